@@ -65,6 +65,8 @@ from fflin.analysis.gramians import Gramians as Gramians
 from fflin.analysis.modes import modes as modes
 from fflin.analysis.modes import Modes as Modes
 from fflin.analysis.modes import Mode as Mode
+from fflin.analysis.effective_masses import effective_masses as effective_masses
+from fflin.analysis.effective_masses import EffectiveMasses as EffectiveMasses
 from fflin.analysis.relative_equilibria import relative_equilibria as relative_equilibria
 from fflin.analysis.relative_equilibria import RelativeEquilibria as RelativeEquilibria
 from fflin.analysis.relative_equilibria import RelativeEquilibrium as RelativeEquilibrium

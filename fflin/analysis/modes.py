@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fflin.analysis.eigenpairs import natural_modes
+from fflin.analysis.modal_energy import energy_by_body
 from fflin.base.errors import InputError
 from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import counted, grid, width
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Mode(FrozenArrays):
-    """One mode: a conjugate pair of poles, or a real pole.
+    r"""One mode: a conjugate pair of poles, or a real pole.
 
     Attributes
     ----------
@@ -35,6 +35,22 @@ class Mode(FrozenArrays):
         Whether it grows, by more than rounding can explain.
     margin : float
         The real part of the pole as a multiple of its rounding; infinite where it has none.
+    energy : mapping of str to float
+        Fraction of the mode's kinetic energy that each body has, the largest first; they are not
+        negative and sum to 1. A body is named by the joint that carries it, the root "base".
+        Empty if the model is from a file, which does not hold the bodies.
+
+    Notes
+    -----
+    With the complex twist :math:`V_i` of body i in the mode and its spatial inertia
+    :math:`I_i`, the fraction of the energy, averaged over a period, is
+
+    .. math::
+        e_i = \frac{V_i^H I_i V_i}{\sum_k V_k^H I_k V_k}.
+
+    The twists are relative to the reference frame. If the robot floats freely from rest, a mode
+    has no momentum, and the fractions do not depend on which link is the base. A product
+    :math:`\phi_i (M \phi)_i` of one coordinate can be negative; :math:`e_i` cannot.
 
     Examples
     --------
@@ -43,12 +59,15 @@ class Mode(FrozenArrays):
     >>> mode = fflin.modes(fflin.linearize(robot)).modes[0]
     >>> mode.unstable, mode.shape.shape
     (False, (30,))
+    >>> list(mode.energy)[:2]
+    ['panel_right', 'panel_left']
     """
 
     pole: complex
     shape: NDArray[np.complexfloating[Any]]
     unstable: bool
     margin: float
+    energy: Mapping[str, float]
 
     @property
     def oscillates(self) -> bool:
@@ -136,13 +155,16 @@ class Modes:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Modes of which rounding decides whether they grow or decay."""
-        return tuple(
+        """Modes of which rounding decides whether they grow or decay, and what is not known."""
+        undecided = tuple(
             f"undecided: whether the mode at {mode.frequency:.4g} rad/s grows or decays; its real "
             f"part is {mode.margin:.1g} times its rounding"
             for mode in self.modes
             if 0.1 < abs(mode.margin) < 10.0
         )
+        if not self.modes or self.modes[0].energy:
+            return undecided
+        return (*undecided, "the kinetic energy of bodies is not known to a model from a file")
 
     @property
     def poles(self) -> NDArray[np.complexfloating[Any]]:
@@ -153,7 +175,7 @@ class Modes:
         return np.array(listed)
 
     def __str__(self) -> str:
-        """Show how many are rigid, and a table of the others with what moves most."""
+        """Show how many are rigid, and a table of the others with the bodies that move most."""
         vibrations, others = len(self.vibrations), len(self.modes) - len(self.vibrations)
         head = (
             f"{self.robot}: {counted(self.rigid_body, 'rigid-body mode')} "
@@ -169,7 +191,7 @@ class Modes:
             said.append(f"unstable: poles with a positive real part {poles}")
         said += [f"note: {note}" for note in self.notes]
         parts = [textwrap.fill(each, width()) for each in said]
-        rows = [["rad/s", "damping", "time [s]", "", "what moves"]]
+        rows = [["rad/s", "damping", "time [s]", "", "kinetic energy"]]
         rows += [
             [
                 f"{mode.frequency:.6g}" if mode.oscillates else ".",
@@ -182,7 +204,7 @@ class Modes:
         ]
         left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
         for row, mode in zip(rows[1:], self.modes, strict=True):
-            row[-1] = _moving_most(mode, self.state_names, width() - left)
+            row[-1] = _percents(mode.energy, width() - left)
         if self.modes:
             parts.append(grid(rows, "rrrll"))
         return "\n\n".join(parts)
@@ -213,6 +235,8 @@ def modes(lin: LinearModel) -> Modes:
     ------
     InputError
         If the model is sampled, or its states are not positions and then as many velocities.
+    ModelError
+        If the robot's model was changed after the linear model was made.
 
     References
     ----------
@@ -229,6 +253,7 @@ def modes(lin: LinearModel) -> Modes:
     """
     if not isinstance(lin, LinearModel):
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    lin.require_unchanged()
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous one")
     nx, nv = len(lin.A), len(lin.M)
@@ -236,8 +261,13 @@ def modes(lin: LinearModel) -> Modes:
         raise InputError(f"the model has {nx} states, expected {nv} positions and their velocities")
     found = natural_modes(lin)
     triples = sorted(found.triples, key=lambda triple: (abs(triple[0]), triple[0].real))
+    shapes = [_normalised(x) for _, x, _ in triples]
+    energies = energy_by_body(lin._robot, lin, shapes)
     return Modes(
-        tuple(Mode(pole, _normalised(x), margin > 1.0, margin) for pole, x, margin in triples),
+        tuple(
+            Mode(pole, shape, margin > 1.0, margin, energy)
+            for (pole, _, margin), shape, energy in zip(triples, shapes, energies, strict=True)
+        ),
         found.rigid_body,
         found.zeros,
         found.residual,
@@ -256,22 +286,14 @@ def _normalised(shape: Array) -> NDArray[np.complexfloating[Any]]:
     return np.asarray(shape / shape[largest], dtype=complex)
 
 
-def _moving_most(mode: Mode, names: Sequence[str], room: int) -> str:
-    """Name the positions that move by a tenth of the most or more, or say how many are left out."""
-    shape = mode.shape[: len(names) // 2]
-    sizes = abs(shape)
-    order = [i for i in (-sizes.round(9)).argsort(kind="stable").tolist() if sizes[i] >= 0.1]
-    words = [f"{names[i]} {_amount(complex(shape[i]))}" for i in order]
+def _percents(energy: Mapping[str, float], room: int) -> str:
+    """Name the bodies with 1 % of the energy or more, and sum up those that are left out."""
+    words = [f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01]
+    text = ""
     for count in range(len(words), 0, -1):
-        left = f"; + {len(words) - count} more" if count < len(words) else ""
-        text = ", ".join(words[:count]) + left
+        left = sum(list(energy.values())[count:])
+        others = f"; + {len(energy) - count} more {100.0 * left:.0f} %" if left >= 0.005 else ""
+        text = ", ".join(words[:count]) + others
         if len(text) <= room:
             break
     return text
-
-
-def _amount(value: complex) -> str:
-    if abs(value.imag) <= 0.02 * abs(value):  # an angle of a degree
-        return f"{value.real:.2g}"
-    angle = math.degrees(math.atan2(value.imag, value.real))
-    return f"{abs(value):.2g} at {angle:.0f} deg"

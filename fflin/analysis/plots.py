@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 # Of the two routes to a block, one is drawn above its line and one below.
 _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
+# Bodies with a smaller fraction of the kinetic energy of a mode are not written.
+_LEAST = 0.005
+
 
 def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     """Draw which entries of A and B are more than rounding, and how large they are, by groups.
@@ -101,7 +104,7 @@ def _name(
 
 
 def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
-    """Draw the frequency and damping of each mode, and how far each position moves in it.
+    """Draw each mode's frequency and damping, its shape, and the kinetic energy of the bodies.
 
     Parameters
     ----------
@@ -128,16 +131,24 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
         with drawing(path, 6.5, 1.0) as figure:
             figure.suptitle(f"{title}\nnothing opposes a motion; a joint with a stiffness vibrates")
         return figure
-    with drawing(path, 5.0 + 0.2 * half, 2.6 + 0.36 * count) as figure:
+    bodies = [body for body in modes.modes[0].energy if max(_energies(modes, body)) >= _LEAST]
+    places = {name: place for place, name in enumerate(names)}
+    bodies.sort(key=lambda body: places.get(f"q_m.{body}", -1))
+    with drawing(path, 5.0 + 0.2 * half + 0.3 * len(bodies), 2.6 + 0.36 * count) as figure:
         from matplotlib.patches import Patch
 
-        axes = figure.add_subplot()
+        widths = (0.2 * half, 0.3 * len(bodies))[: 1 + bool(bodies)]
+        axes, *others = figure.subplots(
+            1, len(widths), squeeze=False, sharey=True, gridspec_kw={"width_ratios": widths}
+        )[0]
         colors = dict(zip(dict.fromkeys(units), COLORS, strict=False))
         for place, mode in enumerate(modes.modes):
             _bars(axes, place, mode.shape[:half], [colors[unit] for unit in units])
         axes.set_xticks(range(half), names, rotation=90, fontsize=8)
         axes.set_yticks(range(count), [_said(mode) for mode in modes.modes], fontsize=8)
         axes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
+        for beside in others:
+            _percentages(beside, modes, bodies)
         figure.legend(
             handles=[Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()],
             title="what moves most is 1; outline: modulus of what is out of phase",
@@ -146,6 +157,24 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
         )
         figure.suptitle(title)
     return figure
+
+
+def _energies(modes: Modes, body: str) -> list[float]:
+    return [mode.energy[body] for mode in modes.modes]
+
+
+def _percentages(axes: Axes, modes: Modes, bodies: Sequence[str]) -> None:
+    """Write the percentage of the kinetic energy of each mode that each body has."""
+    fractions = np.array([_energies(modes, body) for body in bodies]).T
+    axes.imshow(fractions, cmap="Blues", vmin=0.0, vmax=1.6, aspect="auto")
+    for (line, column), fraction in np.ndenumerate(fractions):
+        if fraction >= _LEAST:
+            text = f"{100.0 * fraction:.0f}"
+            axes.text(column, line, text, ha="center", va="center", fontsize=7)
+    axes.grid(visible=False)
+    axes.set_xticks(range(len(bodies)), bodies, rotation=90, fontsize=8)
+    axes.tick_params("y", labelleft=False)
+    axes.set_title("kinetic energy [%]", fontsize=8)
 
 
 def _bars(axes: Axes, place: int, shape: Any, colors: Sequence[str]) -> None:

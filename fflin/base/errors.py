@@ -4,6 +4,26 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
+# Characters that end a line or command the terminal, names that are too long to be read, and how
+# long a message may be. A part of a path is such a name, the path is not.
+_CONTROL, _LONG_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]"), re.compile(r"[^\s/\\]{100,}")
+_LONGEST = 1000
+# The line break of a message of another package that goes on with an indented line.
+_INDENTED = re.compile(r"[ \t]*\r?\n[ \t]+")
+
+
+def one_line(text: str) -> str:
+    """Return a message in one line: what a name holds is escaped, and what is too long is cut."""
+    text = _INDENTED.sub(" ", text)
+    text = _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
+    text = _LONG_NAME.sub(lambda found: _cut(found[0], 60), text)
+    return text if len(text) <= _LONGEST else _cut(text, _LONGEST)
+
+
+def _cut(text: str, size: int) -> str:
+    """Return both ends of a text, about `size` characters."""
+    return f"{text[: 2 * size // 3]}...{text[-size // 3 :]}"
+
 
 class FflinError(Exception):
     """Base of every error that a public call of fflin raises on purpose; reads as one line.
@@ -18,9 +38,7 @@ class FflinError(Exception):
     """
 
     def __str__(self) -> str:
-        text = " ".join(line.strip() for line in super().__str__().splitlines())
-        # A name in a file may hold what commands the terminal.
-        return re.sub(r"[\x00-\x1f\x7f-\x9f]", lambda found: repr(found[0])[1:-1], text)
+        return one_line(super().__str__())
 
 
 class InputError(FflinError, ValueError):
@@ -217,6 +235,9 @@ class FflinWarning(UserWarning):
     ...     warnings.simplefilter("error", fflin.FflinWarning)  # a doubtful URDF is refused
     ...     robot = fflin.load("cubesat")
     """
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 def listed(names: Iterable[str]) -> str:

@@ -18,6 +18,13 @@ class FrozenArrays:
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 object.__setattr__(self, item.name, frozen(value.copy()))
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # NumPy makes arrays anew, and writeable, for deepcopy and most of pickle's protocols.
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                frozen(value)
+        vars(self).update(state)
+
 
 def frozen(array: Array) -> Array:
     """Return the array itself, read-only."""

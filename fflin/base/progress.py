@@ -17,8 +17,8 @@ class Progress:
         self._next = self._start + (_PATIENCE if shown is None else 0.0)
         self._drawn = False
 
-    def update(self, done: int, total: int) -> None:
-        """Say how many steps of how many are done."""
+    def update(self, done: int, total: int, what: str = "") -> None:
+        """Say how many steps of how many are done, and of `what`."""
         if not self._shown or (now := time.monotonic()) < self._next:
             return
         self._next = now + _INTERVAL
@@ -26,7 +26,7 @@ class Progress:
         left = (now - self._start) * (1.0 - share) / share
         bar = "#" * round(30 * share)
         self._drawn = True
-        said = f"\r[{bar:<30}] {share:4.0%}, {left:.0f} s left "
+        said = f"\r{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left "
         print(said, end="", file=sys.stderr, flush=True)
 
     def close(self) -> None:

@@ -2,12 +2,12 @@
 
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from fflin.base.errors import FflinError, InputError, UnknownNameError
-from fflin.base.writing import read_input
+from fflin.base.writing import read_file
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -19,6 +19,9 @@ _SIZE_LIMIT = 2**17
 
 # The time for a dotted key grows with the square of its parts.
 _DOTS_LIMIT = 1_000
+
+# Python refuses to write integers of more than 4,300 digits, as an error would.
+_BITS_LIMIT = 10_000
 
 # What may hold a line that looks like a key: strings of several lines. Those of one line and
 # comments are found too, for they may hold the quotes of the former.
@@ -40,7 +43,7 @@ class TomlFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        content = read_input(path, "TOML", _SIZE_LIMIT)
+        content = read_file(path, "TOML", _SIZE_LIMIT)
         try:
             text = content.decode("utf-8-sig").replace("\r\n", "\n")
         except UnicodeDecodeError as error:
@@ -58,6 +61,10 @@ class TomlFile:
         # Keys may be quoted: what stands on one line is left, and is no line of its own.
         blank = _TEXTS.sub(lambda found: "\n" * found[0].count("\n") or found[0], text)
         self._lines = _lines_of(blank)
+        for place, value in _values(self.record):
+            if type(value) is int and value.bit_length() > _BITS_LIMIT:
+                name = ".".join(map(str, place))
+                raise self.error(f"{name} is too long an integer; write a float, 1e30", *place)
 
     def line(self, *place: str | int) -> int:
         """Return the line of a place, or that of the table that holds it."""
@@ -84,6 +91,18 @@ def flat(table: Mapping[str, Any]) -> dict[str, Any]:
             pairs += [(f"{key}.{below}" if below else key, x) for below, x in inner.items()]
         table = dict(pairs)
     return dict(table)
+
+
+def _values(record: Mapping[str, Any]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    """Yield (place, value) of all that is neither table nor array, however deep."""
+    left: list[tuple[tuple[str | int, ...], Any]] = [((), record)]
+    while left:
+        place, value = left.pop()
+        if isinstance(value, dict | list):
+            pairs = value.items() if isinstance(value, dict) else enumerate(value)
+            left += [((*place, key), inner) for key, inner in pairs]
+        else:
+            yield place, value
 
 
 def _lines_of(text: str) -> dict[str, int]:

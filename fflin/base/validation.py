@@ -99,6 +99,15 @@ def by_name(name: str, value: Any, of_what: str) -> Mapping[str, Any]:
     return mapping
 
 
+def untied(key: str, value: Any) -> tuple[Any, bool]:
+    """Return a range, and whether one value in it is meant for all that its key names."""
+    if not isinstance(value, Mapping):
+        return value, False
+    if value.keys() != {"range", "tied"}:
+        raise InputError(f"'{key}' is {value!r}, expected {{'range': 0.2, 'tied': True}}")
+    return value["range"], truth(f"tied of '{key}'", value["tied"])
+
+
 def numbers(name: str, value: Any, of_what: str, each: str) -> dict[str, float]:
     """Return {name: finite float} of a mapping by names; an error calls one of them `each`."""
     values = by_name(name, value, of_what)

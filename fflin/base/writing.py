@@ -1,22 +1,31 @@
 """The one rule for files.
 
-What is written takes a new name or the place of a regular file, never that of a file that was
-read as input; it is whole, or what was there stays; an old file keeps its mode, and a new one has
-what the umask leaves. Where the target is a link, the file that it leads to is written, and the
-link stays.
+What is written takes a new name or the place of a regular file; it is whole, or what was there
+stays; an old file keeps its mode, and a new one has what the umask leaves. Where the target is a
+link, the file that it leads to is written, and the link stays. A command writes over none of the
+files that it reads.
 """
 
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fflin.base.errors import FileError, InputError
 
-# What was read as input in this process; no name of these files is written to.
-_inputs: set[str] = set()
+
+class CommandFiles(NamedTuple):
+    """What a command was told to write and has not written yet, and what it reads."""
+
+    outputs: set[Path]
+    inputs: set[str]
+
+
+# None in a Python session, which may write over what it has read.
+_of_command: ContextVar[CommandFiles | None] = ContextVar("files of a command", default=None)
 
 
 def as_path(path: Any) -> Path:
@@ -53,19 +62,45 @@ def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
     if limit is not None and len(content) > limit:
         size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
         raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")
-    return content
-
-
-def read_input(path: Path, kind: str, limit: int | None = None) -> bytes:
-    """Do what `read_file` does, and let nothing that is written take the file's place."""
-    content = read_file(path, kind, limit)
     remember(path)
     return content
 
 
+@contextmanager
+def files_of_command(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterator[None]:
+    """Raise `FileError` within it once a file is to be read and written, or to be written twice.
+
+    `inputs` are those that are known at the start; `read_file` and `remember` add the others.
+    """
+    check_distinct(*(outputs := list(outputs)))
+    token = _of_command.set(CommandFiles(set(outputs), set()))
+    try:
+        remember(*inputs)
+        yield
+    finally:
+        _of_command.reset(token)
+
+
 def remember(*paths: str | Path) -> None:
-    """Let nothing that is written take the place of files that are read by other means."""
-    _inputs.update(map(os.path.abspath, paths))
+    """Let a command write over none of these files, which it reads."""
+    if files := _of_command.get():
+        files.inputs.update(map(os.path.abspath, paths))
+        for target in files.outputs:
+            _require_other(target, paths)
+
+
+def _require_other(target: Path, inputs: Iterable[str | Path]) -> None:
+    for path in inputs:
+        if _same_file(path, target):
+            said = f"{target} is the input file {os.path.abspath(path)}"
+            raise FileError(f"{said}; name another to write")
+
+
+def _same_file(path: str | Path, other: Path) -> bool:
+    try:
+        return os.path.samefile(path, other)
+    except (OSError, ValueError):  # one of them does not exist
+        return False
 
 
 def write_whole(contents: Mapping[Path, bytes]) -> None:
@@ -108,6 +143,8 @@ def install(temporary: Path, target: Path) -> None:
     os.umask(mask)
     os.chmod(temporary, real.stat().st_mode & 0o777 if real.exists() else 0o666 & ~mask)
     os.replace(temporary, real)
+    if files := _of_command.get():
+        files.outputs.discard(target)  # what the command made, it may read
 
 
 def place(target: Path) -> Path:
@@ -125,9 +162,8 @@ def place(target: Path) -> Path:
     if not stat.S_ISREG(found.st_mode):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "not a regular file"
         raise FileError(f"{target}: is {kind}; give the name of a file")
-    for path in _inputs:
-        if os.path.exists(path) and os.path.samestat(os.stat(path), found):
-            raise FileError(f"{target} is the input file {path}; name another to write")
+    if files := _of_command.get():
+        _require_other(target, files.inputs)
     return real
 
 
@@ -148,12 +184,13 @@ def check_place(target: Path, endings: tuple[str, ...] = ()) -> None:
 
 def check_distinct(*targets: Path | None) -> None:
     """Raise `FileError` where two outputs are one file, links followed; None is no output."""
-    seen: dict[str, Path] = {}
-    for target in targets:
-        if target is not None:
-            first = seen.setdefault(os.path.realpath(target), target)
-            if first is not target:
+    seen: list[Path] = []
+    for target in filter(None, targets):
+        for first in seen:
+            same = os.path.realpath(first) == os.path.realpath(target)
+            if same or _same_file(first, target):
                 raise FileError(f"{target} and {first} are one file; name another for each output")
+        seen.append(target)
 
 
 def reserve(path: Path) -> None:

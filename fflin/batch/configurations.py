@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.names import joints_by_name
-from fflin.base.validation import Array, number, whole
+from fflin.base.validation import Array, as_double, number, whole
 from fflin.batch.rows import checked_configurations, follow_rows
 from fflin.dynamics.points import configuration
 from fflin.robot.joints import Joint
@@ -173,10 +173,7 @@ def grid(
         robot.joint(name)
         if joints and name in joints:
             raise InputError(f"joint '{name}' is on the grid and in joints; give either")
-        try:
-            axis = np.array(values, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError(f"grid of joint '{name}' is {values!r}, expected numbers") from None
+        axis = as_double(f"grid of joint '{name}'", values)
         if axis.ndim != 1 or not axis.size:
             raise InputError(f"grid of joint '{name}' has shape {axis.shape}, expected (k,), k > 0")
         if not np.isfinite(axis).all() or (np.diff(axis) <= 0.0).any():

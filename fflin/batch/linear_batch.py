@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from fflin.base.errors import InputError, unknown
-from fflin.base.frozen import frozen
+from fflin.base.frozen import FrozenArrays, frozen
 from fflin.base.record import NOT_VERIFIED
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, number, refuse_masked
 from fflin.base.writing import as_path
 from fflin.batch.batch_record import read_batch, texts_of
 from fflin.batch.files import is_constant, write_rows
@@ -31,7 +31,7 @@ _SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearBatch:
+class LinearBatch(FrozenArrays):
     r"""Linear models about N points, ``dx/dt = f0 + A (x - x0) + B (u - u0)``; made by `sweep`.
 
     ``batch[i]`` is the `LinearModel` about point i, ``batch[2:9]`` or ``batch[mask]`` a batch.
@@ -137,6 +137,7 @@ class LinearBatch:
                 raise IndexError(f"point {index} of a batch of {len(self)}")
             return self._model(int(index) % len(self))
         if not isinstance(index, slice):
+            refuse_masked("index", index)
             index = np.asarray(index)
             if index.dtype.kind not in "iub" or index.ndim != 1:
                 raise InputError("a batch is indexed by a number, a slice, numbers or a mask")

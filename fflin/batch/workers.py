@@ -83,7 +83,7 @@ class OwnWorkers(Executor):
             if self._closed:
                 raise NoWorkers("the workers are shut down")
             try:
-                with _deaf_to_ctrl_c():
+                with _isolated(), _deaf_to_ctrl_c():
                     process.start()
             except OSError as error:
                 raise NoWorkers(f"no worker can be started: {error}") from None
@@ -109,6 +109,29 @@ class OwnWorkers(Executor):
             process.kill()
             process.join()
         process.close()
+
+
+# Threads of one process start workers one at a time: `_isolated` changes what is theirs in common.
+_STARTING = Lock()
+
+
+@contextmanager
+def _isolated() -> Iterator[None]:
+    """Start processes that import nothing from the working folder.
+
+    By default multiprocessing runs them with the working folder in front of all that they import
+    from, until they take over the `sys.path` of the process that started them.
+    """
+    from multiprocessing import util
+
+    module: Any = util
+    with _STARTING:
+        usual = module._args_from_interpreter_flags
+        module._args_from_interpreter_flags = lambda: ["-I", *usual()]
+        try:
+            yield
+        finally:
+            module._args_from_interpreter_flags = usual
 
 
 @contextmanager

@@ -256,7 +256,10 @@ class Campaign(FrozenArrays):
         return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
 
     def replay(self, run: int) -> Motion:
-        """Return the motion of a run, which ends in the same state to the last bit.
+        """Return the motion of a run.
+
+        Its q, v and u are those of the run bit for bit. Its x is read from q and v by other code:
+        it is that of the run to machine precision, continuous joints but for full turns.
 
         Raises
         ------
@@ -280,10 +283,14 @@ class Campaign(FrozenArrays):
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz or .h5 file, whole or not at all."""
+        self._save(as_path(path))
+
+    def _save(self, path: Path, **texts: str) -> None:
+        """Write it with more texts, such as the request that `monte_carlo` knows its call by."""
         arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in _ARRAYS}
         rest = {key: getattr(self, key) for key in _HEADER}
-        texts = {"header": json.dumps({"kind": "Campaign", **rest})}
-        write_rows(as_path(path), arrays, texts, sealed=True)
+        texts["header"] = json.dumps({"kind": "Campaign", **rest})
+        write_rows(path, arrays, texts, sealed=True)
 
     @classmethod
     def load(cls, path: str | Path) -> Campaign:

@@ -55,6 +55,7 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     ``{values = [0, 10, 20]}``                  each as likely
     ``{distribution = "triang", c = 0.5}``      one of scipy.stats by its name, with its shapes,
                                                 ``loc`` and ``scale``
+    ``{normal = 0.05, tied = true}``            one draw for all that a pattern or group names
     ==========================================  ==================================================
 
     Units are those of the state, input or joint, SI, as `monte_carlo` says.
@@ -116,7 +117,10 @@ def _names(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, An
 
 
 def _spread(value: Any) -> Any:
-    table: dict[str, Any] = value if isinstance(value, dict) else {"normal": value}
+    table: dict[str, Any] = dict(value) if isinstance(value, dict) else {"normal": value}
+    if "tied" in table:
+        tied = table.pop("tied")
+        return {"range": _spread(table), "tied": tied}
     if isinstance(table.get("distribution"), str):
         return _distribution(**table)
     (form, given), *others = table.items() or [("", None)]
@@ -130,11 +134,15 @@ def _spread(value: Any) -> Any:
 def _distribution(distribution: str, **given: Any) -> Any:
     from scipy import stats
 
-    known = [each for each in dir(stats) if hasattr(getattr(stats, each), "ppf")]
+    kinds = stats.rv_continuous, stats.rv_discrete
+    known = [each for each in dir(stats) if isinstance(getattr(stats, each), kinds)]
     if distribution not in known:
         raise unknown("distribution of scipy.stats", distribution, known)
     kind = getattr(stats, distribution)
     try:
+        for key, value in given.items():
+            if not is_number(value):
+                raise ValueError(f"has {key} = {reprlib.repr(value)}, expected a finite number")
         frozen = kind(**given)
         if abs(float(frozen.ppf(0.5))) < 1e100:
             return frozen

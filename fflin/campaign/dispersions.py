@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from copy import copy
@@ -12,11 +13,13 @@ import numpy as np
 
 from fflin.base.errors import ChartError, InputError, UnknownNameError
 from fflin.base.names import by_name, input_keys
-from fflin.base.validation import Array
+from fflin.base.progress import Progress
+from fflin.base.validation import Array, untied
 from fflin.base.validation import by_name as mapping
+from fflin.base.writing import reason
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
 from fflin.campaign.sensing import Bound, misled, noise_of
-from fflin.campaign.spreads import SEED, deviation_of, inverse_of, whole_number
+from fflin.campaign.spreads import SEED, deviation_of, inverse_of, is_closed_form, whole_number
 from fflin.control.linear_controller import LinearController
 from fflin.control.output_feedback import TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, StateFeedback, bound
@@ -24,12 +27,13 @@ from fflin.dynamics.state import StateMap
 from fflin.kernel.accelerations import loads_of
 from fflin.kernel.tree import Tree
 from fflin.robot.frames import ROOT
-from fflin.robot.link_masses import pieces_of, with_share
+from fflin.robot.link_masses import Piece, pieces_of, with_share
 from fflin.robot.mass_properties import stretched, with_inertias
 from fflin.simulation.plant import Drives, Plant
 from fflin.simulation.times import Times
 
 _BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
+_GLANCE = 0.3  # seconds of drawing from one look at its progress to the next
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz"}  # with their axes
 _AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
@@ -38,11 +42,11 @@ _FACTORS = ("mass", "inertia", "density", *_OF_SPRINGS)
 
 
 class Column(NamedTuple):
-    """A number that is drawn for each run, what it changes and of whom."""
+    """A number that is drawn for each run, what it changes and of whom; of several if tied."""
 
     name: str
     kind: str  # "state", "delay", "seed" of noise, or what a name ends with
-    at: tuple[int, int]  # which state, body, joint, input or sensor, and which of its axes
+    at: tuple[tuple[int, int], ...]  # each state, body, joint, input or sensor, and which axis
     inverse: Callable[[Array], Array]  # of the distribution function
 
 
@@ -86,24 +90,29 @@ class Dispersions:
             kind, head = (kind, head) if kind in known and head else ("state", str(key))
             if key == "delay":
                 kind, known["delay"] = "delay", ("delay",)
-            if kind == "fails" and isinstance(spread, int | float):
+            own, tied = untied(str(key), spread)
+            if kind == "fails" and isinstance(own, int | float):
                 raise InputError(
-                    f"'{key}' is {spread:g}, the deviation about 0 of a time; give (least, "
+                    f"'{key}' is {own:g}, the deviation about 0 of a time; give (least, "
                     "largest), a list of times or a distribution"
                 )
             inverse = deviation_of if kind == "noise" else inverse_of
-            by_kind.setdefault(kind, {})[head] = inverse(str(key), spread)
+            spreads = by_kind.setdefault(kind, {})
+            spreads[head] = inverse(str(key), own), str(key) if tied else ""
         if "noise" in by_kind:
-            self.columns.append(Column(SEED, "seed", (0, 0), whole_number))
+            self.columns.append(Column(SEED, "seed", ((0, 0),), whole_number))
         for kind, spreads in by_kind.items():
             self._add(kind, spreads, list(known[kind]), " | ".join([*known][1:]))
         if not self.columns:
             raise InputError("dispersions is empty; give at least one, such as {'q_b': 0.05}")
         self._kinds = {column.kind for column in self.columns}
-        heavier = {each.at[0] + ROOT: each.name for each in self.columns if each.kind == "mass"}
-        for name, at in self._densities():
+        # What distributions of other packages gave, by name and block; closed forms are quick.
+        self._kept: dict[tuple[str, int], Array] = {}
+        heavier = {at + ROOT: self.names[column] for column, at in self._changed("mass")}
+        for column, _, at in self._densities():
             if at in heavier:
-                raise InputError(f"'{heavier[at]}' and '{name}' both change a mass; give either")
+                one, other = heavier[at], self.names[column]
+                raise InputError(f"'{one}' and '{other}' both change a mass; give either")
 
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:
@@ -123,15 +132,24 @@ class Dispersions:
             raise UnknownNameError(
                 f"{error}" + f"; or NAME.({kinds})" * (kind == "state")
             ) from None
-        for at, inverse in sorted(found.items()):
+        draws: dict[str, tuple[Any, list[int]]] = {}
+        for at, (inverse, tied) in sorted(found.items()):
             own = names[at] if kind in ("state", "delay") else f"{names[at]}.{kind}"
             if kind in _OF_SPRINGS and not getattr(self._plant.robot.springs, kind)[at]:
                 raise InputError(f"'{own}' is dispersed, and is 0, which stays 0 times a factor")
             if kind == "misalignment":
                 require_direction(self._plant.robot, at)
+            draws.setdefault(tied or own, (inverse, []))[1].append(at)
+        for own, (inverse, places) in draws.items():
             for axis, letter in enumerate(_AXES.get(kind, " ")):
                 name = f"{own}.{letter}".rstrip(". ")
-                self.columns.append(Column(name, kind, (at, axis), inverse))
+                where = tuple((at, axis) for at in places)
+                self.columns.append(Column(name, kind, where, inverse))
+
+    def _changed(self, *kinds: str) -> list[tuple[int, int]]:
+        """Return (column, which state, body, joint, input or sensor) of kinds."""
+        columns = enumerate(self.columns)
+        return [(i, at) for i, each in columns if each.kind in kinds for at, _ in each.at]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,20 +158,66 @@ class Dispersions:
 
     def rows(self, start: int, stop: int) -> Draws:
         """Return what is drawn for some runs; it depends on seed, name and run alone."""
-        first, last = start // _BLOCK, -(-stop // _BLOCK)
-        drawn = np.empty(((last - first) * _BLOCK, len(self.columns)))
+        drawn = np.empty((stop - start, len(self.columns)))
         for at, column in enumerate(self.columns):
-            key = (self._seed, zlib.crc32(column.name.encode()))
-            for block in range(first, last):
-                stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
-                # At 0 and 1 the inverse may be infinite.
-                uniform = np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
-                drawn[(block - first) * _BLOCK :][:_BLOCK, at] = column.inverse(uniform)
-        kept = slice(start - first * _BLOCK, stop - first * _BLOCK)
-        return Draws(drawn[kept], np.arange(start, stop, dtype=float))
+            for first in range(start // _BLOCK * _BLOCK, stop, _BLOCK):
+                low, high = max(start, first), min(stop, first + _BLOCK)
+                values = self._drawn(column, first // _BLOCK, high - first)
+                drawn[low - start : high - start, at] = values[low - first : high - first]
+        return Draws(drawn, np.arange(start, stop, dtype=float))
+
+    def _uniform(self, column: Column, block: int) -> Array:
+        key = (self._seed, zlib.crc32(column.name.encode()))
+        stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
+        # At 0 and 1 the inverse may be infinite.
+        return np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
+
+    def _drawn(
+        self, column: Column, block: int, count: int, said: Callable[[int], None] | None = None
+    ) -> Array:
+        """Return the first values of a block of runs, each drawn once: some distributions are slow.
+
+        `said` is called with the number of values that this block has, as they are drawn.
+        """
+        uniform = self._uniform(column, block)
+        if is_closed_form(column.inverse):
+            return column.inverse(uniform)
+        kept, size = self._kept.get((column.name, block), np.empty(0)), 1
+        while len(kept) < count:
+            begun = time.monotonic()
+            part = uniform[len(kept) : min(count, len(kept) + size)]
+            try:
+                values = np.asarray(column.inverse(part), dtype=float)
+            except Exception as error:  # each distribution has its own
+                raise InputError(
+                    f"the distribution of '{column.name}' cannot be drawn: {reason(error)}"
+                ) from None
+            kept = self._kept[column.name, block] = np.concatenate((kept, values))
+            if said:
+                said(len(kept))
+            took = max(time.monotonic() - begun, 1e-9)
+            size = max(1, min(2 * size, int(size * _GLANCE / took)))
+        return kept
+
+    def _draw_all(self, column: Column, runs: int) -> None:
+        """Draw a distribution for so many runs, with a bar on a terminal."""
+        bar = Progress()
+        try:
+            for first in range(0, runs, _BLOCK):
+
+                def said(count: int, first: int = first) -> None:
+                    done = first + count
+                    bar.update(done, runs, f"drawing '{column.name}', {done:,} of {runs:,} ")
+
+                self._drawn(column, first // _BLOCK, min(_BLOCK, runs - first), said)
+        finally:
+            bar.close()
 
     def require_possible(self, runs: int) -> None:
         """Raise `InputError` where a draw of so many runs makes no robot or no attitude."""
+        for column in self.columns:
+            if not is_closed_form(column.inverse):
+                self._draw_all(column, runs)
         for start in range(0, runs, _BLOCK):
             drawn = self.rows(start, min(start + _BLOCK, runs)).drawn
             for values, column in zip(drawn.T, self.columns, strict=True):
@@ -161,10 +225,11 @@ class Dispersions:
                 bad = ~np.isfinite(values) | (values <= least)
                 if bad.any():
                     run = int(bad.argmax())
+                    bound = f" more than {least:g}" if np.isfinite(least) else " a finite number"
                     raise InputError(
                         f"'{column.name}' is drawn as {values[run]:.4g} in run {start + run}, of "
-                        f"which no robot is made: expected more than {least:g}; take a smaller "
-                        "spread, or a uniform one (least, largest)"
+                        f"which no robot is made: expected{bound}; take a smaller spread, or a "
+                        "uniform one (least, largest)"
                     )
             try:
                 self.starts(drawn)
@@ -176,8 +241,8 @@ class Dispersions:
         """Return the draws (N, size, axes) of a kind, zero where nothing is drawn."""
         found = np.zeros((len(drawn), size, axes))
         for values, column in zip(drawn.T, self.columns, strict=True):
-            if column.kind == kind:
-                found[(slice(None), *column.at)] = values
+            for at in column.at if column.kind == kind else ():
+                found[(slice(None), *at)] = values
         return found
 
     def starts(self, drawn: Array) -> tuple[Array, Array]:
@@ -185,25 +250,24 @@ class Dispersions:
         x = self._x0 + self._of("state", drawn, len(self._x0))[..., 0]
         return self._plant.state.points(x)[1:]
 
-    def _densities(self) -> Iterator[tuple[str, int]]:
-        """Yield the densities that are drawn, and the joint of each without wheels."""
-        names, joints = list(self._links), self._plant.robot.model.names
-        for column in self.columns:
-            if column.kind == "density":
-                at = self._links[names[column.at[0]]].joint
-                yield column.name, self._model.getJointId(joints[at]) if at > ROOT else ROOT
+    def _densities(self) -> Iterator[tuple[int, Piece, int]]:
+        """Yield columns of densities, the link of each, and its joint without wheels."""
+        links, joints = list(self._links.values()), self._plant.robot.model.names
+        for column, at in self._changed("density"):
+            joint = links[at].joint
+            own = self._model.getJointId(joints[joint]) if joint > ROOT else ROOT
+            yield column, links[at], own
 
     def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
         """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of bodies that are drawn."""
         size, found = self._model.njoints - ROOT, {}
         of = [self._of(kind, drawn, size, len(axes)) for kind, axes in _OF_BODIES.items()]
-        for at in sorted({each.at[0] for each in self.columns if each.kind in _OF_BODIES}):
+        for at in sorted({at for _, at in self._changed(*_OF_BODIES)}):
             found[ROOT + at] = stretched(self._model.inertias[ROOT + at], *(x[:, at] for x in of))
-        names = self.names
-        for name, at in self._densities():
-            one, none = self._links[name.removesuffix(".density")], np.zeros((len(drawn), 3))
+        none = np.zeros((len(drawn), 3))
+        for column, link, at in self._densities():
             body = found.get(at) or stretched(self._model.inertias[at], none[:, :1], none, none)
-            found[at] = with_share(body, one, drawn[:, names.index(name)])
+            found[at] = with_share(body, link, drawn[:, column])
         return found
 
     def _springs(self, kind: str, drawn: Array) -> Array:
@@ -216,7 +280,7 @@ class Dispersions:
             self._of(kind, drawn, len(self._plant.drives.gain))[..., 0] for kind in _OF_INPUTS
         )
         safe = np.ones(until.shape[1], dtype=bool)
-        safe[[each.at[0] for each in self.columns if each.kind == "fails"]] = False
+        safe[[at for _, at in self._changed("fails")]] = False
         until[:, safe] = np.inf
         turn = columns_of(self._plant.robot, self._angles(drawn))
         return Drives(1.0 + gain, bias, until, turn)

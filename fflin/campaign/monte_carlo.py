@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FileError, InputError, unknown
+from fflin.base.errors import FflinError, FileError, InputError, unknown
 from fflin.base.record import content_digest
-from fflin.base.validation import share, whole
+from fflin.base.validation import share, truth, whole
 from fflin.base.version import __version__
 from fflin.batch.files import hdf5
 from fflin.batch.run import Progress, check_workers, failure, run_chunks
@@ -65,6 +65,7 @@ def monte_carlo(
     histories: int = 0,
     progress: Progress | None = None,
     out: str | Path | None = None,
+    overwrite: bool = False,
     engine: str | None = None,
     **options: Any,
 ) -> Campaign:
@@ -82,10 +83,11 @@ def monte_carlo(
         {name, group or pattern: spread}, or what `load_dispersions` read. A name is one of
 
         - a state, ``q_b``, ``r_b.x``, ``q_m.*``, ``omega_b``: added to the start;
-        - ``BODY.mass``, ``BODY.com``, ``BODY.inertia`` of ``base`` or the body of a joint, relative
-          as in `Robot.perturbed`: the mass is multiplied by 1 + d and the inertia with it, each
-          second moment per mass along the axes of its frame by 1 + d, and the centre of mass is
-          shifted by d times the radius of gyration. The pseudo-inertia stays positive;
+        - ``BODY.mass`` and ``BODY.inertia`` of ``base`` or the body of a joint, relative as in
+          `Robot.perturbed`: the mass is multiplied by 1 + d and the inertia with it, each second
+          moment per mass along the axes of its frame by 1 + d. The pseudo-inertia stays positive;
+        - ``BODY.com`` [m]: the centre of mass is moved along each axis of its frame, mass and
+          inertia about it held, as ``LINK.com.x`` of `sensitivity` and `uncertain`;
         - ``LINK.density``, relative, of a link by its name in the URDF, also of one fixed to
           another: all of its mass and inertia are multiplied by 1 + d, as in `sensitivity` and
           `uncertain`, whose ``LINK.mass`` holds the inertia;
@@ -103,7 +105,8 @@ def monte_carlo(
 
         A spread is a number, the standard deviation of a normal distribution about 0; a tuple
         (least, largest), of a uniform one; a list of values, each as likely; or a frozen
-        distribution of scipy.stats.
+        distribution of scipy.stats. Each name that a pattern or group stands for is drawn for
+        itself; ``{"range": spread, "tied": True}`` draws once for all of them.
     runs : int
     duration : float, optional
         [s]; by default that of the trajectory that is followed.
@@ -130,6 +133,8 @@ def monte_carlo(
         .h5 or .npz file to write. It grows as NAME.part; the same call made again after a crash
         goes on from the chunks that are there and intact. A .h5 file that has all of these runs
         already is read, whatever goals it was made with.
+    overwrite : bool
+        Whether to replace a file `out` of another call or of something else; refused by default.
     engine : {"python", "compiled"}, optional
         As of `simulate`.
     **options
@@ -150,7 +155,7 @@ def monte_carlo(
     SweepError
         If a run cannot be done or a worker dies again and again; the chunk is named.
     FileError, MissingPackageError
-        If the file cannot be written.
+        If the file cannot be written, or is there and of another call.
 
     References
     ----------
@@ -174,6 +179,7 @@ def monte_carlo(
     width, confidence = share("width", width), share("confidence", confidence)
     check_workers(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
+    _require_own(path, truth("overwrite", overwrite))
     options |= {"duration": duration, "histories": whole("histories", histories, 0)}
     job = CampaignJob(robot, policy, dispersions, seed, "", options)
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
@@ -185,11 +191,13 @@ def monte_carlo(
     header["goals"] = _goals(goals, until, shapes, header)
     with placed(dispersions):
         job.dispersions.require_possible(runs)
-    if until is None and (flown := _found(job, path, header)):
+    request = _request(job, header) if path else ""
+    _require_own(path, overwrite, request)
+    if until is None and (flown := _found(job, path, request, header)):
         return flown
     threads = threads or available_cores()
     size = _chunk(runs, chunk, workers or threads, until is not None)
-    store = _store(job, path, header, size, shapes)
+    store = _store(path, request, header, size, shapes)
     with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
         how: Any = {"executor": others, "progress": progress}
         how["threads"] = threads if job.engine == "compiled" else 1
@@ -210,7 +218,7 @@ def monte_carlo(
         if isinstance(store, MemoryStore):
             campaign = Campaign.of(store.read(done), header, job)
             if path is not None:
-                campaign.save(path)
+                campaign._save(path, request=request)
             return campaign
         for start in range(done, runs, store.chunk):
             stop = min(start + store.chunk, runs)
@@ -218,7 +226,7 @@ def monte_carlo(
             store.write(start, stop, none)
         store.complete()
         if store.path.suffix == ".npz":
-            Campaign.load(store.part).save(store.path)
+            Campaign.load(store.part)._save(store.path, request=request)
             store.discard()
     return replace(Campaign.load(store.path), _job=job)
 
@@ -237,25 +245,52 @@ def _goals(given: Any, until: Any, shapes: Any, header: dict[str, Any]) -> list[
 
 
 def _store(
-    job: CampaignJob, path: Path | None, header: dict[str, Any], size: int, shapes: Any
+    path: Path | None, request: str, header: dict[str, Any], size: int, shapes: Any
 ) -> FileStore | MemoryStore:
     if path is None or (path.suffix == ".npz" and find_spec("h5py") is None):
         return MemoryStore(header["asked"], size, shapes)
     texts = {"header": json.dumps(header), "constant": "[]"}
-    request = _request(job, header)
     return FileStore(path, request, header["asked"], size, shapes, {}, texts, what="campaign")
 
 
-def _found(job: CampaignJob, path: Path | None, header: dict[str, Any]) -> Campaign | None:
+def _require_own(path: Path | None, overwrite: bool, request: str = "") -> None:
+    """Refuse to replace a file of another call; before the request is known, of no campaign."""
+    if overwrite or path is None or not path.is_file():
+        return
+    earlier = _request_of(path)
+    if earlier and earlier == (request or earlier):
+        return
+    try:
+        found = Campaign.load(path)
+        there = f"holds another campaign: {found!r}, seed {found.seed}"
+    except FflinError:
+        there = "is there already and holds no campaign"
+    raise FileError(
+        f"{path} {there}; name another file, or replace it with overwrite=True (--force)"
+    )
+
+
+def _request_of(path: Path) -> str:
+    """Return the hash of the call that made a file; "" if none did."""
+    try:
+        if path.suffix == ".h5":
+            with hdf5().File(path, "r") as file:
+                return str(file.attrs.get("request", ""))
+        with path.open("rb") as content, np.load(content, allow_pickle=False) as file:
+            return str(file["request"])
+    except Exception:  # each decoder has its own
+        return ""
+
+
+def _found(
+    job: CampaignJob, path: Path | None, request: str, header: dict[str, Any]
+) -> Campaign | None:
     """Return what a file has of the same runs, all of them, whatever its goals."""
-    if path is None or path.suffix != ".h5" or not path.is_file():
+    if path is None or path.suffix != ".h5" or not path.is_file() or _request_of(path) != request:
         return None
     try:
-        with hdf5().File(path, "r") as file:
-            if file.attrs.get("request") != _request(job, header):
-                return None
         found = Campaign.load(path)
-    except (OSError, FileError):
+    except FileError:
         return None  # it is written anew
     goals = tuple(header["goals"])
     whole = len(found) == header["asked"]

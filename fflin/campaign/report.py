@@ -61,13 +61,14 @@ def worst_runs(campaign: Any, k: int) -> list[str]:
     rows = [["run", about, "unit", "settled after [s]", "ended at [s]", "drawn, above all"]]
     ranks = campaign.drawn.argsort(axis=0).argsort(axis=0)
     weights = {key.strip("|"): abs(x) for key, x in campaign.sensitivity().items()}
-    out = abs(ranks - ranks.mean()) * [weights[name] for name in campaign.names]
+    # The seed of a run's noise tells nothing.
+    out = abs(ranks - ranks.mean()) * [weights.get(name, 0.0) for name in campaign.names]
     for run in campaign.worst(k):
         far = int(out[run].argmax())
         stop = STOPS[int(campaign.stop[run])]
         ended = f"{campaign.end[run]:g}{', ' * bool(stop)}{stop}"
         settled = _when(campaign.values("settle")[run])
-        drawn = f"{campaign.names[far]} = {campaign.drawn[run, far]:.3g}"
+        drawn = f"{campaign.names[far]} = {campaign.drawn[run, far]:.3g}" if out[run, far] else "-"
         rows.append([str(run), f"{values[run]:.3g}", unit, settled, ended, drawn])
     return ["", grid(rows, "rrlrll"), ""]
 

@@ -42,6 +42,11 @@ def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
     return partial(_normal, deviation)
 
 
+def is_closed_form(inverse: Callable[[Array], Array]) -> bool:
+    """Whether an inverse is one of this module, and no distribution's that may take long."""
+    return isinstance(inverse, partial) or inverse is whole_number
+
+
 def _uniform(least: float, largest: float, u: Array) -> Array:
     return least + (largest - least) * u
 

@@ -38,12 +38,12 @@ def add_commands(commands: Commands) -> None:
     add_figure(analyze, "draw the modes")
     modes = command(
         *(commands, "modes", _modes),
-        "show natural frequencies, damping ratios and time constants",
+        "show natural frequencies, damping ratios, kinetic energies and effective masses",
         "fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100",
     )
     add_point(modes)
     add_figure(modes, "draw frequencies, damping and shapes")
-    add_options(modes, "--html FILE: write a page that plays the mode shapes")
+    add_options(modes, "--html >FILE: write a page that plays the mode shapes")
     validity = command(
         *(commands, "validity", _validity),
         "measure how far from the point the linear model can be trusted and its regulator holds",
@@ -85,17 +85,19 @@ def add_commands(commands: Commands) -> None:
     add_options(uncertain, "--joint NAME=VALUE*: put a joint at VALUE [rad|m]; others at neutral")
     add_system(uncertain, axes=False)
     vary = """--vary NAME=RANGE*: a parameter of `fflin sensitivity` or a pattern, and its range:
-        0.2, a share of its value, or LEAST:LARGEST"""
+        0.2, a share of its value, or LEAST:LARGEST; RANGE,tied is one for all of a pattern"""
     add_options(uncertain, vary, type=_range, required=True)
     add_output_file(uncertain, "save A, B1 .. D22 and the blocks: .npz, .mat or .json")
 
 
 def _range(text: str) -> tuple[str, Any]:
     name, _, value = text.rpartition("=")
-    ends = value.split(":")
+    tied = value.endswith(",tied")
+    ends = value.removesuffix(",tied").split(":")
     if not name or len(ends) > 2:
         raise argparse.ArgumentTypeError(f"'{text}' is not NAME=SHARE or NAME=LEAST:LARGEST")
-    return name, tuple(map(number, ends)) if ends[1:] else number(value)
+    found = tuple(map(number, ends)) if ends[1:] else number(ends[0])
+    return name, {"range": found, "tied": True} if tied else found
 
 
 def _analyze(arguments: argparse.Namespace) -> int:
@@ -118,6 +120,7 @@ def _analyze(arguments: argparse.Namespace) -> int:
 
 
 def _modes(arguments: argparse.Namespace) -> int:
+    from fflin.analysis.effective_masses import effective_masses
     from fflin.analysis.modes import modes
 
     check_figure(arguments.plot)
@@ -128,6 +131,8 @@ def _modes(arguments: argparse.Namespace) -> int:
     robot, lin = linear_model(arguments)
     found = modes(lin)
     print(found)
+    if any(robot.stiffness.values()):
+        print(f"\n{effective_masses(lin)}")
     if robot.orbit and not found.equilibrium:
         print("\nequilibria in orbit: --equilibrium, --relative-equilibrium")
     draw(arguments.plot, "plot_modes", found)

@@ -40,11 +40,21 @@ def count_of(text: str) -> int:
     return count
 
 
-def file_name(text: str) -> Path:
-    """Read the name of a file."""
+def input_file(text: str) -> Path:
+    """Read the name of a file that the command reads."""
     if not text:
         raise argparse.ArgumentTypeError("the name of the file is empty")
     return Path(text)
+
+
+def input_name(text: str) -> str:
+    """Read the name of a file that the command reads, or of what is bundled."""
+    return text
+
+
+def output_file(text: str) -> Path:
+    """Read the name of a file that the command writes."""
+    return input_file(text)
 
 
 def assignment(text: str) -> tuple[str, float]:
@@ -74,7 +84,8 @@ def lock(text: str) -> tuple[str, float | None]:
 
 
 _READ: dict[str, Callable[[str], Any]] = {
-    **dict.fromkeys(("FILE", "FILE.npz"), file_name),
+    **dict.fromkeys(("FILE", "FILE.npz"), input_file),
+    **{"FILE.toml": input_name, ">FILE": output_file},
     **dict.fromkeys(("T", "H", "P", "X", "FPS", "SPEED"), number),
     **{"N": count_of, "S": whole, "K": whole, "[NAME=]VALUE": passive, "NAME[=VALUE]": lock},
     "ALTITUDE[:BODY]": orbit,
@@ -96,17 +107,27 @@ def command(
         description=f"{summary[0].upper()}{summary[1:]}.",
         epilog=f"example: {example}",
     )
-    command.set_defaults(run=run)
+    command.set_defaults(run=run, command=command)
     return command
+
+
+def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[Path]]:
+    """Return the files that the arguments have a command read, and those that it is to write."""
+    given: dict[Any, list[Path]] = {input_file: [], input_name: [], output_file: []}
+    for action in arguments.command._actions:
+        value = getattr(arguments, action.dest, None)
+        if action.type in given and value is not None:
+            given[action.type] += map(Path, value if isinstance(value, list) else [value])
+    return given[input_file] + given[input_name], given[output_file]
 
 
 def add_options(group: Container, text: str, **more: Any) -> None:
     """Add options, each a line ``--name METAVAR: help`` and those that go on with it.
 
     A metavar in _READ says how the value is read, one such as a|b what it may be, X,Y numbers;
-    behind it stand ``*`` where the option is repeatable, ``!`` where it is required, or
-    ``= default``. Without one it is a switch, ``--[no-]x`` of both ways. What holds of all is in
-    `more`.
+    FILE is read and >FILE written. Behind it stand ``*`` where the option is repeatable, ``!``
+    where it is required, or ``= default``. Without one it is a switch, ``--[no-]x`` of both ways.
+    What holds of all is in `more`.
     """
     for line in re.split(r"\n\s*(?=--)", text.strip()):
         found = _OPTION.fullmatch(" ".join(line.split()))
@@ -121,7 +142,8 @@ def add_options(group: Container, text: str, **more: Any) -> None:
             options |= {"metavar": (each := tuple(metavar.split(","))), "nargs": len(each)}
             options["type"] = number
         else:
-            options = {"metavar": metavar, "type": _READ.get(metavar, str)} | options
+            kind = _READ.get(metavar, str)
+            options = {"metavar": metavar.lstrip(">"), "type": kind} | options
         if many == "*":
             options |= {"action": "append", "default": []}
         if many == "!":
@@ -134,7 +156,7 @@ def add_options(group: Container, text: str, **more: Any) -> None:
 def add_robot(command: argparse.ArgumentParser) -> None:
     """Add ROBOT and --lock."""
     what = "a name of `fflin robots`, or the path of a URDF or of a robot.toml"
-    command.add_argument("robot", metavar="ROBOT", help=what)
+    command.add_argument("robot", metavar="ROBOT", type=input_name, help=what)
     add_options(
         command,
         """
@@ -229,4 +251,4 @@ def add_system(command: Container, *, axes: bool = True) -> None:
 
 def add_output_file(command: Container, what: str) -> None:
     """Add -o FILE; `what` says which endings there are."""
-    command.add_argument("-o", "--output-file", metavar="FILE", type=file_name, help=what)
+    command.add_argument("-o", "--output-file", metavar="FILE", type=output_file, help=what)

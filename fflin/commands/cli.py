@@ -12,9 +12,11 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
-from fflin.base.errors import FflinError, FflinWarning
+from fflin.base.errors import FflinError, FflinWarning, one_line
 from fflin.base.version import __version__
+from fflin.base.writing import files_of_command
 from fflin.commands import BAD_INPUT, DONE
+from fflin.commands.arguments import files_of
 
 # The commands by task, as the help lists them, each with its module.
 TASKS = {
@@ -36,6 +38,12 @@ class _Parser(argparse.ArgumentParser):
         # What is a negative number and no option; by default -1e-3 is taken for one.
         self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        # argparse ignores that a help cannot be written.
+        if file is not None:
+            file.write(message)
+            file.flush()
+
     def error(self, message: str) -> NoReturn:
         _tell(f"fflin: error: {message} (see {self.prog} --help)")
         self.exit(BAD_INPUT)
@@ -48,29 +56,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     told: set[str] = set()  # each once, however many models a command makes
 
     def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
-        text = " ".join(str(message).split())
+        text = str(message)
         if issubclass(category, FflinWarning):
             if text not in told:
                 _tell(f"fflin: warning: {text}")
             told.add(text)
         else:
-            held.append(f"fflin: {category.__name__}: {text}")
+            held.append(f"fflin: {category.__name__}: {' '.join(text.split())}")
 
     warnings.showwarning = show
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Names may hold what the terminal cannot show.
         sys.stdout.reconfigure(errors="backslashreplace")
     argv = sys.argv[1:] if argv is None else argv
-    arguments = _parser(argv[0] if argv else "").parse_args(argv)
     try:
-        code: int = arguments.run(arguments)
+        arguments = _parser(argv[0] if argv else "").parse_args(argv)
+        with files_of_command(*files_of(arguments)):
+            code: int = arguments.run(arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
         for line in held:
             _tell(line)
         return code
     except (FflinError, FflinWarning) as error:  # a warning where Python is told to raise them
-        _tell(f"fflin: error: {' '.join(str(error).split())}")
+        _tell(f"fflin: error: {error}")
         return BAD_INPUT
     except BrokenPipeError:
         # The reader, such as head, has what it wanted; the interpreter must not complain either.
@@ -85,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _tell(line: str) -> None:
     """Write a line to stderr; the exit code tells enough where that cannot be written."""
     try:
-        print(line, file=sys.stderr, flush=True)
+        print(one_line(line), file=sys.stderr, flush=True)
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 

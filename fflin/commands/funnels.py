@@ -37,7 +37,7 @@ def add_commands(commands: of.Commands) -> None:
         funnel,
         f"""
         --schedule FILE: the gains, as tvlqr saves them; without it they are designed
-        --html FILE: write a page that plays the motion with the funnel as a tube
+        --html >FILE: write a page that plays the motion with the funnel as a tube
         --goal NAME=VALUE*: largest error at the end: {_KINDS}
         --within NAME=VALUE*: largest error on the way, as of --goal
         --limits urdf|none = urdf: what cuts the inputs: the limits of the robot (default), or none

@@ -9,7 +9,13 @@ from pathlib import Path
 
 from fflin.base.errors import FileError, InputError
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_options, add_output_file, command
+from fflin.commands.arguments import (
+    Commands,
+    add_options,
+    add_output_file,
+    command,
+    input_name,
+)
 
 
 def add_commands(commands: Commands) -> None:
@@ -19,7 +25,9 @@ def add_commands(commands: Commands) -> None:
         "write a robot.toml with what a URDF suggests: inputs, limits, joints without a motor",
         "fflin init my.urdf && fflin simulate my.toml",
     )
-    init.add_argument("robot", metavar="URDF", help="its path, or a name of `fflin robots`")
+    init.add_argument(
+        "robot", metavar="URDF", type=input_name, help="its path, or a name of `fflin robots`"
+    )
     add_output_file(init, "where to; by default the URDF's name with .toml, in this folder")
     add_options(init, "--force: write over a file that is there")
 

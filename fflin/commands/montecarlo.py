@@ -7,14 +7,14 @@ import json
 from typing import Any
 
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_options, add_output_file, command, file_name
+from fflin.commands.arguments import Commands, add_options, add_output_file, command, input_file
 from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
 from fflin.commands.sweeps import executor_of, going_on
 from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 
 _ROWS = 240  # at which errors and inputs are kept for a figure
-_OUTPUTS = ("output_file", "plot", "html", "png", "gif")
+_PICTURES = ("html", "png", "gif")
 _PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
 
 
@@ -30,7 +30,7 @@ def add_commands(commands: Commands) -> None:
     montecarlo.add_argument(
         "dispersions",
         metavar="DISPERSIONS",
-        type=file_name,
+        type=input_file,
         help="what is drawn at random, a table [dispersions] in TOML as fflin.load_dispersions "
         "reads it",
     )
@@ -55,7 +55,7 @@ def add_commands(commands: Commands) -> None:
             and draw its bounds
         --worst K = 3: say the K worst runs; 3 by default
         --json: print the figures as JSON
-        --plot FILE: draw bands over time, histograms and the worst runs into FILE: .png, .pdf or
+        --plot >FILE: draw bands over time, histograms and the worst runs into FILE: .png, .pdf or
             .svg""",
     )
     add_output_file(
@@ -63,11 +63,11 @@ def add_commands(commands: Commands) -> None:
         "save the runs to FILE: .h5 (HDF5) or .npz; it grows as FILE.part, and the same command "
         "goes on from what is there",
     )
+    add_options(shown, "--force: replace a file of -o that holds anything but these runs")
     add_pictures(shown, "that plays the worst run, with the paths of others as thin lines")
 
 
 def _montecarlo(arguments: argparse.Namespace) -> int:
-    from fflin.base.writing import check_distinct
     from fflin.batch.store import output_path
     from fflin.campaign.dispersion_files import load_dispersions
     from fflin.campaign.monte_carlo import monte_carlo
@@ -75,7 +75,6 @@ def _montecarlo(arguments: argparse.Namespace) -> int:
     from fflin.campaign.report import campaign_record, worst_runs
 
     path = arguments.output_file
-    check_distinct(*(getattr(arguments, name) for name in _OUTPUTS))
     check_figure(arguments.plot)
     if path:
         output_path(path)
@@ -87,13 +86,14 @@ def _montecarlo(arguments: argparse.Namespace) -> int:
     options |= {"goals": arguments.goal, "histories": _ROWS if arguments.plot else 0}
     with executor_of(arguments) as executor, going_on(path, "runs") as progress:
         options |= {"executor": executor, "progress": progress, "out": path}
+        options["overwrite"] = arguments.force
         campaign = monte_carlo(robot, loop.policy, dispersions, **options)
     lines = [f"wrote {path}"] if path else []
     try:
         if arguments.plot:
             plot_campaign(campaign, arguments.plot)
             lines.append(f"wrote {arguments.plot}")
-        if any(getattr(arguments, name) for name in _OUTPUTS[2:]):
+        if any(getattr(arguments, name) for name in _PICTURES):
             worst = campaign.replay(campaign.worst(1)[0])
             lines += show_motion(robot, worst, arguments, campaign)
     finally:

@@ -50,7 +50,7 @@ def add_weights(command: Container) -> None:
             q_m.hinge_*
         --r NAME=W*: weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*
         --bryson NAME=VALUE*: largest acceptable value of a state, an input or a group: its weight
-            is 1/VALUE^2
+            is 1/VALUE^2, and those of the rule are scaled alike
         --dt H: design for inputs held over H [s]; the cost stays the continuous one
         --reduce: regulate the part that the inputs can hold where momentum is conserved
         --[no-]wheel-speeds: bring the speeds of reaction wheels back to the point's: by default
@@ -107,7 +107,11 @@ def _lqr(arguments: argparse.Namespace) -> int:
         from fflin.base.writing import check_place
 
         check_place(arguments.output_file, FORMATS)
+    from fflin.control.gain import one_sided
+
     gain = gain_of(regulated_part(lin, arguments), arguments)
+    if pulling := one_sided(gain):  # a simulation says how much of it is cut
+        warnings.warn(pulling, FflinWarning, stacklevel=2)
     if arguments.output_file:
         gain.save(arguments.output_file)
     print(gain)

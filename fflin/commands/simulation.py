@@ -36,7 +36,7 @@ def add_commands(commands: Commands) -> None:
     add_options(
         shown,
         """
-        --plot FILE: draw linear beside nonlinear into FILE: .png, .pdf or .svg
+        --plot >FILE: draw linear beside nonlinear into FILE: .png, .pdf or .svg
         --show NAME*: what --plot draws: a state or input, a group or a pattern, such as q_m,
             '*.hinge_*'""",
     )
@@ -45,12 +45,11 @@ def add_commands(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    from fflin.base.writing import check_distinct, check_place
+    from fflin.base.writing import check_place
     from fflin.simulation.motion import FORMATS
     from fflin.simulation.report import motion_report
 
     robot = load_robot(arguments)
-    check_distinct(*(getattr(arguments, name) for name in _OUTPUTS))
     if arguments.output_file:
         check_place(arguments.output_file, FORMATS)
     check_figure(arguments.plot)

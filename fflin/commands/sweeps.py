@@ -212,9 +212,9 @@ def _given(path: Path) -> dict[str, Array]:
 
     import numpy as np
 
-    from fflin.base.writing import read_input, reason
+    from fflin.base.writing import read_file, reason
 
-    content = io.BytesIO(read_input(path, ".npz"))
+    content = io.BytesIO(read_file(path, ".npz"))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of headers that damage makes look old

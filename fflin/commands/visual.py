@@ -48,10 +48,10 @@ def add_pictures(command: Container, page: str = "that plays it without a networ
     add_options(
         command,
         f"""
-        --html FILE: write a page {page}
-        --png FILE: write a picture (takes Chromium): a strip of four, or at the --times that are
+        --html >FILE: write a page {page}
+        --png >FILE: write a picture (takes Chromium): a strip of four, or at the --times that are
             given
-        --gif FILE: write an animated picture (takes Chromium)""",
+        --gif >FILE: write an animated picture (takes Chromium)""",
     )
     add_options(command, "--times T: when [s] pictures are taken", nargs="+")
     _add_scene(command)
@@ -75,7 +75,7 @@ def _add_scene(command: Container) -> None:
 
 def add_figure(command: Container, what: str) -> None:
     """Add --plot FILE."""
-    add_options(command, f"--plot FILE: {what} into FILE: .png, .pdf or .svg")
+    add_options(command, f"--plot >FILE: {what} into FILE: .png, .pdf or .svg")
 
 
 def check_figure(path: Path | None) -> None:

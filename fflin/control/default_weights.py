@@ -1,8 +1,8 @@
 """The weights that a regulator gets where none are given."""
 
 import math
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.linalg import eigh
@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 from fflin.analysis.mechanics import second_order, slopes
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array
-from fflin.control.riccati import half_size, solve
+from fflin.control.riccati import Solution, half_size, rates_of, solve
 from fflin.control.saturation import warn_beyond
 from fflin.linear.model import LinearModel
 
@@ -22,8 +22,23 @@ BANDWIDTH, _HELD = 0.2, 0.3
 # gyration, and a joint's [rad], [m], or this share of its travel.
 TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
-# So many times the loops of springs and gravity are slowed.
-_TRIALS = 8
+# So many times the loops of springs and gravity are slowed. One that needs this much more than the
+# least is slowed in vain.
+_TRIALS, _IN_VAIN = 8, 0.9
+
+# What grows is held by a loop of at least this fraction of its rate of growth. A slower one lets
+# light joints swing by radians.
+_OF_GROWTH = 0.4
+
+# The inputs count as reaching each mode by at least this fraction of what holds it at rest. A mode
+# that they reach less keeps its decay.
+_LEAST_REACH = 1e-3
+
+# A coordinate that inputs act on by no more, relative to what holds it, is one that none acts on.
+_IDLE = 1e-12
+
+# A mode of a smaller fraction of the decay at rest is named.
+_AS_SLOW = 0.9
 
 # So many times the bandwidth is sought at which damping counts.
 _PASSES = 4
@@ -38,6 +53,7 @@ class Weights(NamedTuple):
     R: Array
     rule: str
     bandwidth: float
+    terms: tuple[Array, Array]  # what the largest of each coordinate (m,) and input (nu,) costs
 
 
 class Pace(NamedTuple):
@@ -50,6 +66,9 @@ class Pace(NamedTuple):
 
 
 AT_A_POINT = Pace()
+
+
+_Costs: TypeAlias = Callable[[float], tuple[Array, Array]]
 
 
 class _Limit(NamedTuple):
@@ -112,11 +131,11 @@ def _of_inertia(
     ratios, T = eigh(reach, M)
     back = T.T @ M  # T^-1
     # The slowest is to have the bandwidth w.
-    cost, reach, ratios = cost * ratios[0], reach / ratios[0], ratios / ratios[0]
+    unit = ratios[0]
+    cost, reach, ratios = cost * unit, reach / unit, ratios / unit
     to_modes = back @ inverse
-    Q = np.zeros_like(lin.A)
-    Q[:m, :m] = to_modes.T @ (np.sqrt(ratios)[:, None] * to_modes)
-    Q = 0.5 * (Q + Q.T)
+    on_positions = to_modes.T @ (np.sqrt(ratios)[:, None] * to_modes)
+    on_positions = 0.5 * (on_positions + on_positions.T)
     # At w = 1, before anything slows it.
     stiffness = back.T @ (ratios[:, None] ** 0.75 * to_modes)
     gain = (S / cost).T @ np.linalg.solve(reach, stiffness)
@@ -128,23 +147,62 @@ def _of_inertia(
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
     motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta]
     taken = np.vstack((T, added[motors]))
+    use = _largest(gain, size, lin.state_names)
     limits = [
         _Limit(pace.bandwidth, ""),
         *_limits("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0),
-        *_limits("effort", _efforts(lin), _largest(gain, size, lin.state_names), 2.0),
+        *_limits("effort", _efforts(lin), use, 2.0),
     ]
+    limit, achieved = min(limits), ""
+    rate = slopes(lin)
+    loaded = rate[m:].any() or rate[:m, :m].any()
+    if loaded:
+        growth = float(rates_of(np.linalg.eigvals(lin.A), lin.dt).real.max())
+        limit = max(limit, _Limit(_OF_GROWTH * growth, f"what grows by {growth:.3g} 1/s"))
     if pace.hold or lin.dt:
         fastest = pace.held / ((pace.hold or lin.dt) * rates[-1])
-        limits.append(_Limit(float(fastest), "the time of the hold"))
-    limit = min(limits)
-    rate = slopes(lin)
-    if rate[m:].any() or rate[:m, :m].any():
-        limit = _slowed(lin, Q, cost, size, limit)
-    R = np.diag(h * cost / limit.bandwidth**4)
-    rule = _rule(lin, size, limit, pace.share * TURN) + (
-        "; damping is counted in" if (lin.M != M).any() else ""
+        limit = min(limit, _Limit(float(fastest), "the time of the hold"))
+    damped = (lin.M != M).any()
+    on_velocities = _on_velocities(lin, S, cost, D / unit, damped) if loaded else None
+
+    def costs(w: float) -> tuple[Array, Array]:
+        Q = np.zeros_like(lin.A)
+        Q[:m, :m] = h * on_positions
+        if on_velocities:
+            Q[m:, m:] = h * on_velocities(w)
+        return Q, np.diag(h * cost / w**4)
+
+    if loaded:
+        driven = (S**2 / cost).sum(axis=1) > _IDLE * D / unit
+        limit, achieved = _slowed(lin, costs, size, size * driven, limit)
+    rule = _rule(lin, size, limit, achieved, pace.share * TURN) + (
+        "; damping is counted in" if damped else ""
     )
-    return Weights(h * Q, R, rule, limit.bandwidth)
+    terms = h * on_positions.diagonal() * size**2, h * cost * use**2
+    return Weights(*costs(limit.bandwidth), rule, limit.bandwidth, terms)
+
+
+def _on_velocities(
+    lin: LinearModel, S: Array, cost: Array, least: Array, damped: bool
+) -> Callable[[float], Array]:
+    """Return the weight (m, m) on velocities of (10.8), for a bandwidth."""
+    m, X = len(lin.M), slopes(lin)
+    size = np.sqrt(least)
+    values, directions = np.linalg.eigh((S / cost) @ S.T / np.outer(size, size))
+    root = size[:, None] * directions * np.sqrt(values.clip(_LEAST_REACH))
+    L = np.linalg.solve(lin.M, root)
+    F, H = np.linalg.solve(L, X[m:, :m] @ X[:m, m:] @ L), np.linalg.solve(L, X[m:, m:] @ L)
+    _, stiffness, modes = np.linalg.svd(F)
+    own, back = H.T @ H * damped, np.linalg.inv(L)
+
+    def at(w: float) -> Array:
+        part = 2.0 * w**2 * (1.0 - w**2 / (stiffness + np.hypot(stiffness, w**2)))
+        values, directions = np.linalg.eigh((modes.T * part) @ modes - own)
+        rows = directions.T @ back
+        weight = (rows.T * values.clip(0.0)) @ rows / w**4
+        return 0.5 * (weight + weight.T)
+
+    return at
 
 
 def displacements(lin: LinearModel, share: float) -> Array:
@@ -188,7 +246,7 @@ def _largest(K: Array, size: Array, names: tuple[str, ...]) -> Array:
 def _reach(S: Array, cost: Array, D: Array) -> Array:
     """Return S R^-1 S' (m, m), and D where no input acts."""
     reach = (S / cost) @ S.T
-    idle = reach.diagonal() <= 1e-12 * D
+    idle = reach.diagonal() <= _IDLE * D
     reach[idle, idle] = D[idle]
     if np.linalg.eigvalsh(reach / np.sqrt(np.outer(D, D)))[0] < 1e-9:
         reach += np.diag(D)
@@ -229,29 +287,75 @@ def _efforts(lin: LinearModel) -> dict[str, float]:
     return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
 
 
-def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit) -> _Limit:
-    """Return the bandwidth at which a loop with springs or gravity keeps within the limits."""
+class _Trial(NamedTuple):
+    """A loop, by what its limits leave of its bandwidth, and what its inputs are asked for."""
+
+    limit: _Limit
+    left: float
+    solution: Solution
+    asked: Array
+
+
+def _slowed(
+    lin: LinearModel, costs: _Costs, size: Array, driven: Array, limit: _Limit
+) -> tuple[_Limit, str]:
+    """Slow a loop with springs or gravity until it keeps within the limits; say what it achieves.
+
+    What is displaced by `size` (m,) asks for efforts at first, what inputs drive by `driven` on its
+    way back too: a joint without a motor is where its spring or gravity leaves it.
+    """
+    trials = list[_Trial]()
     for _ in range(_TRIALS):
-        arguments = (lin.A, lin.B, Q, np.diag(cost / limit.bandwidth**4), None, lin.dt)
+        arguments = (lin.A, lin.B, *costs(limit.bandwidth), None, lin.dt)
         try:
-            solution: Any = half_size(*arguments) or solve(*arguments)
+            solution = half_size(*arguments) or solve(*arguments)
         except np.linalg.LinAlgError:
-            break  # which the regulator tells with the reason
-        use = _largest(solution.K, size, lin.state_names)
-        share, what = min(_limits("effort", _efforts(lin), use, 2.0), default=_Limit(1.0, ""))
-        if share >= 1.0 - 1e-6:
-            return limit
+            break
+        use = np.maximum(
+            _largest(solution.K, size, lin.state_names), _on_the_way(lin, solution, driven)
+        )
+        left, what = min(_limits("effort", _efforts(lin), use, 2.0), default=_Limit(1.0, ""))
+        trials.append(_Trial(limit, left, solution, np.abs(lin.u0) + use))
+        if left >= 1.0 - 1e-6:
+            return limit, _achieved(lin, solution, limit.bandwidth)
         # What springs and gravity ask for stays however slow the loop.
-        limit = _Limit(max(share, 0.3) * limit.bandwidth, what)
-        asked = np.abs(lin.u0) + use
-    else:
-        high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
-        where = "at the displacements of the default weights"
-        warn_beyond(lin.robot, where, lin.input_names, lin.input_units, asked[None], -high, high)
-    return limit._replace(what=f"{limit.what}{_NOT_ENOUGH}")
+        limit = _Limit(min(max(left, 0.3), 0.8) * limit.bandwidth, what)
+    if not trials:
+        return limit, ""  # the regulator raises with the reason
+    most = max(trial.left for trial in trials)
+    limit, _, solution, asked = next(x for x in trials if x.left >= _IN_VAIN * most)
+    high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
+    where = "at the displacements of the default weights"
+    warn_beyond(lin.robot, where, lin.input_names, lin.input_units, asked[None], -high, high)
+    limit = limit._replace(what=f"{limit.what or trials[-1].limit.what}{_NOT_ENOUGH}")
+    return limit, _achieved(lin, solution, limit.bandwidth)
 
 
-def _rule(lin: LinearModel, size: Array, limit: _Limit, turn: float) -> str:
+def _on_the_way(lin: LinearModel, solution: Solution, size: Array) -> Array:
+    """Return the largest inputs (nu,) on the way back from displacements (m,)."""
+    poles, modes = np.linalg.eig(lin.A - lin.B @ solution.K)
+    rates = rates_of(poles, lin.dt)
+    time = np.geomspace(0.1 / np.abs(rates).max(), 3.0 / np.abs(rates).min(), 60)
+    passing = (solution.K @ modes) * np.exp(rates * time[:, None])[:, None]
+    way = (passing @ np.linalg.inv(modes)[:, : len(size)]).real
+    return _largest(way, size, lin.state_names).max(axis=0)
+
+
+def _achieved(lin: LinearModel, solution: Solution, bandwidth: float) -> str:
+    """Say how fast a loop decays, and which of its modes are slower than at rest."""
+    m, (poles, modes) = len(lin.M), np.linalg.eig(lin.A - lin.B @ solution.K)
+    rates = rates_of(poles, lin.dt)
+    decay, fast = -rates.real, np.abs(rates)
+    said = f"decay {decay.min():.3g} 1/s and damping {(decay / fast).min():.2g} at least"
+    slow = np.flatnonzero(decay < _AS_SLOW * math.sqrt(0.5) * bandwidth)
+    large = np.abs(modes[:m, slow]) * np.sqrt(lin.M.diagonal())[:, None]
+    among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
+    if names := [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]:
+        said += f", slower than at rest: {listed(names)}"
+    return f"at {fast.min():.3g} rad/s or faster, {said}"
+
+
+def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: float) -> str:
     groups = [name.partition(".")[0] for name in lin.state_names[: len(size)]]
     base = [f"{turn:g} deg"] * ("q_b" in groups)
     if "r_b" in groups:
@@ -268,7 +372,5 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, turn: float) -> str:
     slow = f", set by {limit.what}" if limit.what else ""
     if beyond := [name for name, room in _efforts(lin).items() if room <= 0.0]:
         slow += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
-    return (
-        f"from {source}: {', '.join(from_where)} come back at {limit.bandwidth:.3g} rad/s or "
-        f"faster{slow}"
-    )
+    pace = achieved or f"at {limit.bandwidth:.3g} rad/s or faster"
+    return f"from {source}: {', '.join(from_where)} come back {pace}{slow}"

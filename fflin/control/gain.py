@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from fflin.analysis.wheels import picked
+from fflin.base.errors import listed
+from fflin.base.names import group_of, input_keys
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import grid, matrix, width
 from fflin.base.validation import Array
 from fflin.control.margins import Margins, input_margins
+from fflin.control.riccati import rates_of
 from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
@@ -110,7 +113,7 @@ class Gain(Design):
         more = {
             "not regulated": _unregulated(self),
             "weights": self.weights,
-            "warning": fragility(self),
+            "warning": "; ".join(filter(None, (fragility(self), one_sided(self)))),
         }
         parts = [
             fold(f"{head}, frame {self.frame}, {time}"),
@@ -198,6 +201,24 @@ def fragility(gain: Gain) -> str:
     )
 
 
+def one_sided(gain: Gain) -> str:
+    """Say which thrusters a gain lets pull; else nothing."""
+    thrusters = [
+        name
+        for key, name, row, at in zip(
+            input_keys(gain), gain.input_names, gain.K, gain.u0, strict=True
+        )
+        if group_of(key) == "thrust" and row.any() and at <= 0.0
+    ]
+    if not thrusters:
+        return ""
+    return (
+        f"the design lets thrusters pull ({listed(thrusters)}): thrust below zero is cut, so that "
+        "poles and margins do not hold; design with torque and force on the base, which "
+        "fflin.Allocation shares out among thrusters, as fflin simulate does (--allocate)"
+    )
+
+
 def _unregulated(gain: Gain) -> str:
     """Say which states are not fed back, and why."""
     left = [name for name in gain.state_names if gain.regulated and name not in gain.regulated]
@@ -237,7 +258,7 @@ def _poles(gain: Gain) -> str:
     poles: Any = gain.poles[gain.poles.imag >= 0.0]
     if gain.dt:
         order, heads = np.argsort(-np.abs(poles)), ["pole", "modulus", "frequency [rad/s]"]
-        rates = np.log(np.where(poles == 0.0, 1e-300, poles)) / gain.dt
+        rates = rates_of(poles, gain.dt)
         columns = [np.abs(poles), np.abs(rates.imag)]
     else:
         order, heads = np.argsort(-poles.real), ["pole [1/s]", "frequency [rad/s]", "damping"]
@@ -260,8 +281,11 @@ def _figures(gain: Gain) -> str:
     margins = gain.margins
     slowest = "1 - largest modulus" if gain.dt else "slowest decay [1/s]"
     low, high = margins.gain
+    rates = rates_of(gain.poles, gain.dt)
+    damping = float((-rates.real / np.abs(rates)).min())
     return (
-        f"Riccati residual {gain.residual:.1e} ({gain.method}); {slowest} {gain.margin:.5g}; "
+        f"Riccati residual {gain.residual:.1e} ({gain.method}); {slowest} {gain.margin:.5g}, least "
+        f"damping {damping:.2g}; "
         f"all inputs at once bear gains of {low:.3g} to {high:.3g} and {margins.phase:.3g} deg of "
         f"phase (disk margin {margins.disk:.3g})"
     )

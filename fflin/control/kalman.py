@@ -223,9 +223,9 @@ def kalman(
     W, V = S @ through @ noise @ through.T @ S.T, seen @ V @ seen.T
     W = 0.5 * W + 0.5 * W.T
     require_detectable(lin)
-    require_disturbed(lin, W)
     C = np.ascontiguousarray(lin.C)
     try:
+        require_disturbed(lin, W)
         solution = solve(lin.A.T.copy(), C.T.copy(), W, V, None, lin.dt)
     except np.linalg.LinAlgError as error:
         raise DetectabilityError(

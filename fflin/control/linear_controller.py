@@ -291,7 +291,7 @@ def growing(policy: Any) -> tuple[str, ...]:
         if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
             pole, unit = complex(poles[growth.argmax()]), "" if by.dt else " 1/s"
             said.append(f"the {what} is unstable, with a pole at {pole:.4g}{unit}")
-            poles = np.linalg.eigvals(replace(by, sign=-1.0).loop)
+            poles = np.linalg.eigvals(LinearController(by.system, by.lin, sign=-1.0).loop)
             if what == "linear loop" and ((np.abs(poles) < 1) if by.dt else (poles.real < 0)).all():
                 said[-1] += (
                     "; with the other sign it is stable: try sign=-1 (--negative-feedback), "

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fflin.analysis.mechanics import slopes
 from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.analysis.wheels import picked, regulated_part
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
@@ -54,7 +55,9 @@ def lqr(
     Without weights the regulator is one that the robot can bear: its slowest motion comes back at
     0.2 rad/s, or as much slower as the efforts and speeds of the URDF ask for where the base is
     turned by 30 deg and the joints by 0.3 rad; see (10.7) of docs/derivation.md. Every input
-    then bears 60 deg of phase, and any gain from a half up.
+    then bears 60 deg of phase, and any gain from a half up. With springs or gravity each mode that
+    the inputs reach keeps the decay that it has at rest (10.8); ``gain.weights`` has the
+    bandwidth, decay and damping of the loop, and names the modes that are slower.
 
     Of a model with reaction wheels what can be is regulated, and named in ``gain.regulated``:
     wheels' angles are ignorable, their speeds follow the body's rate where only they turn it, and
@@ -190,9 +193,11 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
         if solution.residual > _USELESS:
             raise np.linalg.LinAlgError("the weights are too badly scaled")
     except np.linalg.LinAlgError as error:
+        # The closed form is for double integrators alone.
+        forces = slopes(lin)[len(lin.M) - len(lin.A) :].any()
         raise StabilizabilityError(
             f"no stabilising solution of the Riccati equation was found: {error}; scale the "
-            "weights, with bryson, or use acceleration_lqr"
+            f"weights, with bryson{'' if forces else ', or use acceleration_lqr'}"
         ) from None
     if solution.residual > _COARSE:
         warnings.warn(

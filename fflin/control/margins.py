@@ -8,7 +8,7 @@ import numpy as np
 
 from fflin.base.validation import Array
 
-_ACCURACY = 1e-5
+ACCURACY = 1e-5
 
 _POINTS = 400
 
@@ -51,20 +51,28 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
     poles = np.linalg.eigvals(A)
     found = max((float(np.linalg.norm(D, 2)), math.inf), *map(gain, {0.0, *np.abs(poles).tolist()}))
     while True:
-        bound = found[0] * (1.0 + _ACCURACY)
-        inverse = np.linalg.inv(bound**2 * np.eye(D.shape[1]) - D.T @ D)
-        F = A + B @ inverse @ D.T @ C
-        spread = C.T @ (np.eye(len(D)) + D @ inverse @ D.T) @ C
-        crossings = np.linalg.eigvals(np.block([[F, B @ inverse @ B.T], [-spread, -F.T]]))
-        # The gain crosses the bound at eigenvalues on the imaginary axis; one too many in this list
-        # costs only another evaluation.
-        on_axis = np.abs(crossings.real) <= 1e-6 * np.abs(crossings)
+        bound = found[0] * (1.0 + ACCURACY)
+        crossings, on_axis = gain_crossings(A, B, C, D, bound)
         frequencies = np.sort(np.abs(crossings.imag[on_axis]))
         between = np.concatenate((frequencies, 0.5 * (frequencies[1:] + frequencies[:-1])))
         best = max(map(gain, between.tolist()), default=found)
         if best[0] <= bound:
             return max(found, best)
         found = best
+
+
+def gain_crossings(A: Array, B: Array, C: Array, D: Array, bound: float) -> tuple[Any, Any]:
+    """Return eigenvalues (.., 2 nx), and which are imaginary: there the gain crosses the bound.
+
+    One too many of these costs only another evaluation.
+    """
+    inverse = np.linalg.inv(bound**2 * np.eye(D.shape[1]) - D.T @ D)
+    F = A + B @ inverse @ D.T @ C
+    spread = C.T @ (np.eye(len(D)) + D @ inverse @ D.T) @ C
+    lower = np.concatenate((np.broadcast_to(-spread, F.shape), -F.mT), axis=-1)
+    upper = np.concatenate((F, B @ inverse @ B.mT), axis=-1)
+    crossings = np.linalg.eigvals(np.concatenate((upper, lower), axis=-2))
+    return crossings, np.abs(crossings.real) <= 1e-6 * np.abs(crossings)
 
 
 class Loop(NamedTuple):

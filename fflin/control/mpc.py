@@ -56,8 +56,8 @@ def mpc(
     pass their limits. States and outputs keep within theirs at the samples, as the linear model
     has it; where they cannot, they pass them by little, which the motion's `notes` say. Where no
     plan is found, the regulator acts, cut at the limits, and a warning says so. The quadratic
-    program (docs/mpc.md) is solved by DAQP (``pip install 'fflin[mpc]'``), which begins with the
-    limits that were active a sample before.
+    program (docs/guide/mpc.md) is solved by DAQP (``pip install 'fflin[mpc]'``), which begins with
+    the limits that were active a sample before.
 
     Parameters
     ----------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.base.errors import InputError, listed
+from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array, number, whole
 from fflin.control.saturation import saturation
@@ -27,6 +28,10 @@ from fflin.robot.robot import Robot
 
 # What may be missed of the goal and of limits of states in rad, m and s; what is sought of it.
 _REACHED, _ENDS = 1e-7, 1e-8
+
+# Between knots limits are exceeded by no more than this share of them, looked at so many times an
+# interval. Where they are, they are tightened at the knots beside, this often.
+_BETWEEN, _PARTS, _MOST_TIGHTER = 0.01, 16, 8
 
 # Intervals are flown as one motion where they miss each other by no more.
 _MEETS = 1e-10
@@ -63,13 +68,15 @@ def plan(
 ) -> Trajectory:
     r"""Plan a motion to a goal within limits: a slew from rest to rest, or the end of a tumble.
 
-    Of all inputs that stay within their limits, and keep joints and wheels within theirs at the
-    knots, those of a least :math:`\int u^T R\,u\;dt`: a local minimum, or as near to one as 50
-    iterations of sequential quadratic programming come, with the start of each interval a variable
-    of its own (multiple shooting). The linear models along the motion make the quadratic programs,
-    which PIQP solves (``pip install 'fflin[mpc]'``). The attitude may turn by any angle, and goes
-    round where the rates at both ends have it so; continuous joints take the shorter way. Between
-    knots the limits of joints are not seen: take knots near enough for them to hold.
+    Of all inputs that stay within their limits, and keep joints and wheels within theirs, those of
+    a least :math:`\int u^T R\,u\;dt`: a local minimum, or as near to one as 50 iterations of
+    sequential quadratic programming come, with the start of each interval a variable of its own
+    (multiple shooting). The linear models along the motion make the quadratic programs, which PIQP
+    solves (``pip install 'fflin[mpc]'``). The attitude may turn by any angle, and goes round where
+    the rates at both ends have it so; continuous joints take the shorter way.
+    Limits of joints and wheels hold at the knots. Between knots they hold to 1 %: where the
+    integrated motion exceeds one, the limit is tightened at the knots beside and the plan is made
+    again. A warning says if more than 1 % is left, and the printed trajectory states how much.
 
     Parameters
     ----------
@@ -155,18 +162,22 @@ def plan(
     left = {*shooting.wheels, *chosen("state", free, state.names)}
     asked = np.array([i not in left for i in range(state.nx)])
     bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in state.names]).T
-    room = partial(_room, shooting, end, bounds, asked)
+    size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
+    size[size == 0.0] = 1.0
     with np.errstate(all="ignore"):  # what leads nowhere may diverge, which is said
-        u = _sought(shooting, start, end, weights, np.array((low, high)), room)
-        q, v = shooting.flown(start, u)
+        sought = partial(_sought, shooting, start, end, weights, np.array((low, high)))
+        q, v, u, beyond = _kept_between(shooting, start, end, sought, bounds, size, asked)
         missed = np.abs(shooting.between((q[-1], v[-1]), end)) * asked
-        passed = _excess(room(q, v))
-    passed[-1, asked] = 0.0
-    passed = passed.max(axis=0)
+    largest = beyond.max(axis=(0, 1))
+    at_knots = beyond[:, ::_PARTS].max(axis=(0, 1))
+    passed = np.where(at_knots > _REACHED, at_knots, 0.0)
     if max(missed.max(), passed.max()) <= _REACHED:
         if asked.all():
             q[-1], v[-1] = end  # at rest, rounding would be all that a check sees
-        return Trajectory(robot, t, q, v, u, hold=hold)
+        note = _note(state, largest / size)
+        if (largest > _BETWEEN * size).any():
+            warnings.warn(f"{note}; give more knots or more time", FflinWarning, stacklevel=2)
+        return Trajectory(robot, t, q, v, u, hold=hold, _note=note)
     units = ["rad"] * 3 + [*state.units[3:]]
     by = [
         f"{words} {state.names[i]} by {far[i]:.2g} {units[i]}"
@@ -181,6 +192,46 @@ def plan(
     )
 
 
+def _note(state: StateMap, shares: Array) -> str:
+    """Say which limit of a state (nx,) the integrated motion exceeds most, as a fraction of it."""
+    i = int(shares.argmax())
+    most = "exceeds none"
+    if shares[i] > 0.0:
+        most = f"exceeds that of {state.names[i]} by {100.0 * shares[i]:.2g} %"
+    return f"limits of states: at {_PARTS} points an interval the integrated motion {most}"
+
+
+def _kept_between(
+    shooting: Shooting,
+    start: Point,
+    end: Point,
+    sought: Callable[..., Array],
+    bounds: Array,
+    size: Array,
+    asked: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """Return knots, inputs, and how far the motion is beyond limits at all points (2, .., nx).
+
+    Of all plans that reach the goal it is the one that exceeds limits between knots by the least.
+    """
+    within, known = np.repeat(bounds[:, None], len(shooting.t), axis=1), None
+    best, least = None, np.inf
+    for _ in range(_MOST_TIGHTER):
+        u = sought(partial(_room, shooting, end, within, asked), known)
+        fine = shooting.flown(start, u, _PARTS)
+        q, v = (each[::_PARTS] for each in fine)
+        beyond = _beyond(shooting.state, bounds, *fine)
+        most = float((beyond / size).max())
+        missed = float((np.abs(shooting.between((q[-1], v[-1]), end)) * asked).max())
+        if best is None or (missed <= _REACHED and most < least):
+            best, least = (q, v, u, beyond), most
+        known, within = (q, v, u), _tighter(within, beyond)
+        if most <= _BETWEEN or missed > _REACHED or (within[0] > within[1]).any():
+            break
+    assert best is not None
+    return best
+
+
 def _sought(
     shooting: Shooting,
     start: Point,
@@ -188,11 +239,15 @@ def _sought(
     R: Array,
     limits: Array,
     room: Callable[[Array, Array], Array],
+    known: tuple[Array, Array, Array] | None,
 ) -> Array:
-    """Return the inputs (N + 1, nu) of the least effort that lead to the end, or nearest to it."""
+    """Return the inputs (N + 1, nu) of the least effort that lead to the end, or nearest to it.
+
+    The search begins at the knots and inputs that are `known`, if any.
+    """
     # The Hessian is Gauss and Newton's, to which steps of the states add a cost that falls where
     # whole steps succeed (Levenberg and Marquardt).
-    q, v, u = shooting.guess(start, end)
+    q, v, u = known or shooting.guess(start, end)
     cost, u = _shares(shooting, R, u), np.clip(u, *limits)
     shooting.refine(q, v, u, _SEEKS)
     wheels = [*shooting.wheels, *(shooting.state.nx // 2 + i for i in shooting.wheels)]
@@ -292,13 +347,38 @@ def _shares(shooting: Shooting, R: Array, u: Array) -> Array:
 
 def _room(shooting: Shooting, end: Point, bounds: Array, asked: Array, q: Array, v: Array) -> Array:
     """Return how far knots may move (2, N + 1, nx) within the limits of the joints, to the end."""
-    state, n, nx = shooting.state, shooting.state.robot.n, shooting.state.nx
-    room = np.tile(np.array([[[-np.inf]], [[np.inf]]]), (1, len(q), nx))
-    room[:, 1:, 6 : 6 + n] = bounds[:, None, 6 : 6 + n] - state.joint_positions(q[1:])
-    room[:, 1:, nx - n :] = bounds[:, None, nx - n :] - state.velocities(v[1:])[:, 6:]
+    state = shooting.state
+    room = bounds - _limited(state, q, v)
+    room[0, 0], room[1, 0] = -np.inf, np.inf
     way = shooting.between((q[-1], v[-1]), end)
     room[:, -1, asked] = np.clip(way, *room[:, -1])[asked]
     return room
+
+
+def _limited(state: StateMap, q: Array, v: Array) -> Array:
+    """Return what limits are of (N, nx): places and rates of joints, zero for the base."""
+    n, values = state.robot.n, np.zeros((len(q), state.nx))
+    values[:, 6 : 6 + n] = state.joint_positions(q)
+    values[:, state.nx - n :] = state.velocities(v)[:, 6:]
+    return values
+
+
+def _beyond(state: StateMap, bounds: Array, q: Array, v: Array) -> Array:
+    """Return how far rows are below and above limits (2, N, nx), more than the first one is."""
+    values = _limited(state, q, v)
+    far = np.maximum(np.array((bounds[0] - values, values - bounds[1])), 0.0)
+    return np.maximum(far - far[:, :1], 0.0)
+
+
+def _tighter(within: Array, beyond: Array) -> Array:
+    """Return limits of knots (2, N + 1, nx), tighter beside intervals with rows beyond them."""
+    # The last knot is the goal's.
+    inside = beyond[:, 1:].reshape(2, within.shape[1] - 1, _PARTS, -1).max(axis=2)
+    beside = np.maximum(inside[:, :-1], inside[:, 1:])
+    tighter = within.copy()
+    tighter[0, 1:-1] += beside[0]
+    tighter[1, 1:-1] -= beside[1]
+    return tighter
 
 
 def _excess(room: Array) -> Array:

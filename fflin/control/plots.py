@@ -11,7 +11,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing, letters_of, logarithmic
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, number, refuse_masked
 from fflin.control.gain import Gain
 from fflin.control.margins import Loop, input_loops
 from fflin.linear.model import LinearModel
@@ -44,7 +44,7 @@ def plot_poles(
     >>> figure = fflin.plot_poles(fflin.lqr(lin), "poles.png")
     """
     dt = number("dt", dt)
-    sets = poles if isinstance(poles, dict) else {"": poles}
+    sets = poles if isinstance(poles, dict) and poles else {"": poles}
     found = {str(label): _poles_of(given) for label, given in sets.items()}
     dt = next((own for _, own in found.values() if own), dt)
     with drawing(path, 6.0, 5.0) as figure:
@@ -156,10 +156,15 @@ def _poles_of(given: Any) -> tuple[Any, float]:
         return np.linalg.eigvals(given.A), given.dt
     if hasattr(given, "poles"):
         return np.asarray(given.poles), float(getattr(given, "dt", 0.0))
+    refuse_masked("poles", given)
     try:
         poles = np.asarray(given)
     except ValueError:
         poles = np.asarray(None)  # its rows differ in length
-    if poles.dtype.kind not in "fiuc" or not np.isfinite(poles).all():
-        raise InputError(f"poles is a {type(given).__name__}, expected finite numbers or a Gain")
-    return poles.ravel(), 0.0
+    right = poles.dtype.kind in "fiuc" and poles.ndim == 1 and poles.size
+    if not right or not np.isfinite(poles).all():
+        raise InputError(
+            f"poles is a {type(given).__name__} of shape {poles.shape}, expected several finite "
+            "numbers (k,), a Gain, a LinearModel or {label: poles}"
+        )
+    return poles, 0.0

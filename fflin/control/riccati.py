@@ -40,6 +40,11 @@ class Solution(NamedTuple):
         return poles, float(1.0 - np.abs(poles).max() if dt else -poles.real.max())
 
 
+def rates_of(poles: Any, dt: float) -> Any:
+    """Return poles [1/s] of a continuous system, or of the one that samples of dt [s] show."""
+    return np.log(np.where(poles == 0.0, 1e-300, poles) + 0j) / dt if dt else poles
+
+
 class _Trial(NamedTuple):
     P: Array
     defect: Array

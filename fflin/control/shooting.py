@@ -11,7 +11,7 @@ from fflin.linear.flow import Flow
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
 
-_MOST_STEPS = 128
+_FEWEST_STEPS, _MOST_STEPS = 4, 128
 
 Point = tuple[Array, Array]
 
@@ -23,7 +23,8 @@ class Shooting:
     # axes, those of the linear models with the rotation vector for twice q_b.
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
-        self.state, self.t, self.held, self.steps = StateMap(robot, frame="local"), t, held, 4
+        self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
+        self.steps = _FEWEST_STEPS
         # Of one engine, so that a plan is the same to the last bit whatever ran before.
         self._linearizer = Linearizer(robot, moving=True, engine="python")
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
@@ -52,16 +53,20 @@ class Shooting:
             [self.between(knot, flow.end(k, self.steps, q[k], v[k])) for k, knot in knots]
         )
 
-    def flown(self, start: Point, u: Array) -> Point:
-        """Return the knots q and v (N + 1, ...) of the motion from a point under inputs."""
-        q, v = (np.tile(each, (len(self.t), 1)) for each in start)
-        flow = self._flow(q, v, u)
-        for k in range(len(q) - 1):
-            q[k + 1], v[k + 1] = flow.end(k, self.steps, q[k], v[k])
+    def flown(self, start: Point, u: Array, parts: int = 1) -> Point:
+        """Return q and v of the motion from a point under inputs, so many rows an interval."""
+        rows, steps = parts * (len(self.t) - 1), max(1, self.steps // parts)
+        q, v = (np.tile(each, (rows + 1, 1)) for each in start)
+        flow = self._flow(q[::parts], v[::parts], u)
+        for row in range(rows):
+            k, part = divmod(row, parts)
+            over = (part / parts, (part + 1) / parts)
+            q[row + 1], v[row + 1] = flow.end(k, steps, q[row], v[row], over)
         return q, v
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
         """Take so many steps that the ends of the intervals are this accurate in rad, m and s."""
+        self.steps = _FEWEST_STEPS
         missed = self.missed(q, v, u)
         while self.steps < _MOST_STEPS:
             self.steps *= 2

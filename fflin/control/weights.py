@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from fflin.analysis.gramians import held_cost
 from fflin.base.errors import InputError
 from fflin.base.names import by_name, input_keys, matching
-from fflin.base.validation import Array, dimension, number, vector
+from fflin.base.validation import Array, dimension, instance, number, vector
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 
@@ -19,14 +19,14 @@ Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 _ROUNDING = 1e-9
 
 
-def bryson(lin: LinearModel, largest: Mapping[str, float]) -> Array:
+def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) -> Array:
     r"""Return the diagonal of a weight by Bryson's rule, :math:`1/\text{largest}^2` each.
 
     A deviation as large as is acceptable then costs 1, whatever its unit.
 
     Parameters
     ----------
-    lin : LinearModel
+    lin : LinearModel or LinearTrajectory
     largest : mapping
         {name: largest acceptable value}, of states or of inputs. A name is one of
         ``lin.state_names`` or ``lin.input_names``, or that of a group such as ``q_b``, ``r_b``,
@@ -44,7 +44,7 @@ def bryson(lin: LinearModel, largest: Mapping[str, float]) -> Array:
     UnknownNameError
         If there is no such name.
     InputError
-        If a value is not positive, or states and inputs are named together.
+        If `lin` is no model, a value is not positive, or states and inputs are named together.
 
     References
     ----------
@@ -58,8 +58,7 @@ def bryson(lin: LinearModel, largest: Mapping[str, float]) -> Array:
     >>> fflin.lqr(lin, Q, R).K.shape
     (9, 18)
     """
-    if not (hasattr(lin, "state_names") and hasattr(lin, "input_names")):
-        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    instance("lin", lin, LinearModel | LinearTrajectory, "a LinearModel or a LinearTrajectory")
     if not isinstance(largest, Mapping) or not largest:
         raise InputError(f"largest is {largest!r}, expected {{name: largest acceptable value}}")
     sides = {name: is_input("state or input", name, lin) for name in largest}
@@ -77,7 +76,7 @@ def bryson(lin: LinearModel, largest: Mapping[str, float]) -> Array:
     return _diagonal("largest", values, names, complete=of_inputs)
 
 
-def is_input(kind: str, key: str, lin: LinearModel) -> bool:
+def is_input(kind: str, key: str, lin: Any) -> bool:
     """Whether a name, group or pattern is of inputs and not of states."""
     found = matching(kind, key, (*lin.state_names, *input_keys(lin)))
     sides = {index >= len(lin.state_names) for index in found}

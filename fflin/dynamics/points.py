@@ -16,6 +16,8 @@ from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import by_joint
 from fflin.robot.robot import Robot
 
+LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
+
 
 def configuration(
     robot: Robot, joints: Mapping[str, float] | None = None, base: pin.SE3 | None = None
@@ -61,6 +63,15 @@ def configuration(
         robot.joint(name).place(q, value)
     robot.follow(q)
     return robot.checked_configuration(q)
+
+
+def require_slow(what: str, v: Array) -> None:
+    """Raise `InputError` if the square of a velocity overflows."""
+    if not np.abs(v).max(initial=0.0) < LARGEST_SPEED:
+        raise InputError(
+            f"{what} has an entry of {np.abs(v).max():.3g}, expected less than {LARGEST_SPEED:g} "
+            "[rad/s|m/s]"
+        )
 
 
 def start_of(robot: Robot) -> tuple[Array, Array]:

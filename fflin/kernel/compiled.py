@@ -6,7 +6,9 @@ import logging
 import math
 import os
 import sys
-from functools import cache
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,6 +35,9 @@ _QUOTAS = (
 
 ENGINES = ("python", "compiled")
 
+# Wait for another process's compilation for so long [s] before saying so, and at most.
+_SILENCE, _LONGEST_WAIT = 2.0, 600.0
+
 _log = logging.getLogger("fflin")
 _TURN = Lock()
 _FOUND: set[str] = set()  # what was found on disk once
@@ -55,14 +60,14 @@ def available_cores() -> int:
 
 def pays(count: int) -> bool:
     """Whether the kernel is there and beats the loop over so many points."""
-    if "numba" in sys.modules:
-        return count >= _BREAK_EVEN
-    return count >= _BREAK_EVEN_UNLOADED and find_spec("numba") is not None
+    if not numba_is_there():
+        return False
+    return count >= (_BREAK_EVEN if "numba" in sys.modules else _BREAK_EVEN_UNLOADED)
 
 
 def numba_is_there() -> bool:
     """Whether the kernel can be compiled."""
-    return "numba" in sys.modules or find_spec("numba") is not None
+    return find_spec("numba") is not None
 
 
 def loop_pays(steps: int, name: str = "advance") -> bool:
@@ -99,12 +104,47 @@ def kernel(module: str, name: str, what: str = "the batch kernel") -> Any:
 def _prepared(module: str, name: str, what: str) -> Any:
     compiled = getattr(import_module(f"fflin.kernel.{module}"), name)
     folder = Path(compiled.stats.cache_path)
-    kept = _kept(folder, module, name)
-    for entry in set(folder.glob(f"{module}.{name}-*.nbi")) - set(kept):
-        entry.unlink(missing_ok=True)
-    if not kept:
-        _log.warning("fflin: compiling %s, once; it is kept in %s", what, folder)
+    with _between_processes(folder / f"{module}.{name}.lock"):
+        older = set(folder.glob(f"{module}.{name}-*.nbi")) - set(_kept(folder, module, name))
+        for entry in older:
+            entry.unlink(missing_ok=True)
+    compiled.compile = partial(_compile_alone, compiled.compile, folder, module, name, what)
     return compiled
+
+
+def _compile_alone(
+    compile: Callable[[Any], Any], folder: Path, module: str, name: str, what: str, signature: Any
+) -> Any:
+    """Compile for a signature, or load the code that another process has compiled meanwhile."""
+    with _between_processes(folder / f"{module}.{name}.lock"):
+        if not _kept(folder, module, name):
+            _log.warning("fflin: compiling %s, once; it is kept in %s", what, folder)
+        return compile(signature)
+
+
+@contextmanager
+def _between_processes(path: Path) -> Iterator[None]:
+    """Hold the lock of a function's machine code; the system frees it if the process dies.
+
+    Without the package, in a folder that cannot be written, or after a long wait it goes on without
+    the lock: at worst two processes compile the same.
+    """
+    try:
+        from filelock import FileLock, Timeout
+    except ImportError:
+        yield
+        return
+    lock = FileLock(path)
+    with suppress(OSError, NotImplementedError):  # `Timeout` is an OSError too
+        try:
+            lock.acquire(timeout=_SILENCE)
+        except Timeout:
+            _log.warning("fflin: waiting for another process that compiles in %s", path.parent)
+            lock.acquire(timeout=_LONGEST_WAIT)
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _kept_somewhere(module: str, name: str) -> bool:

@@ -92,7 +92,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     .. math:: A' = (T A + \dot T)\,T^+ + \ldots, \qquad B' = T B\,T_u^{-1}
 
     with what comes of inputs held in other axes and of the length of a quaternion: (15.1) to
-    (15.6) of docs/derivation.md. docs/tools.md has the conventions side by side.
+    (15.6) of docs/derivation.md. docs/guide/tools.md has the conventions side by side.
 
     Parameters
     ----------

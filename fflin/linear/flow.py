@@ -47,26 +47,25 @@ class Flow:
 
     def missed(self, intervals: Iterable[int]) -> Array:
         """Return how far the ends of some intervals are from the next knots."""
-        # An observer who flies along with the base's mean velocity takes the rates (Galilei), and
+        # An observer who flies along with the base's median velocity takes the rates (Galilei), and
         # each rotor counts for itself: neither an orbit nor a fast wheel hides anything.
         t, u, state = self._t, self._u, self._aba.state
         rotations, q, v = rotation_matrices(self._q[:, 3:7]), self._q.copy(), self._v.copy()
         velocities = (rotations @ v[:, :3, None])[..., 0]
-        mean = velocities.mean(axis=0)
-        flown = np.outer(t - t[0], mean)
+        usual = np.median(velocities, axis=0)
+        flown = np.outer(t - t[0], usual)
         farthest = float(np.abs(q[:, 7:]).max(initial=1.0))
         digits = np.full(v.shape[1], _OF_PLACES * farthest)
         digits[:3] = _OF_PLACES * max(float(np.abs(x).max()) for x in (q[:, :3], flown, velocities))
         q[:, :3] -= q[0, :3] + flown
-        v[:, :3] -= mean @ rotations
+        v[:, :3] -= usual @ rotations
         knots = list(zip(q, v, u, strict=True))
-        sums = np.max([state.spread(self._aba.terms(*each)) for each in knots], axis=0)
+        sums = _largest([state.spread(self._aba.terms(*each)) for each in knots])
         rotors = rotor_names(state.robot)
         alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
         others = sorted({*range(6, len(digits))} - {*alone})
         groups = [[0, 1, 2], [3, 4, 5], *([each] for each in alone), *([others] if others else [])]
-        speed, rates = np.abs(v).max(axis=0), [self.rate(*each) for each in knots]
-        push = np.abs(rates).max(axis=0)
+        speed, push = np.abs(v).max(axis=0), _largest([self.rate(*each) for each in knots])
         for group in groups:
             speed[group], push[group] = (x[group].max() or 1.0 for x in (speed, push))
 
@@ -85,7 +84,8 @@ class Flow:
                     before, steps = end, 2 * steps
                     end = self.end(k, steps, q[k], v[k])
                     apart = pin.difference(self._model, before[0], end[0])
-                    if size(apart, end[1] - before[1], h) <= _ACCURACY:
+                    change = size(apart, end[1] - before[1], h)
+                    if change <= _ACCURACY or not np.isfinite(change):
                         break
                 apart = pin.difference(self._model, end[0], q[k + 1])
                 found.append(size(apart, v[k + 1] - end[1], h))
@@ -149,6 +149,13 @@ class Flow:
             _cubic(np.zeros_like(way), way, h * v[:-1], h * slopes),
             _cubic(v[:-1], v[1:], h * begin[:-1], h * end),
         )
+
+
+def _largest(rows: list[Array]) -> Array:
+    """Return the largest magnitudes (nv,) of rows; a row that overflows counts nothing."""
+    sizes = np.abs(rows)
+    largest: Array = np.where(sizes < np.inf, sizes, 0.0).max(axis=0)
+    return largest
 
 
 def placed(t: Array, time: float) -> tuple[int, float]:

@@ -186,7 +186,8 @@ def linearize_trajectory(
     Warns
     -----
     FflinWarning
-        Of knots that are no motion of the robot: when, by how much, and what would mend it.
+        Of knots that are no motion of the robot: where they miss it most, by how much, and what
+        the usual causes are.
 
     Examples
     --------
@@ -215,4 +216,6 @@ def along(motion: Trajectory) -> LinearTrajectory:
     values = motion._given | {name: np.array([getattr(x, name) for x in models]) for name in "ABCD"}
     names = ("state_names", "input_names", "output_names")
     values |= {name: getattr(models[0], name) for name in names}
-    return LinearTrajectory(**values, y=np.array([lin.y0 for lin in models]))
+    made = LinearTrajectory(**values, y=np.array([lin.y0 for lin in models]))
+    object.__setattr__(made, "flow", motion.flow)  # what it has found of the same motion
+    return made

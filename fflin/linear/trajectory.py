@@ -19,10 +19,21 @@ from fflin.base.validation import Array, as_double, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import refuse_orbit
+from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
-from fflin.linear.trajectory_doubt import doubt
 from fflin.robot.robot import Robot
+
+# The largest residual of a motion of the robot.
+_MOTION = 1e-2
+
+# Between two knots the base goes the shorter way, of less than half a turn [rad].
+_FARTHEST_TURN = 2.5
+
+_CAUSES = (
+    "usual causes: hold, the axes (frame) of u or v, units of t or of joints, and the robot's "
+    "springs, damping and gravity"
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,6 +87,7 @@ class Trajectory(Design):
     u: Array
     hold: str | None = field(default=None, kw_only=True)
     frame: str = field(default="local", kw_only=True)
+    _note: str = field(default="", kw_only=True)  # what is printed below it; no file has it
 
     def __post_init__(self) -> None:
         refuse_orbit(self.robot, "trajectories")
@@ -106,6 +118,7 @@ class Trajectory(Design):
             try:
                 rows["q"].append(robot.checked_configuration(row[0]))
                 rows["v"].append(robot.checked_velocity(row[1]))
+                require_slow("v", rows["v"][-1])
                 rows["u"].append(vector("u", row[2], nu, "the robot's inputs"))
             except FflinError as error:
                 raise InputError(f"at t = {t:g} s: {error}") from None
@@ -124,8 +137,9 @@ class Trajectory(Design):
 
     def __str__(self) -> str:
         """Show how good a motion of the robot it is."""
-        said = doubt(self) or f"residual {self.residual.max():.1e}"
-        return f"{folded(super().__str__().splitlines())}\n{folded([said])}"
+        said = self._fault or f"residual {self.residual.max():.1e}"
+        note = f"\n{folded([self._note])}" if self._note else ""
+        return f"{folded(super().__str__().splitlines())}\n{folded([said])}{note}"
 
     @property
     def _state(self) -> StateMap:
@@ -190,15 +204,43 @@ class Trajectory(Design):
         return times
 
     def require(self, *, strict: bool = False) -> None:
-        """Warn of knots that are no motion of the robot to 1e-2, or refuse them where `strict`.
+        """Warn of knots that are no motion of the robot to 1e-2, or refuse them if `strict`.
 
-        It is said when they miss it and by how much, and what would mend it.
+        The message says which interval misses the motion most, by how much, and how many do. A
+        motion that overflows is refused in any case.
         """
-        said = doubt(self)
-        if said and strict:
-            raise InputError(said)
-        if said:
-            warnings.warn(said, FflinWarning, stacklevel=3)
+        fault = self._fault
+        if fault and (strict or self.flow.residual.max() == np.inf):
+            raise InputError(fault)
+        if fault:
+            warnings.warn(fault, FflinWarning, stacklevel=3)
+
+    @property
+    def _fault(self) -> str:
+        """Say why the knots are no motion of the robot; nothing if they are one."""
+        missed = self.flow.residual
+        k = int(missed.argmax())
+        where = f"'{self.robot.name}': from t = {self.t[k]:g} to {self.t[k + 1]:g} s"
+        if missed[k] == np.inf:
+            return (
+                f"t, q, v, u are no motion of {where} it overflows; expected finite rates and "
+                "times; check their units"
+            )
+        if missed[k] > _MOTION:
+            return (
+                f"t, q, v, u are no motion of {where} they miss it by {missed[k]:.2g} of its "
+                f"largest rate, and {(missed > _MOTION).sum()} of "
+                f"{len(missed)} intervals by more than {_MOTION:g}; {_CAUSES}"
+            )
+        rates = np.linalg.norm(self.v[:, 3:6], axis=1)
+        turns = np.diff(self.t) * np.maximum(rates[1:], rates[:-1])
+        k = int(turns.argmax())
+        if turns[k] > _FARTHEST_TURN:
+            return (
+                f"the base turns by {turns[k]:.2g} rad from t = {self.t[k]:g} to {self.t[k + 1]:g} "
+                f"s, more than its ends can tell; give knots at most {_FARTHEST_TURN:g} rad apart"
+            )
+        return ""
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz, .mat, .json or .csv file, whole or not at all; see `load`."""
@@ -251,10 +293,6 @@ class Trajectory(Design):
         if not self.t[0] <= t <= self.t[-1]:
             raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
         return t
-
-    @property
-    def _plain(self) -> Trajectory:
-        return Trajectory(**self._given)
 
     @property
     def _given(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from fflin.base import record
 from fflin.base.errors import FflinError, FileError, InputError, unknown
 from fflin.base.record import Record, read_record, reading, text
 from fflin.base.validation import Array, as_double
-from fflin.base.writing import check_ending, read_input, write_whole
+from fflin.base.writing import check_ending, read_file, write_whole
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
@@ -87,7 +87,7 @@ def arguments(
 
 def _columns(path: Path) -> Record:
     """Return the columns of a csv by their names, as texts."""
-    lines = csv.reader(io.StringIO(read_input(path, ".csv").decode("utf-8-sig"), newline=""))
+    lines = csv.reader(io.StringIO(read_file(path, ".csv").decode("utf-8-sig"), newline=""))
     header, *rows = [[cell.strip() for cell in line] for line in lines if any(line)]
     if len({*header}) < len(header):
         raise ValueError("two of its columns have one name")

@@ -104,7 +104,9 @@ def perturbed(robot: Any, seed: Any, **spreads: Any) -> Any:
         if any(checked.values()):
             sizes = checked["mass"], checked["com"], checked["inertia"]
             parts = (size * x for size, x in zip(sizes, np.split(drawn, (1, 4), 1), strict=True))
-            mass, com, about = stretched(model.inertias[index], *parts)
+            heavier, shift, wider = parts
+            body = model.inertias[index]
+            mass, com, about = stretched(body, heavier, shift * _radii(body), wider)
             new.inertias[index] = pin.Inertia(float(mass[0]), com[0], about[0])
     return _of_model(robot, new)
 
@@ -133,17 +135,27 @@ def _of_model(robot: Any, model: pin.Model) -> Any:
     return with_inputs(replace(robot, urdf_sha256=told, _wheelless=other), robot.inputs)
 
 
+def _radii(body: pin.Inertia) -> Array:
+    """Return the root mean square distances (3,) of a body's mass from its centre, by axis [m]."""
+    second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
+    radii: Array = np.sqrt(np.abs(second) / (body.mass or np.inf))
+    return radii
+
+
 def stretched(
     body: pin.Inertia, mass: Array, com: Array, inertia: Array
 ) -> tuple[Array, Array, Array]:
-    """Return masses (N,), centres (N, 3), inertias of a body changed by (N, 1), (N, 3), (N, 3)."""
+    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of a body that was changed.
+
+    `mass` (N, 1) and `inertia` (N, 3) are relative; `com` (N, 3) moves the centre [m], mass and
+    inertia about it held. All are along the axes of the body's frame.
+    """
     # Stretched along its frame's axes by S, its Sigma becomes S Sigma S, which stays positive.
     heavier, unit = 1.0 + mass.reshape(-1), np.eye(3)
     second = 0.5 * np.trace(body.inertia) * unit - body.inertia
     # A body that is none, as some files have them, keeps its shape.
     sound = np.linalg.eigvalsh(second)[0] >= -_ROUNDING * np.trace(second)
     stretch = np.sqrt(1.0 + (inertia if sound else inertia[:, :1] * np.ones(3)))
-    shift = com * np.sqrt(np.abs(second.diagonal()) / (body.mass or np.inf))
     second = heavier[:, None, None] * second * stretch[:, :, None] * stretch[:, None]
     about = np.trace(second, axis1=1, axis2=2)[:, None, None] * unit - second
-    return heavier * body.mass, body.lever + shift, about
+    return heavier * body.mass, body.lever + com, about

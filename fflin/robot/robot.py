@@ -238,7 +238,8 @@ class Robot(Coordinates):
 
         With d uniform in [-1, 1], anew for each body and axis, a mass is multiplied by
         1 + mass d, the second moments per mass along the axes of the body's frame by
-        1 + inertia d, and the centre of mass is shifted by com d times the radius of gyration.
+        1 + inertia d, and the centre of mass is shifted along each axis by com d times the root
+        mean square distance of the mass from it along that axis.
 
         Parameters
         ----------

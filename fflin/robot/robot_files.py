@@ -100,9 +100,10 @@ class RobotToml:
             parts = value if key in ("weights", "start") else {"": value}
             parts = {part: flat(x) if isinstance(x, dict) else x for part, x in parts.items()}
             value = parts.get("", parts)
-        named = key in _OF_NAMES and not isinstance(value, dict)
+        named = key in _OF_NAMES and not (key == "lock" and isinstance(value, dict))
         right, expected = NAME if named else NUMBER
-        for *place, leaf in _leaves(value, key):
+        no_table = named and isinstance(value, dict)
+        for *place, leaf in [(key, value)] if no_table else _leaves(value, key):
             if not right(leaf) and not (isinstance(leaf, str) and place in _WORDS):
                 shown = f"{'.'.join(place)} is {reprlib.repr(leaf)}, expected {expected}"
                 raise self._document.error(shown, *place)
@@ -110,13 +111,12 @@ class RobotToml:
 
 
 def _leaves(value: Any, *place: str) -> Iterator[tuple[Any, ...]]:
-    """Yield (*place, value) of all that is no table or list."""
+    """Yield (*place, value) of all that is no table, and of the entries of its lists."""
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from _leaves(inner, *place, key)
     elif isinstance(value, list):
-        for inner in value:
-            yield from _leaves(inner, *place)
+        yield from ((*place, entry) for entry in value)
     else:
         yield (*place, value)
 

@@ -20,12 +20,12 @@ _placement = pin.XYZQUATToSE3
 
 
 class Histories(NamedTuple):
-    """Energy (N,), momentum (N, 6) about the centre of mass (N, 3), and the base's share of it."""
+    """Energy (N,), momentum (N, 6) about the centre of mass (N, 3), and the sizes it may have."""
 
     energy: Array
     momentum: Array
     center: Array
-    of_base: Array
+    sizes: Array  # (N, 2), the largest linear momentum and that about the point, see (11.5)
 
 
 class Conserved:
@@ -92,37 +92,31 @@ class Conserved:
         rows, q = len(q), q.copy()
         q[:, :7] -= self._start
         energy, center = np.empty(rows), np.empty((rows, 3))
-        momentum, of_base = np.empty((rows, 6)), np.empty((rows, 6))
+        momentum, polar = np.empty((rows, 6)), np.empty(rows)
         for i, (q_i, v_i) in enumerate(zip(q, v, strict=True)):
             energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
-            of_base[i] = pin.ccrba(model, data, q_i, v_i)[:, :6].dot(v_i[:6])
+            pin.ccrba(model, data, q_i, v_i)
             # Not CCRBA's own sum, which is taken about the origin and rounds more.
             momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
             center[i] = data.com[0]
+            polar[i] = 0.5 * np.trace(data.Ig.inertia) + self.mass * center[i].dot(center[i])
             if self._stored:
                 momentum[i, 3:] += self._of_wheels()
+        sizes = np.sqrt(2.0 * energy[:, None] * np.column_stack((np.full(rows, self.mass), polar)))
         if self._weight is not None:
             energy -= (center + self._root.rotation @ self._start[:3]) @ self._weight
         stiffness, _, rest = self._robot.springs
         if stiffness.any():
             positions = [[joint.value(q_i) for joint in self._robot.joints] for q_i in q]
             energy += 0.5 * (np.array(positions) - rest) ** 2 @ stiffness
-        return Histories(energy, momentum, center, of_base)
+        return Histories(energy, momentum, center, sizes)
 
     def momentum_drift(self, history: Histories, expected: Array) -> Array:
-        """Return how far the momentum is off, relative to what base, joints and wheels add."""
-        p = history.momentum[:, :3]
-        flight = np.linalg.norm(history.center, axis=1) * np.linalg.norm(p, axis=1)
-        shares = (history.of_base, history.momentum - history.of_base)
-        linear, angular = (
-            sum(np.linalg.norm(share[:, part], axis=1) for share in shares).max()
-            for part in (slice(0, 3), slice(3, 6))
-        )
-        angular += flight.max()
-        angular += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
+        """Return how far the momentum is off, relative to the largest there may be: (11.5)."""
+        scale = history.sizes.max(axis=0)
+        scale[1] += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
         missing = self.about_point(history) - expected
         sizes = np.linalg.norm(missing.reshape(-1, 2, 3), axis=2)
-        scale = np.array((linear, angular))
         relative = np.divide(sizes, scale, out=np.zeros_like(sizes), where=scale > 0.0)
         largest: Array = relative.max(axis=1)
         return largest

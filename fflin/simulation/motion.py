@@ -57,9 +57,12 @@ class Motion(Design):
         Angular about the centre of mass [N m s], then linear [N s], in world axes; in orbit that
         of the motion relative to the frame.
     momentum_drift : ndarray (N,)
-        How far the momentum is from its initial value and the impulse since, relative to the
-        largest sum of the momenta of base and joints. In orbit, where none is kept, how far
-        `energy` is from its initial value and the work since, relative to its largest terms.
+        How far the momentum is from its initial value and the impulse since. The linear part is
+        relative to the mass times the rms speed of its elements at the fastest row. The angular
+        part is relative to that speed times mass and radius of gyration about the base's first
+        position, plus what wheels store: the most that momenta of that energy can be, (11.5) of
+        docs/derivation.md. In orbit, where momentum is not kept, how far `energy` is from its
+        initial value and the work since, relative to its largest terms.
     com_drift : ndarray (N,)
         How far the centre of mass is from where its initial velocity and the impulse since take
         it [m]; no rows in orbit, and where a file does not tell.

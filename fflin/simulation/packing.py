@@ -14,6 +14,7 @@ from fflin.control.output_feedback import TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.saturation import Pulses, Wheels
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
+from fflin.dynamics.points import LARGEST_SPEED
 from fflin.dynamics.state import StateMap
 from fflin.kernel import channel, course, forward, laws, loop, sharing, tracking
 from fflin.kernel.accelerations import layout_of, loads_of
@@ -21,7 +22,7 @@ from fflin.kernel.tree import Tree, batch_tree
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.limits import limits_of
 from fflin.simulation.conservation import Conserved, Course
-from fflin.simulation.plan import LARGEST_SPEED, Plan
+from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant, triads
 from fflin.simulation.times import LARGEST_TURN, Times
 
@@ -269,7 +270,9 @@ def _channel(plan: Plan, plant: Plant) -> channel.Channel:
         )
     )
     held: Array = np.minimum(np.maximum(plan.initial, limits.low), limits.high)
-    slots = times.delay // times.sample + 1 if times.sample else 1
+    # What would act after the end needs no place to wait in.
+    waiting = min(times.delay, times.steps)
+    slots = waiting // times.sample + 1 if times.sample else 1
     return channel.Channel(
         np.array(limits.low),
         np.array(limits.high),

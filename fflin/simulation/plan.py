@@ -42,8 +42,6 @@ Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 # A share of a step that is no longer part of what comes after it.
 _BEFORE = 1e-6
 
-LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
-
 
 @dataclass(frozen=True, eq=False)
 class Plan:
@@ -76,6 +74,12 @@ class Plan:
         """When in a step, of 1, its last stage asks: before a knot at its end where inputs jump."""
         return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
 
+    @property
+    def repeatable(self) -> bool:
+        """Whether nothing that it calls is a function of the caller's, which may remember."""
+        bound_anew = self.policy is None or hasattr(self.policy, "bind")
+        return bound_anew and not self.events and self.callback is None
+
     def channel(self) -> Channel | None:
         """Return the way of the law's commands to the inputs, with nothing on it yet."""
         if self.law is None:
@@ -95,11 +99,7 @@ def start_of(
         return points.start_of(state.robot)
 
     q, v = points.point_of(state, x0, q0, v0, default)
-    if not np.abs(v).max() < LARGEST_SPEED:
-        raise InputError(
-            f"the initial velocity has an entry of {np.abs(v).max():.3g}, expected less than "
-            f"{LARGEST_SPEED:g} [rad/s|m/s]"
-        )
+    points.require_slow("the initial velocity", v)
     return q, v
 
 

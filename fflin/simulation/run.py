@@ -10,8 +10,9 @@ from fflin.base.errors import InputError
 from fflin.base.progress import Progress
 from fflin.base.validation import Array
 from fflin.control.channel import Channel
+from fflin.dynamics.points import LARGEST_SPEED
 from fflin.simulation.conservation import Conserved, Course
-from fflin.simulation.plan import LARGEST_SPEED, Plan
+from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import LARGEST_TURN
 
@@ -128,10 +129,11 @@ def ending_of(plan: Plan) -> Callable[[float, Array, Array], str]:
     def ending(t: float, q: Array, v: Array) -> str:
         nonlocal scalar
         turn = float(np.abs(v[plan.turning]).max(initial=0.0)) * plan.times.dt
+        diverged = f"diverged at t = {t:g} s in steps of {plan.times.dt:g} s"
         if not np.abs(v).max() < LARGEST_SPEED or turn > 1e3:
-            return f"diverged at t = {t:g} s"
+            return diverged
         if not turn < LARGEST_TURN:
-            return f"diverged at t = {t:g} s: a joint or the base turns by {turn:.2g} rad a step"
+            return f"{diverged}: a joint or the base turns by {turn:.2g} rad a step"
         if chart:
             before, scalar = scalar, chart.scalar(q)
             if before * scalar < 0.0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +28,11 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fflin.control.gain_schedule import GainSchedule
+
+# A step that was chosen here is divided by this if the motion diverges, up to so many times, while
+# the runs that diverged took less than so many times the steps of the first one, and while the next
+# one takes no more than so many steps.
+_FINER, _MOST_FINER, _MOST_SPENT, _MOST_STEPS = 4, 3, 4, 10_000_000
 
 
 def simulate(
@@ -82,8 +88,11 @@ def simulate(
     duration : float, optional
         [s]; by default that of the trajectory that is followed.
     dt : float, optional
-        Step [s]; by default 0.01, or less where the loop's fastest pole or the samples ask for it.
-        Where the input is neither sampled nor late, it is made to divide the duration.
+        Step [s]; by default 0.01, or less if the loop's fastest pole or the samples ask for it. If
+        the motion diverges in steps of that size, it is flown again in steps of a quarter, up to
+        three times, and `Motion.notes` say so. A motion with an event, a callback, a disturbance or
+        a policy of your own in Python is flown once, as these may remember their calls. Where the
+        input is neither sampled nor late, the step is made to divide the duration.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
         Whether momentum and centre of mass are kept as above.
@@ -132,7 +141,7 @@ def simulate(
     -------
     Motion
         Ended early, ``stopped`` says why: an event, an interrupt (Ctrl-C), or a loop that left
-        the chart or diverged.
+        the chart or diverged, and in steps of which size.
 
     Raises
     ------
@@ -162,20 +171,43 @@ def simulate(
     >>> motion.u.shape[1], float(motion.t[-1])
     (9, 5.0)
     """
-    plan, plant = planned(
-        robot,
-        policy,
-        *(x0, q0, v0, duration, dt, method, project, sample, delay, limits, disturbance),
-        *(events, callback, linear, target, frame, reference, every, progress),
-    )
-    engine = engine_of(engine, plan, plant)
+
+    def prepared(dt: float | None, every: int | None) -> tuple[Plan, Plant]:
+        return planned(
+            robot,
+            policy,
+            *(x0, q0, v0, duration, dt, method, project, sample, delay, limits, disturbance),
+            *(events, callback, linear, target, frame, reference, every, progress),
+        )
+
+    plan, plant = prepared(dt, every)
+    # A function of the caller's may remember what it was called with.
+    again = dt is None and plan.repeatable and disturbance is None
+    most, spent, coarse = _MOST_SPENT * plan.times.steps, 0, list[str]()
     try:
-        return motion_of(plan, plant, engine)
+        while True:
+            conserved = conserved_by(plant.robot, plan.q, plant.field)
+            run = carried_out(plan, plant, conserved, engine_of(engine, plan, plant))
+            spent += run.steps
+            last = len(coarse) == _MOST_FINER or spent > most
+            last = last or _FINER * plan.times.steps > _MOST_STEPS
+            if not again or last or not run.stopped.startswith("diverged"):
+                break
+            coarse.append(f"{plan.times.dt:g}")
+            plan, plant = prepared(plan.times.dt / _FINER, plan.times.every * _FINER)
+        motion = motion_of(plan, plant, run.engine, run)
     except MemoryError:
         raise InputError(
             f"{plan.times.rows} rows of '{robot.name}' do not fit into the memory; take a larger "
             "dt or `every`"
         ) from None
+    if not coarse:
+        return motion
+    note = f"the motion diverges in steps of {', '.join(coarse)} s"
+    if not motion.stopped:
+        taken = f"flown in steps of {plan.times.dt:g} s"
+        note = f"{taken}, as {note}; a smaller dt (--step) shows how accurate that is"
+    return replace(motion, notes=(*motion.notes, note))
 
 
 def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = None) -> Motion:

@@ -105,8 +105,11 @@ def times_of(
         raise InputError("duration is missing; give it [s]")
     duration = _positive("duration", follows.duration if follows and duration is None else duration)
     delay = number("delay", delay)
-    if not 0.0 <= delay <= _FOREVER:
-        raise InputError(f"delay is {delay:g} s, expected 0 to {_FOREVER:g} s")
+    if not 0.0 <= delay < duration:
+        raise InputError(
+            f"delay is {delay:g} s, expected 0 or more and less than the duration, {duration:g} s, "
+            "within which a command is to act"
+        )
     if every is not None:
         every = whole("every", every, 1)
     if dt is None:

@@ -29,7 +29,7 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Range(NamedTuple):
-    """A parameter, the middle of its range, and half the width."""
+    """A parameter, the middle of its range, and how far a delta of 1 is from it."""
 
     parameter: Parameter
     middle: float
@@ -47,6 +47,29 @@ class Range(NamedTuple):
         if part[:8] == "inertia." and part[8] == part[9]:
             return 1
         return _REPEATS.get(part.partition(".")[0], 1)
+
+
+class Block(NamedTuple):
+    """What one delta varies: a parameter, or several that are tied.
+
+    Tied parameters have a common value in a range, or a common factor of what the robot has.
+    """
+
+    name: str
+    unit: str
+    middle: float
+    half: float
+    ranges: tuple[Range, ...]
+
+    @property
+    def repeats(self) -> int:
+        """How many signals its delta multiplies."""
+        return sum(each.repeats for each in self.ranges)
+
+    def values(self, value: float) -> dict[str, float]:
+        """Return {parameter: value} of the value or factor that they have in common."""
+        delta = (value - self.middle) / self.half
+        return {each.parameter.name: each.middle + each.half * delta for each in self.ranges}
 
 
 # An inertia's entry beside the diagonal, or a wheel's inertia, which its carrier loses.

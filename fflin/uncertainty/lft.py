@@ -33,11 +33,12 @@ class LFT(Design):
     C2, D21, D22 : ndarray
         Of the outputs (ny,).
     parameters : tuple of str
-        What is uncertain, in the order of the blocks.
+        What is uncertain, in the order of the blocks; of tied parameters their pattern.
     repeats : ndarray (k,)
         How often each delta stands in Delta.
     middle, half : ndarray (k,)
-        A parameter is middle + half delta.
+        A parameter is middle + half delta; what is tied is a common value, or factor of the
+        robot's own.
     units : tuple of str
     state_names, input_names, output_names : tuple of str
     robot : str

@@ -107,16 +107,18 @@ def _piece(piece: Piece, parts: Mapping[str, float]) -> tuple[Piece, float]:
 
 
 def _no_body(before: Piece, piece: Piece, name: str) -> str:
-    """Say why a link is no rigid body; nothing where it is, or no less than it was."""
+    """Return why a link is not a rigid body; nothing if it is, or is no less than it was."""
     if not piece.mass > 0.0:
         return f"the mass of '{name}' is {piece.mass:.4g} kg"
+    if (piece.inertia == before.inertia).all():  # a point mass has none
+        return ""
     was, least = (
-        float(np.linalg.eigvalsh(0.5 * np.trace(J) * np.eye(3) - J)[0] / np.trace(J))
+        float(np.linalg.eigvalsh(0.5 * np.trace(J) * np.eye(3) - J)[0] / (np.trace(J) or 1.0))
         for J in (before.inertia, piece.inertia)
     )
     if np.trace(piece.inertia) > 0.0 and least >= min(-_ROUNDING, was - _ROUNDING):
         return ""
-    return f"the inertia of '{name}' is that of no rigid body"
+    return f"the inertia of '{name}' is not physically realisable"
 
 
 def _input(item: Any, parts: Mapping[str, float]) -> Any:

@@ -15,17 +15,25 @@ from fflin.base.progress import Progress
 from fflin.base.tables import folded
 from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array, as_double
-from fflin.control.margins import largest_gain
+from fflin.control.margins import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.singular_value import largest_bound
 
 _CORNERS = 256
-# Ends of a search, steps of each, and how far these go, relative to half a range; 1e9 to a corner.
-_STARTS, _STEPS, _LENGTHS = 3, 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
+# Steps of a climb, and how far these go, relative to half a range; 1e9 to a corner.
+_STEPS, _LENGTHS = 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
 # Loops held exactly in a step, and frequencies at which the others are judged.
 _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
 
 Figure: TypeAlias = Callable[[Array], Array]  # how bad loops are, of rows of deltas
+
+
+class Figures(NamedTuple):
+    """How bad loops are: by a few frequencies, by all, and which are worse than a bound."""
+
+    quick: Figure
+    exact: Figure
+    above: Callable[[Array, float], Any]
 
 
 @dataclass(frozen=True)
@@ -101,14 +109,16 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     else:
         corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
     physical = np.array([of.makes(corner) for corner in corners])
-    tried = np.vstack((draws, corners[physical], middle))
+    # Draws come last, so that more of them find what fewer found before they go on.
+    tried = np.vstack((middle, corners[physical], draws))
     # The disk margin is of (S - T)/2, each input counted in sqrt(R_ii), as in control.margins.
     scale = np.sqrt(getattr(gain, "R", np.eye(len(K))).diagonal())
     disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
     whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
     found, bar = [], Progress()
-    for figures in ((loops.undamped,) * 2, loops.figures(disk), loops.figures(whole)):
-        value, delta = _largest(*figures, tried, of.makes)
+    undamped = Figures(loops.undamped, loops.undamped, lambda rows, b: loops.undamped(rows) > b)
+    for figures in (undamped, loops.figures(disk), loops.figures(whole)):
+        value, delta = _largest(figures, tried, of.makes)
         found.append(Found(value, of.values(delta)))
         bar.update(len(found), 4)
     unstable = loops.undamped(tried) >= 0.0
@@ -162,8 +172,8 @@ class Loops:
             found = np.maximum(found, np.linalg.eigvalsh(gram)[..., -1])
         return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(found))
 
-    def figures(self, of: Gain) -> tuple[Figure, Figure]:
-        """Return what judges gains of many loops by a few frequencies, and of one by all."""
+    def figures(self, of: Gain) -> Figures:
+        """Return what judges gains."""
         middle = np.zeros((1, len(self.lft.repeats)))
         sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))
         at = np.argsort([-self.gains(of, middle, np.array((w,)))[0] for w in sizes])
@@ -177,34 +187,55 @@ class Loops:
             peaks.append(min(w, 1e300))  # where others like it have theirs
             return np.array((value,))
 
-        return lambda rows: self.gains(of, rows, np.unique(peaks[-_FREQUENCIES:])), exact
+        def above(rows: Array, bound: float) -> Any:
+            F, B = self.matrices(rows)
+            unstable = np.linalg.eigvals(F).real.max(axis=-1) >= 0.0
+            limit = bound * (1.0 + ACCURACY)
+            _, crossed = gain_crossings(F, B * of.scale, of.C, of.D, limit)
+            return unstable | crossed.any(axis=-1)
+
+        def quick(rows: Array) -> Array:
+            return self.gains(of, rows, np.unique(peaks[-_FREQUENCIES:]))
+
+        return Figures(quick, exact, above)
 
 
-def _largest(
-    quick: Figure, exact: Figure, tried: Array, makes: Callable[[Array], bool]
-) -> tuple[float, Array]:
-    """Climb a figure from the worst that was tried, along its slope and one delta at a time."""
-    best, at, unit = -np.inf, tried[0], np.eye(tried.shape[1])
-    for start in tried[np.argsort(-quick(tried))[:_STARTS]]:
-        value, delta = exact(start[None])[0], start
-        for _ in range(_STEPS):
-            if not np.isfinite(value):
-                break
-            around = quick(np.vstack((delta + _DIFFERENCE * unit, delta)))
-            slope = np.nan_to_num(around[:-1] - around[-1], posinf=1.0)
-            steps = _LENGTHS[:, None] * slope / max(np.abs(slope).max(), 1e-300)
-            alone = [np.where(unit, end, delta) for end in (-1.0, 1.0)]
-            trials = np.vstack((np.clip(delta + steps, -1.0, 1.0), *alone))
-            held = islice(filter(makes, trials[np.argsort(-quick(trials))]), _HELD)
-            ahead = max(
-                ((exact(x[None])[0], x) for x in held), key=itemgetter(0), default=(value, delta)
-            )
-            if not ahead[0] > value + 1e-9 * abs(value):
-                break
-            value, delta = ahead
-        if value > best:
-            best, at = value, delta
+def _largest(figures: Figures, tried: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
+    """Climb a figure from the first that was tried, and from each that is worse than what is found.
+
+    So nothing that was tried is worse than what is returned, and rows after others only add to it.
+    """
+    best, at = _climbed(figures, tried[0], makes)
+    ahead = tried[1:]
+    while np.isfinite(best) and len(ahead := ahead[figures.above(ahead, best)]):
+        if figures.exact(ahead[:1])[0] > best:
+            best, at = _climbed(figures, ahead[0], makes)
+        ahead = ahead[1:]
     return best, at
+
+
+def _climbed(figures: Figures, start: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
+    """Climb along the slope of a figure and one delta at a time."""
+    quick, exact, _ = figures
+    value, delta, unit = float(exact(start[None])[0]), start, np.eye(len(start))
+    for _ in range(_STEPS):
+        if not np.isfinite(value):
+            break
+        around = quick(np.vstack((delta + _DIFFERENCE * unit, delta)))
+        slope = np.nan_to_num(around[:-1] - around[-1], posinf=1.0)
+        steps = _LENGTHS[:, None] * slope / max(np.abs(slope).max(), 1e-300)
+        alone = [np.where(unit, end, delta) for end in (-1.0, 1.0)]
+        trials = np.vstack((np.clip(delta + steps, -1.0, 1.0), *alone))
+        held = islice(filter(makes, trials[np.argsort(-quick(trials))]), _HELD)
+        ahead = max(
+            ((float(exact(x[None])[0]), x) for x in held),
+            key=itemgetter(0),
+            default=(value, delta),
+        )
+        if not ahead[0] > value + 1e-9 * abs(value):
+            break
+        value, delta = ahead
+    return value, delta
 
 
 def _safe(loops: Loops) -> float:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fflin.analysis.modal_energy import energy_by_body
 from fflin.base.errors import InputError
 from fflin.base.tables import counted
 from fflin.base.validation import Array
@@ -53,6 +54,7 @@ def mode_page(
     about = f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}"
     info = stage_info(robot, drawing, at_rest, scene=scene, subtitle=about, frame=lin.frame)
     swings = [_swing(state, drawing, mode, lin, info["size"]) for mode in found.vibrations]
+    energies = energy_by_body(robot, lin, [mode.shape for mode in found.vibrations])
     points = [corner_points(drawing, poses) for swing in swings for poses in swing[:: _PHASES // 4]]
     info |= {
         "mode": "modes",
@@ -65,10 +67,11 @@ def mode_page(
                 "frequency": mode.frequency,
                 "damping": mode.damping_ratio,
                 "unstable": bool(mode.unstable),
+                "energy": list(energy.items())[:2],
                 "shape": _shape(mode, lin),
                 "poses": packed(poses),
             }
-            for mode, poses in zip(found.vibrations, swings, strict=True)
+            for mode, energy, poses in zip(found.vibrations, energies, swings, strict=True)
         ],
     }
     return build_page(info, window.commands()), drawing.notes

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import pinocchio as pin
 
 from fflin.base.errors import UrdfError
-from fflin.base.writing import read_input
+from fflin.base.writing import read_file
 from fflin.robot.urdf.joints import UNLIMITED, JointElement, Mimic, counted_leaders, resolve_mimics
 from fflin.robot.urdf.links import INERTIA, Link, Pose, inertia_notes
 from fflin.robot.urdf.tree import Urdf, read_description
@@ -102,7 +102,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
 
 def read_document(path: Path) -> bytes:
     """Return what the file of a URDF holds, or raise `FileError`."""
-    return read_input(path, "URDF", _SIZE_LIMIT)
+    return read_file(path, "URDF", _SIZE_LIMIT)
 
 
 def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> pin.Model:

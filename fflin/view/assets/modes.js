@@ -4,11 +4,10 @@
 const aside = (phase) => Math.abs(Math.sin((phase * Math.PI) / 180)) > 0.02;
 const sign = (phase) => (!aside(phase) && Math.abs(phase) > 90 ? "−" : "");
 
-// A mode by the two positions that move most, and whether they move alike.
-function nameOf({ shape }) {
-  const [first, second] = shape.map(([name]) => name.replace(/^q_m\./, ""));
-  if (!second || shape[1][2] < 0.5) return first;
-  return `${first} ${Math.abs(shape[1][3]) > 90 ? "−" : "+"} ${second}`;
+// A mode by the one or two bodies that have most of its kinetic energy.
+function nameOf({ energy }) {
+  const [first, second] = energy.map(([name, part]) => `${name} ${(100 * part).toFixed(0)} %`);
+  return second && energy[1][1] > 0.5 * energy[0][1] ? `${first}, ${second}` : first;
 }
 
 function makeModes({ viewer, aim, keepFramed }, info) {
@@ -23,6 +22,7 @@ function makeModes({ viewer, aim, keepFramed }, info) {
   head.className = "figures";
   const cells = (parent, texts) => texts.forEach((text) => parent.append(Object.assign(document.createElement("span"), { textContent: text })));
   cells(head, ["rad/s", "Hz", "damping"]);
+  head.title = "modes by the bodies with most of the kinetic energy";
   shape.className = "readouts shape";
   const rows = info.modes.map((mode, k) => {
     const row = document.createElement("button"), name = document.createElement("b"), figures = document.createElement("div");

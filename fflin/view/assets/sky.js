@@ -73,12 +73,12 @@ void main() {
   float miss = dot(c, c) - b * b;
   vec3 colour = mix(vec3(0.0016, 0.0022, 0.0050), vec3(0.0030, 0.0042, 0.0095), 0.5 + 0.5 * d.y);
   float band = dot(d, normalize(vec3(0.42, 0.52, 0.62)));
-  float dust = fbm(d * 5.0);
-  float milk = exp(-band * band * 22.0) * smoothstep(0.30, 0.75, dust);
-  colour += milk * mix(vec3(0.010, 0.012, 0.020), vec3(0.024, 0.019, 0.020), fbm(d * 9.0 + 4.0));
   if (b > 0.0 && miss < 1.0) {
     vec3 n = normalize(d * (b - sqrt(1.0 - miss)) - c);
     colour = lit(ground(n), n, d);
+  } else if (abs(band) < 0.6) { // farther off it is too faint to be seen
+    float milk = exp(-band * band * 22.0) * smoothstep(0.30, 0.75, fbm(d * 5.0));
+    colour += milk * mix(vec3(0.010, 0.012, 0.020), vec3(0.024, 0.019, 0.020), fbm(d * 9.0 + 4.0));
   }
   if (b > 0.0) colour = rim(colour, d, b, miss, c);
   float toSun = max(dot(d, sun), 0.0);

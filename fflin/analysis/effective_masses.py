@@ -1,0 +1,202 @@
+"""Effective masses of the vibrations of a robot whose base is clamped."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+
+import numpy as np
+
+from fflin.analysis.mechanics import floating_inertia
+from fflin.base.errors import InputError
+from fflin.base.frozen import FrozenArrays
+from fflin.base.tables import counted, grid, width
+from fflin.base.validation import Array
+from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
+
+# Modes whose frequencies differ by less, relative to them, share one frequency.
+_EQUAL = 1e-9
+
+# Effective masses below this part of the total are rounding, as are singular values below its root.
+_ROUNDING = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class EffectiveMasses(FrozenArrays):
+    """Effective masses of the modes of a robot with its base clamped; prints as a table.
+
+    All stand about the base frame's origin and in the base's axes, translation before rotation.
+
+    Attributes
+    ----------
+    frequencies : ndarray (k,)
+        Of the clamped modes, ascending [rad/s].
+    participation : ndarray (6, k)
+        L of modes with unit modal mass; rows 0 to 2 [kg^1/2], 3 to 5 [kg^1/2 m].
+    free : ndarray (6, 6)
+        Part of the inertia that joints without a spring let go.
+    residual : ndarray (6, 6)
+        Inertia that is left if all joints follow the forces on them: what the base weighs alone.
+    total : ndarray (6, 6)
+        Inertia of the rigid robot, of which the others are the parts.
+    robot : str
+
+    Examples
+    --------
+    >>> springs = {"panel_left": 100.0, "panel_right": 90.0}  # N m/rad
+    >>> robot = fflin.load("servicer_7dof", stiffness=springs)
+    >>> found = fflin.effective_masses(fflin.linearize(robot))
+    >>> found.frequencies.round(2), found.masses.shape
+    (array([0.83, 0.87]), (2, 3))
+    """
+
+    frequencies: Array
+    participation: Array
+    free: Array
+    residual: Array
+    total: Array
+    robot: str
+
+    @property
+    def masses(self) -> Array:
+        """Effective masses (k, 3) along x, y and z [kg]."""
+        return self.participation[:3].T ** 2
+
+    @property
+    def inertias(self) -> Array:
+        """Effective moments of inertia (k, 3) about x, y and z [kg m^2]."""
+        return self.participation[3:].T ** 2
+
+    def __str__(self) -> str:
+        """Show a table of masses and one of inertias, with their percentages of the total."""
+        head = (
+            f"{self.robot}, base clamped: {counted(len(self.frequencies), 'mode')}, effective "
+            "masses about the base frame's origin in the base's axes"
+        )
+        parts = [textwrap.fill(head, width())]
+        for values, unit, at in ((self.masses, "kg", 0), (self.inertias, "kg m^2", 3)):
+            others = {"free joints": self.free} if self.free.any() else {}
+            others |= {"residual": self.residual, "total": self.total}
+            total = self.total.diagonal()[at : at + 3]
+            titles = [title for axis in "xyz" for title in (f"{axis} [{unit}]", "%")]
+            rows = [["rad/s", *titles]]
+            for w, mode in zip(self.frequencies, values, strict=True):
+                rows.append([f"{w:.6g}", *_cells(mode, total)])
+            for name, matrix in others.items():
+                rows.append([name, *_cells(matrix.diagonal()[at : at + 3], total)])
+            parts.append(grid(rows, "r"))
+        return "\n\n".join(parts)
+
+
+def effective_masses(lin: LinearModel) -> EffectiveMasses:
+    r"""Return the effective masses of a robot's vibrations with its base clamped.
+
+    With the base at rest, the joints' springs K and M in base axes, base before joints, and
+    :math:`\tilde M` the inertia after the joints without a spring, which float, are condensed out
+    of M, the modes are
+
+    .. math::
+        K \phi_i = \omega_i^2 \tilde M_{mm} \phi_i, \qquad \phi_i^T \tilde M_{mm} \phi_i = 1,
+        \qquad L_i = \tilde M_{bm} \phi_i.
+
+    On a base that is shaken along or about axis d, mode i pulls like a mass on a spring: the
+    effective mass :math:`L_{di}^2` [kg], or the effective inertia [kg m^2]. Over all modes,
+    with the free joints' part and the residual, they are the inertia of the rigid robot,
+
+    .. math::
+        \textstyle\sum_i L_i L_i^T + M_{free} + M_{res} = M_{bb}, \qquad
+        M_{res} = M_{bb} - M_{bm} M_{mm}^{-1} M_{mb}.
+
+    `modes` lists the frequencies of the floating robot, which are higher. Of modes with one
+    frequency only the sum is unique; the first takes as much mass as one can.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Of a whole robot about any point; the configuration alone matters. Gravity, dampers
+        and inputs are left out of K.
+
+    Returns
+    -------
+    EffectiveMasses
+
+    Raises
+    ------
+    InputError
+        If the model is reduced or from a file, which do not hold the robot's springs.
+    ModelError
+        If the robot's model was changed after the linear model was made.
+
+    References
+    ----------
+    A. Girard and N. Roy, Structural Dynamics in Industry, 2008, chapter 5.
+
+    Examples
+    --------
+    >>> robot = fflin.load("servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 100.0})
+    >>> found = fflin.effective_masses(fflin.linearize(robot))
+    >>> parts = found.participation @ found.participation.T + found.free + found.residual
+    >>> bool(abs(parts - found.total).max() < 1e-9)
+    True
+    """
+    if not isinstance(lin, LinearModel):
+        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    lin.require_unchanged()
+    robot = lin._robot
+    if robot is None or len(lin.M) != 6 + robot.n:
+        raise InputError(
+            "effective masses need the robot's springs, which a reduced model or a file does not "
+            "hold; give what fflin.linearize returns"
+        )
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    chart = state.chart(lin.q)
+    M = state.to_base(chart, state.to_base(chart, lin.M).T)
+    order = np.arange(len(M))
+    order[:6] = np.r_[order[LINEAR], order[ANGULAR]]
+    M, stiffness = M[np.ix_(order, order)], robot.springs.stiffness
+    springs, others = 6 + np.flatnonzero(stiffness), 6 + np.flatnonzero(stiffness == 0.0)
+    kept = np.r_[:6, springs]
+    floating = floating_inertia(M, kept, others)
+    base, joints = np.arange(6), np.arange(6, len(kept))
+    # In coordinates scaled by the springs K is the identity, and soft modes keep their digits.
+    soft = 1.0 / np.sqrt(stiffness[springs - 6])
+    M_mm = floating[6:, 6:] * np.outer(soft, soft)
+    squares, vectors = np.linalg.eigh((M_mm + M_mm.T) / 2.0)
+    squares, vectors = squares[::-1], vectors[:, ::-1]
+    frequencies = 1.0 / np.sqrt(squares)
+    return EffectiveMasses(
+        frequencies,
+        _separated(frequencies, floating[:6, 6:] * soft @ vectors * frequencies),
+        M[:6, :6] - floating[:6, :6],
+        floating_inertia(floating, base, joints),
+        M[:6, :6],
+        lin.robot,
+    )
+
+
+def _separated(frequencies: Array, L: Array) -> Array:
+    """Return L (6, k) with modes of one frequency combined, the first with the most mass."""
+    L, first = L.copy(), 0
+    while first < len(frequencies):
+        near = frequencies <= (1.0 + _EQUAL) * frequencies[first]
+        last = int(np.count_nonzero(near))
+        group = L[:, first:last]
+        # Those without mass are combined by their inertia.
+        for rows in (slice(0, 3), slice(3, 6)):
+            _, sizes, turned = np.linalg.svd(group[rows])
+            group[:] = group @ turned.T
+            heavy = np.count_nonzero(sizes**2 > _ROUNDING * (L[rows] ** 2).sum())
+            group = group[:, heavy:]
+        first = last
+    return L
+
+
+def _cells(values: Array, total: Array) -> list[str]:
+    """Return each of three values with its percentage of the total; rounding shows as a dot."""
+    cells = []
+    for value, whole in zip(values.tolist(), total.tolist(), strict=True):
+        seen = abs(value) > 1e2 * _ROUNDING * whole
+        cells += [f"{value:.4g}", f"{100.0 * value / whole:.1f}"] if seen else [".", "."]
+    return cells

@@ -1,0 +1,46 @@
+"""Program that expands one xacro document. It runs as a file, isolated, without the package fflin.
+
+Its arguments are the path of the document, the most seconds that it may take, and the folders to
+import from. Until it has these it imports built-in modules alone.
+"""
+
+import sys
+
+
+def main(path: str, limit: float) -> None:
+    """Expand stdin; write to stdout a line of JSON, the files that were read, and the document."""
+    import contextlib
+    import ctypes
+    import faulthandler
+    import json
+    import signal
+    from pathlib import Path
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever started it ends it
+    # It ends with who started it, or else in time, whatever it does.
+    if sys.platform == "linux":
+        set_death_signal = 1  # of prctl.h
+        ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
+    faulthandler.dump_traceback_later(limit, exit=True)
+    import xacro
+    from xacrodoc import XacroDoc, packages
+
+    document = sys.stdin.buffer.read().decode("utf-8-sig")
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            packages.walk_up_from(path)
+            # Files to include are looked up from the one on top of xacro's stack.
+            xacro.init_stacks(path)
+            urdf = XacroDoc.from_string(
+                document, resolve_packages=False, rootdir=Path(path).parent
+            ).to_urdf_string()
+    except Exception as error:  # xacro evaluates Python expressions, which may raise anything
+        sys.exit(" ".join(str(error).split()) or type(error).__name__)
+    # Included documents and YAML files; one that is read twice is in the list twice.
+    files = json.dumps(sorted(set(xacro.all_includes)))
+    sys.stdout.buffer.write(f"{files}\n{urdf}".encode())
+
+
+if __name__ == "__main__":
+    sys.path[:] = sys.argv[3:]
+    main(sys.argv[1], float(sys.argv[2]))
