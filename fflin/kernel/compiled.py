@@ -108,7 +108,8 @@ def _prepared(module: str, name: str, what: str) -> Any:
         older = set(folder.glob(f"{module}.{name}-*.nbi")) - set(_kept(folder, module, name))
         for entry in older:
             entry.unlink(missing_ok=True)
-    compiled.compile = partial(_compile_alone, compiled.compile, folder, module, name, what)
+    if not isinstance(compiled.compile, partial):  # a lock within itself would wait for itself
+        compiled.compile = partial(_compile_alone, compiled.compile, folder, module, name, what)
     return compiled
 
 

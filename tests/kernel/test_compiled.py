@@ -65,6 +65,21 @@ def test_code_that_is_older_than_any_source_is_not_taken(compiled, caplog, tmp_p
     assert bool(caplog.records) is older
 
 
+@pytest.mark.compiled
+def test_a_function_that_is_prepared_twice_does_not_wait_for_itself(
+    compiled, caplog, monkeypatch, signatures
+):
+    pytest.importorskip("filelock")
+    monkeypatch.setattr(kernel_code, "_SILENCE", 0.05)
+    monkeypatch.setattr(kernel_code, "_LONGEST_WAIT", 0.05)
+    for what in ("a kernel", "another use of it"):
+        kernel_code.kernel("factor", "invert", what)
+        kernel_code._prepared.cache_clear()
+    compiled.compile("double")
+    assert signatures == ["double"]
+    assert not any("waiting" in record.message for record in caplog.records)
+
+
 @pytest.mark.parametrize("kept", [False, True])
 @pytest.mark.parametrize("loaded", [False, True])
 def test_a_short_run_waits_for_no_compiler(monkeypatch, tmp_path, kept, loaded):
