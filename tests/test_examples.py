@@ -7,11 +7,19 @@ import numpy as np
 import pytest
 
 import fflin
+from tests.support.marks import exhaustive
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
-@pytest.mark.parametrize("name", fflin.__all__)
+# Examples that fly many runs or search long.
+LONG = {"plot_funnel", "Funnel", "funnel", "plan", "plot_validity", "validity", "Validity"}
+LONG |= {"plot_campaign"}
+
+
+@pytest.mark.parametrize(
+    "name", [*(name for name in fflin.__all__ if name not in LONG), *exhaustive(*sorted(LONG))]
+)
 def test_the_example_of_a_public_name_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")

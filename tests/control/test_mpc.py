@@ -367,6 +367,7 @@ def test_a_plan_that_is_not_found_is_told_and_not_applied(servicer, monkeypatch)
     assert "regulator" in flown.notes[-1]
 
 
+@pytest.mark.exhaustive
 def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp_path):
     robot, lin = servicer
     _, along = planned

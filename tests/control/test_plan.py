@@ -8,6 +8,7 @@ import pytest
 
 import fflin
 from fflin.control.shooting import Shooting
+from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
 
 
@@ -161,7 +162,7 @@ def one_joint():
     return robot, fflin.configuration(robot, {"joint_1": 1.0})
 
 
-@pytest.mark.parametrize(("knots", "spin"), [(6, 0.0), (11, 0.2)])
+@pytest.mark.parametrize(("knots", "spin"), [(11, 0.2), *exhaustive((6, 0.0))])
 def test_speeds_keep_within_limits_between_knots(one_joint, knots, spin):
     """Linear torques bend the speeds between knots, beyond limits that the knots keep."""
     (robot, goal), limit = one_joint, SPEEDS["qdot_m"]

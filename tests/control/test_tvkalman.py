@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
+from tests.support.marks import exhaustive
 from tests.support.motions import motion
 
 POSES = (fflin.BasePose(), fflin.JointPositions())
@@ -201,7 +202,7 @@ def test_at_rest_it_tends_to_the_steady_filter_and_stays_positive(sample):
     assert np.abs(begun.L - steady.L).max() < 1e-7 * np.abs(steady.L).max()
 
 
-@pytest.mark.parametrize("ending", ["npz", "mat", "json"])
+@pytest.mark.parametrize("ending", ["npz", *exhaustive("mat", "json")])
 def test_filters_are_kept(moving, tmp_path, ending):
     for sample in (None, 0.2):
         schedule = fflin.tvkalman(moving, 0.1, 0.1, P0=0.1, sample=sample)

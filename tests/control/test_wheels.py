@@ -10,6 +10,7 @@ from scipy.linalg import solve_continuous_are
 
 import fflin
 from fflin import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
+from tests.support.marks import exhaustive
 from tests.support.messages import says
 from tests.support.robots import free_body
 from tests.support.wheels import AXES, ORTHOGONAL, PYRAMID, carrier_alone, unit, wheels
@@ -140,6 +141,7 @@ def test_the_motion_is_that_of_the_rigid_body_under_the_textbooks_law(layout):
 
 @pytest.mark.sample
 @pytest.mark.exhaustive
+@pytest.mark.exhaustive
 def test_wheels_on_links_hold_base_and_joints():
     arm = fflin.load("servicer_7dof")
     motors = [JointTorque(name) for name in arm.joint_names]
@@ -213,7 +215,9 @@ def test_the_speed_of_a_wheel_limits_the_loop(spin):
     assert 0.85 * 6.0 < largest < 1.03 * 6.0
 
 
-@pytest.mark.parametrize("axis", ORTHOGONAL)
+@pytest.mark.parametrize(
+    "axis", [ORTHOGONAL[0], *exhaustive(*((each,) for each in ORTHOGONAL[1:]))]
+)
 def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
     """Its speed per momentum is that of both, the carrier free: a fifth more than of it alone."""
     added = [ReactionWheel(each, inertia=3e-3, max_speed=0.05) for each in ORTHOGONAL]
@@ -261,6 +265,7 @@ def test_spinning_wheels_are_held_about_their_speed():
     )
 
 
+@pytest.mark.exhaustive
 def test_speeds_come_back_where_something_else_turns_the_body():
     """To the point's, neither despun nor drifting, slowly beside the attitude."""
     robot = wheeled(AXES[:3], others=[BaseTorque()])

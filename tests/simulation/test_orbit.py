@@ -8,6 +8,7 @@ import pytest
 from scipy.special import ellipk
 
 import fflin
+from tests.support.marks import exhaustive
 from tests.support.robots import free_body, random_point
 
 N = 0.05  # [rad/s]: some revolutions take minutes
@@ -74,7 +75,7 @@ def test_a_body_flies_as_clohessy_and_wiltshire_say():
     assert np.abs(same.x[:, 3:6] - motion.x[:, 3:6] @ R.T).max() < 1e-9 * np.abs(expected).max()
 
 
-@pytest.mark.parametrize("degrees", [20.0, 60.0, 85.0])
+@pytest.mark.parametrize("degrees", [60.0, *exhaustive(20.0, 85.0)])
 def test_pitch_swings_with_the_period_of_the_elliptic_integral(degrees):
     """theta'' = -(3 n^2 / 2) k sin 2 theta, k = (I_x - I_z)/I_y in lvlh: a pendulum of 2 theta."""
     roll, pitch, yaw = 5.0, 4.5, 2.0

@@ -8,6 +8,7 @@ import fflin
 from benchmarks.cases.trajectory import beside as beside_knots
 from benchmarks.cases.trajectory import flown
 from fflin.dynamics.state_rows import moved_by, moving_error, moving_errors
+from tests.support.marks import exhaustive
 from tests.support.messages import says
 from tests.support.motions import beside, swung
 
@@ -65,6 +66,7 @@ def test_a_schedule_runs_as_the_feedback_along_its_trajectory(case):
     assert says(str(run), "attitude")
 
 
+@pytest.mark.exhaustive
 def test_without_a_start_it_begins_on_its_trajectory(case):
     robot, schedule, traj = case
     run = fflin.simulate(robot, schedule)
@@ -112,6 +114,7 @@ def test_after_the_end_the_last_configuration_is_held_at_rest():
     assert np.abs(run.linear[-1] - run.x[-1]).max() < 1e-4
 
 
+@pytest.mark.exhaustive
 def test_a_sampled_schedule_is_asked_at_its_samples():
     robot = fflin.load("ets_vii")
     traj = swung(robot, sample=0.2).trajectory()
@@ -350,7 +353,9 @@ def test_a_run_of_just_the_trajectorys_length_needs_no_rest(first):
         assert np.abs(run.error).max() < 1e-4
 
 
-@pytest.mark.parametrize(("sample", "degrees"), [(0.05, 0.01), (0.1, 0.02), (0.2, 0.1)])
+@pytest.mark.parametrize(
+    ("sample", "degrees"), [(0.2, 0.1), *exhaustive((0.05, 0.01), (0.1, 0.02))]
+)
 def test_default_gains_of_samples_bring_errors_to_nothing_within_a_trajectory(sample, degrees):
     robot = fflin.load("planar_detumble")
     traj = swung(robot, 6.0, size=0.5).trajectory().resampled(0.1)

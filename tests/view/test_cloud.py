@@ -51,6 +51,7 @@ def test_the_page_has_the_paths_of_base_and_tool(robots, campaign, watch, tmp_pa
     assert "tool in 240 of 300 runs" in page.do("document.getElementById('legend').textContent")
 
 
+@pytest.mark.exhaustive
 def test_a_cloud_of_something_else_is_refused(robots, campaign, tmp_path):
     robot, other = robots["ets_vii"], robots["canadarm2"]
     motion = campaign.replay(0)

@@ -99,6 +99,7 @@ def test_pages_of_other_sites_get_nothing(live):
     run(refused(host="evil.example"))
 
 
+@pytest.mark.exhaustive
 def test_it_survives_a_thousand_reconnects(live):
     def count():
         return len(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else 0
@@ -192,6 +193,7 @@ def test_a_running_simulation_is_shown_as_it_runs(robots):
         fflin.visualize(robot, open=False, speed=0)
 
 
+@pytest.mark.exhaustive
 def test_a_slow_browser_gets_the_newest_state_and_not_all(live, robots):
     """What waits for one that reads nothing stays small, and ends with the last state."""
     robot = robots["ets_vii"]

@@ -430,6 +430,7 @@ def test_on_a_long_way_the_camera_follows_unless_it_is_told_not_to(robots, tmp_p
         assert (np.ptp(shown["points"], axis=0).max() > 5e3) is not expected
 
 
+@pytest.mark.exhaustive
 def test_two_minutes_at_2048_rows_a_second_are_below_5_megabytes(robots, tmp_path):
     robot = robots["servicer_7dof"]
     motion = settling(robot, duration=120.0, predicted=True)

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 import fflin
 from fflin.robot.catalog import find_mesh, find_robot
 from fflin.view.shapes import shapes
+from tests.support.marks import exhaustive
 from tests.support.meshes import tetrahedron
 from tests.support.motions import settling
 
@@ -31,7 +32,9 @@ def write(folder, mesh="missing.stl", more=""):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", ["ets_vii", "canadarm2", "dual_arm", "talos", "panda", "tiago"])
+@pytest.mark.parametrize(
+    "name", ["ets_vii", "canadarm2", "dual_arm", *exhaustive("talos", "panda", "tiago")]
+)
 def test_shapes_stand_where_pinocchio_puts_them(name):
     robot = fflin.load(name)
     found, notes = shapes(robot)
