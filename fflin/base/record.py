@@ -4,7 +4,8 @@ Models, gains, schedules, filters and motions are such records, and whoever read
 .json can read them. Each file carries a SHA-256 of its content, so that one that was damaged or
 edited is refused: the entry ``sha256`` of .npz (of the other entries) and .json (of the text
 before it), the header's text of .mat (of all that follows). One without it is read as it is, and
-what is made of it is not ``verified``, nor written with one.
+what is made of it is not ``verified``, nor written with one. A .mat file is checked before SciPy
+reads it, since SciPy can crash on a damaged one.
 """
 
 from __future__ import annotations
@@ -165,7 +166,7 @@ def _to_mat(record: Mapping[str, Any], sealed: bool) -> bytes:
 
 
 def _from_mat(content: bytes) -> tuple[Record, bool]:
-    from fflin.base.mat5 import read_mat
+    from scipy.io import loadmat
 
     sealed = content.startswith(_MAT_SEAL)
     if sealed:
@@ -174,7 +175,23 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
             raise ValueError(DAMAGED)
     elif _MAT_NEARLY.search(content[:_MAT_TEXT]):
         raise ValueError("its header was damaged or edited")
-    return read_mat(content), sealed
+    if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
+        hint = ", but of version 7.3; write it with save -v7" * (content[124:128] == b"\0\2IM")
+        raise ValueError(f"not a MATLAB file of level 5{hint}")
+    record = {key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()}
+    return {key: value for key, value in record.items() if key[:2] != "__"}, sealed
+
+
+def _of_mat(value: Any) -> Any:
+    """Return a variable of MATLAB: an array, text, a list of cells or rows, a dict of a struct."""
+    if not isinstance(value, np.ndarray):
+        return value
+    if value.dtype.names:
+        return {name: _of_mat(value[name].item()) for name in value.dtype.names}
+    if value.dtype.kind == "U":  # an empty text has no row
+        rows = [str(row).rstrip() if value.size > 1 else str(row) for row in value.ravel()]
+        return rows if len(rows) > 1 else "".join(rows)
+    return [_of_mat(cell) for cell in value.ravel(order="F")] if value.dtype.kind == "O" else value
 
 
 def _to_json(record: Mapping[str, Any], sealed: bool) -> bytes:
