@@ -113,16 +113,13 @@ def write_whole(contents: Mapping[Path, bytes]) -> None:
 @contextmanager
 def replacing(*targets: Path) -> Iterator[list[Path]]:
     """Yield a new file for each target, which takes its place where all ends well."""
-    from tempfile import mkstemp
-
     written: dict[Path, Path] = {}
     target = Path()
     try:
         for target in targets:
-            real = place(target)
-            handle, name = mkstemp(prefix=".fflin-", dir=real.parent)
-            os.close(handle)
-            written[Path(name)] = target
+            temporary = place(target).parent / f".fflin-{os.urandom(8).hex()}"
+            temporary.touch(exist_ok=False)  # with the mode that the umask leaves
+            written[temporary] = target
         yield list(written)
         for temporary, target in list(written.items()):
             install(temporary, target)
@@ -139,9 +136,8 @@ def replacing(*targets: Path) -> Iterator[list[Path]]:
 def install(temporary: Path, target: Path) -> None:
     """Let a file that is whole take the place of its target."""
     real = place(target)
-    mask = os.umask(0o077)  # it can be read only by setting it
-    os.umask(mask)
-    os.chmod(temporary, real.stat().st_mode & 0o777 if real.exists() else 0o666 & ~mask)
+    if real.exists():
+        os.chmod(temporary, real.stat().st_mode & 0o777)
     os.replace(temporary, real)
     if files := _of_command.get():
         files.outputs.discard(target)  # what the command made, it may read
