@@ -205,12 +205,12 @@ def add_inputs_there(command: Container) -> None:
         """
         --effort NAME=VALUE*: input at the operating point, by its name in u, such as
             tau_m.joint_1
-        --equilibrium: use the smallest inputs that balance springs, gravity and steady motion at
-            the operating point; passive joints sag on their springs; an error if no inputs
-            balance them""",
+        --equilibrium: use the smallest inputs that hold the operating point against springs,
+            gravity and steady motion. Passive joints sag on their springs. If no inputs hold the
+            point, the command reports an error""",
     )
     text = """--relative-equilibrium N: in orbit, use the N-th (default: first) of the 24 attitudes
-        without gravity-gradient torque, with the inputs of --equilibrium; attitude and position
+        without gravity-gradient torque, with the inputs of --equilibrium. Attitude and position
         are relative to it"""
     add_options(command, text, nargs="?", const=1, choices=range(1, 25))
 
@@ -237,19 +237,19 @@ def add_system(command: Container, *, axes: bool = True) -> None:
         --gravity X,Y,Z: uniform gravity in world axes [m/s^2]; zero by default
         --passive NAME*: joint without a motor, which gets no torque input by default
         --inputs FILE.toml: inputs of the robot: a file for fflin.load_inputs, a bundled name,
-            `joints` (joint torques only) or `base` (base torque and force only); by default the
-            inputs of robot.toml, or base torque, base force and all joint torques
+            `joints` (joint torques only) or `base` (base torque and force only). The default is
+            the inputs of robot.toml, or base torque, base force and all joint torques
         --output SPEC*: outputs of the model: state (default), base, joints, rates, joints:NAME,
             rates:NAME (a joint or a pattern), com, momentum, frame:NAME (pose and velocity),
             pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (NAME
             relative to frame TO)""",
     )
     frame = """
-        --frame hybrid|local|world|lvlh|hill: axes of velocities and wrenches: angular in base axes
-            and linear in reference axes (hybrid, default), all in base axes (local), all in
-            reference axes (world); in orbit, axes as in hybrid, with x along the orbit, y against
-            its normal, z towards the body (lvlh, default), or x away from the body, y along the
-            orbit, z along its normal (hill)"""
+        --frame hybrid|local|world|lvlh|hill: axes of velocities and wrenches. hybrid (default):
+            angular in base axes, linear in reference axes; local: all in base axes; world: all in
+            reference axes. In orbit the axes are as in hybrid, and the world is lvlh (default): x
+            along the orbit, y against its normal, z towards the body; or hill: x away from the
+            body, y along the orbit, z along its normal"""
     if axes:
         add_options(command, frame)
 

@@ -90,8 +90,8 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
             selects y
         --negative-feedback: the controller was designed for u - u0 = -system (y - y0)
         --[no-]allocate: design with torque and force on the base, and allocate the nearest wrench
-            to the thrusters, which cannot pull; by default if the thrusters can push in every
-            direction; otherwise negative thrust is set to zero
+            to the thrusters, which cannot pull. This is the default if the thrusters can push in
+            every direction. Without it, negative thrust is set to zero
         --free: simulate without a regulator and without inputs
         --limits urdf|none = urdf: saturate the inputs at the efforts of the URDF, at max and min of
             the inputs and at wheel speeds (urdf, default), or only at --limit (none)
@@ -204,7 +204,7 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
         "the trajectory defines the target",
     )
     poses = ("joint", "rpy", "position", "velocity")
-    _refuse(arguments, poses, "the start is on the trajectory; --offset displaces it")
+    _refuse(arguments, poses, "the start is on the trajectory, or displaced from it by --offset")
     design = _without_thrusters(robot) if arguments.allocate else robot
     if arguments.schedule is None:
         models = models_along(arguments, design)

@@ -35,7 +35,7 @@ def add_commands(commands: Commands) -> None:
     add_point(lqr)
     add_weights(lqr)
     add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json")
-    add_figure(lqr, "plot the loop of each input with its margins, and the poles,")
+    add_figure(lqr, "plot the poles, and the loop of each input with its margins,")
 
 
 def add_weights(command: Container) -> None:
@@ -43,9 +43,9 @@ def add_weights(command: Container) -> None:
     add_options(
         command,
         """
-        --weights urdf|identity: rule for all weights that are not given: `urdf` (default) keeps
-            the inputs within the limits of the URDF if the base is rotated by 30 deg and the
-            joints by 0.3 rad; `identity` is 1 for each
+        --weights urdf|identity: rule for all weights that are not given. `urdf` (default) keeps
+            the inputs within the limits of the URDF for displacements of 30 deg of the base and
+            0.3 rad of the joints; `identity` is 1 for each
         --q NAME=W*: weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b,
             q_m.hinge_*
         --r NAME=W*: weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*
@@ -54,8 +54,9 @@ def add_weights(command: Container) -> None:
         --dt H: design for inputs held for H [s]; the cost remains the continuous cost
         --reduce: if momentum is conserved, regulate only the states that the inputs can control
         --[no-]wheel-speeds: return the speeds of reaction wheels to their values at the operating
-            point; by default if thrusters or a base torque can do so; on: also speeds that the
-            wheels can change without rotating the robot; off: none""",
+            point, or not. By default it does so if thrusters or a base torque can absorb their
+            torque. --wheel-speeds adds speeds that the wheels alone can change without rotating
+            the robot""",
     )
 
 

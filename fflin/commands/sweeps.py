@@ -136,7 +136,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
             )
         check_room(count, size, path)
         part = part_of(path)
-        said += f" to {path}" + f", going on from {part}" * part.exists()
+        said += f" to {path}" + f", resuming from {part}" * part.exists()
 
     q, v, u = _points(robot, arguments, v, u, announce)
     with executor_of(arguments) as executor:

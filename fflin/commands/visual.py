@@ -76,7 +76,7 @@ def _add_scene(command: Container) -> None:
 
 def add_figure(command: Container, what: str) -> None:
     """Add --plot FILE."""
-    add_options(command, f"--plot >FILE: {what} into FILE: .png, .pdf or .svg")
+    add_options(command, f"--plot >FILE: {what} to FILE: .png, .pdf or .svg")
 
 
 def check_figure(path: Path | None) -> None:
