@@ -69,7 +69,7 @@ def add_commands(commands: Commands) -> None:
     add_figure(validity, "plot the results")
     sensitivity = command(
         *(commands, "sensitivity", _sensitivity),
-        "show or save the derivatives of A and B over masses, inertias, springs and thrusters",
+        "show or save the derivatives of A and B with respect to masses, springs, thrusters ...",
         "fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
     )
     add_point(sensitivity)

@@ -14,7 +14,7 @@ from fflin.commands.regulator import add_weights
 from fflin.commands.tracking import add_trajectory
 from fflin.commands.visual import add_figure, check_figure, draw
 
-_KINDS = "attitude [deg], position [m], joints, turning, moving or rates"
+_KINDS = "attitude [deg], position [m], joints, turning (omega_b), moving (v_b) or rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
 
 # Options of other commands, which `along` refuses.

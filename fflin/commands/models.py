@@ -40,7 +40,7 @@ def add_commands(commands: Commands) -> None:
     add_system(info, axes=False)
     linearize = command(
         *(commands, "linearize", _linearize),
-        "show or save A, B, C, D",
+        "show or save the linear model A, B, C, D about an operating point",
         "fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat",
     )
     add_point(linearize)

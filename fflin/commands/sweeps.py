@@ -47,7 +47,9 @@ def add_commands(commands: Commands) -> None:
         "fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5",
     )
     add_robot(sweep)
-    points = sweep.add_argument_group("points", "one of these; at rest unless --velocity is given")
+    points = sweep.add_argument_group(
+        "points", "--grid, --random or --configurations; at rest unless --velocity is given"
+    )
     add_options(
         points,
         """--grid JOINT=LO:HI:N*: N values of a joint [rad|m] from LO to HI; for several joints all
