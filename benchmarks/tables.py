@@ -89,8 +89,8 @@ def machine() -> str:
 def document(tables: Sequence[Table], command: str) -> str:
     """Return the whole file of results."""
     head = (
-        f"# Benchmarks\n\nMade by `{command}`. {machine()} Each time is the least of many rounds, "
-        "in which the candidates take turns.\n\n"
+        f"# Benchmarks\n\nMade by `{command}`. {machine()} Each time is the shortest of many "
+        "rounds in which the candidates take turns.\n\n"
     )
     return head + "\n".join(table.markdown() for table in tables)
 

@@ -1,4 +1,4 @@
-"""How the documents become a site: ``sphinx-build -W docs site``."""
+"""Configuration of the documentation site: ``sphinx-build -W docs site``."""
 
 import sys
 from importlib.util import find_spec
@@ -28,8 +28,8 @@ extensions = [
 exclude_patterns = ["_*"]
 templates_path = ["_templates"]
 
-# The pages: plain Markdown with tables, formulas and links to headings; those with a Jupytext
-# header are run.
+# Pages are plain Markdown with tables, formulas and links to headings. Pages with a Jupytext
+# header are executed.
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
 nb_execution_mode = "force"
@@ -48,7 +48,7 @@ autodoc_preserve_defaults = True
 autosummary_ignore_module_all = False
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = True
-# Links to the public names alone: those of numpydoc lead off the site.
+# Links to public names only: numpydoc links to other sites.
 numpydoc_xref_ignore = "all"
 numpydoc_xref_aliases = {
     **{name: name for name in DEFAULT_LINKS},
@@ -67,7 +67,7 @@ copybutton_exclude = ".linenos, .gp, .go"
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 
-# Formulas without a network: MathJax beside the pages, whose outlines need no fonts.
+# Formulas without a network: MathJax is part of the site, and its SVG output needs no fonts.
 _mathjax = find_spec("sphinx-mathjax-offline")
 assert _mathjax is not None and _mathjax.origin is not None, "pip install -e '.[docs]'"
 html_static_path.append(str(Path(_mathjax.origin).parent / "static/mathjax/tex-svg.js"))

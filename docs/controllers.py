@@ -12,7 +12,7 @@ NAMES = ("PD with a direct term", "H-infinity, weighed as an integral")
 
 
 def main() -> None:
-    """Run the page's code and draw the two motions that it ends with."""
+    """Run the code of the page and draw its last two motions."""
     page = (HERE / "guide" / "controllers.md").read_text(encoding="utf-8")
     toml, *_ = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     code, own = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), {}

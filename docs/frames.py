@@ -1,7 +1,8 @@
 """Print the table of docs/conventions.md on frames: ``python docs/frames.py [ROBOT ...]``.
 
-Ten postures drawn from the joints' limits, the base turned about a random axis and moved by 0.5 m
-for each 90 deg: how many of the loops settle that feed back in each frame.
+The table counts the loops that settle with feedback in each frame. Each of ten random postures
+within the joint limits starts with the base rotated about a random axis and displaced by 0.5 m per
+90 deg.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Draw the rooms of the package and what imports what, from the code: ``python docs/rooms.py``."""
+"""Draw the rooms of the package and their imports from the code: ``python docs/rooms.py``."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs" / "rooms.svg"
 
-# Of the page, in pixels.
+# Dimensions of the page, in pixels.
 WIDTH, LEFT, BOX, LINE, GAP, COLUMNS = 960, 16, 640, 15, 14, 100
 
 
 def rooms() -> list[str]:
-    """Return the rooms from the top down, as the import contract has them."""
+    """Return the rooms of the import contract from top to bottom."""
     contract = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     layers = re.search(r"layers = \[(.*?)\]", contract, re.DOTALL)
     assert layers is not None
@@ -25,21 +25,21 @@ def rooms() -> list[str]:
 
 
 def modules(room: str) -> list[str]:
-    """Return the modules of a room, those of a room within it with its name."""
+    """Return the modules of a room; a module of a nested room has the name of this room too."""
     folder = ROOT / "fflin" / room
     found = [file.relative_to(folder).with_suffix("").parts for file in folder.rglob("*.py")]
     return sorted(".".join(parts) for parts in found if parts[-1] != "__init__")
 
 
 def purpose(room: str) -> str:
-    """Return the first line of what a room says of itself."""
+    """Return the first line of the docstring of a room."""
     text = ast.get_docstring(ast.parse((ROOT / "fflin" / room / "__init__.py").read_text("utf-8")))
     assert text is not None
     return text.splitlines()[0]
 
 
 def imports(room: str) -> Counter[str]:
-    """Count the import statements of a room by the room that they import from."""
+    """Return the number of import statements of a room for each imported room."""
     found: Counter[str] = Counter()
     for file in (ROOT / "fflin" / room).rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
@@ -50,7 +50,7 @@ def imports(room: str) -> Counter[str]:
 
 
 def drawing() -> str:
-    """Return the picture: a box for each room, an arc for each room that it imports from."""
+    """Return the picture: a box for each room, and an arc to each room that it imports."""
     order = rooms()
     boxes, middles, y = [], {}, GAP
     for room in order:

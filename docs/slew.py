@@ -16,7 +16,7 @@ SHOWN = ("joint_3", "joint_6", "panel_left", "panel_right")
 
 
 def main() -> None:
-    """Fly both and draw attitude, joints with their travels, and torques of the joints."""
+    """Simulate both and draw attitude, joints with their limits, and joint torques."""
     robot = fflin.load("servicer_7dof")
     lin = fflin.linearize(robot)
     Q = fflin.bryson(lin, {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1})

@@ -1,4 +1,4 @@
-"""Linear models of free-floating robots: URDF in, checked A and B out."""
+"""Linear models of free-floating robots from URDF, for analysis, control and simulation."""
 
 from importlib import import_module
 from pathlib import Path
@@ -6,9 +6,9 @@ from typing import Any
 
 from fflin.base.version import __version__
 
-# The stub beside this file is the one list of the public names: by what they are for, each with its
-# module. A name is imported when it is first asked for, so that a command which needs no dynamics
-# does not pay for it.
+# The stub beside this file is the only list of the public names, grouped by task, with their
+# modules. A name is imported when it is first used, so that a command without dynamics does not
+# load Pinocchio.
 _titles: dict[str, list[str]] = {}
 _modules: dict[str, str] = {}
 for _line in Path(__file__).with_suffix(".pyi").read_text("utf-8").splitlines():

@@ -10,8 +10,8 @@ def run() -> Table:
     return compare(
         "at_point",
         "One linearisation at an operating point",
-        "Random joint positions, velocities and inputs, by the compiled kernel; the peers' times "
-        "as multiples of fflin's.",
+        "Random joint positions, velocities and inputs. The column fflin is its time with the "
+        "compiled kernel; the columns of the peers are their times divided by fflin's.",
         (random_point(load(name)) for name in NAMES),
         fflin_call,
         in_readme=True,

@@ -50,9 +50,10 @@ def run() -> Table:
         )
     return Table(
         "One linearisation by the compiled kernel",
-        "The times of pin.computeABADerivatives and of fflin at an operating point; and as "
-        f"shares of {SHARE:g} times the first and {BESIDE * 1e6:g} us: that of the second, at "
-        "rest, along a moving reference, in another frame and reference, and without the kernel.",
+        "The first two columns are the times of pin.computeABADerivatives and of fflin at an "
+        f"operating point. The other columns are times divided by {SHARE:g} times the first time "
+        f"plus {BESIDE * 1e6:g} us: of fflin at an operating point, at rest, along a moving "
+        "reference, in another frame and reference, and without the kernel.",
         ("robot", "n", "Pinocchio [us]", "fflin [us]", "point", "at rest", *CASES, "numpy"),
         tuple(rows),
     )

@@ -10,9 +10,10 @@ def run() -> Table:
     return compare(
         "at_rest",
         "One linearisation at rest",
-        "fflin's time, its ratio to its floor (crba, dpotrf and dpotri called by hand), and the "
-        "peers' times as multiples of fflin's: above 1, fflin is faster. MuJoCo by hand is "
-        "kinematics, inertia, factor, solve and B, without checks, names or units.",
+        "The columns are fflin's time, its ratio to its lower bound (crba, dpotrf and dpotri "
+        "called by hand), and the times of the peers divided by fflin's. Above 1, fflin is "
+        "faster. MuJoCo by hand is kinematics, inertia, factorisation, solution and B, without "
+        "checks, names or units.",
         (random_point(load(name)) for name in NAMES),
         fflin_call,
         in_readme=True,

@@ -54,9 +54,10 @@ def run() -> Table:
         )
     return Table(
         "Batch",
-        f"A sweep of {COUNT:,} random configurations at rest on one thread: time a point; its "
-        "ratio to pin.computeMinverse called one after the other, without checks or reordering; "
-        "how many times faster two threads are; peak memory as a multiple of the result.",
+        f"A sweep of {COUNT:,} random configurations at rest on one thread. The columns are the "
+        "time per point, its ratio to pin.computeMinverse called for one point after the other "
+        "without checks or reordering, the speed-up by two threads, and the peak memory divided "
+        "by the size of the result.",
         (
             *("robot", "n", "fflin [us a point]", "fflin / computeMinverse"),
             *("two threads", "memory / result"),

@@ -40,9 +40,9 @@ def run() -> Table:
         rows.append((name, robot.n, figure(own * 1e6), row))
     return Table(
         "Batch at operating points",
-        f"A sweep of {COUNT:,} random configurations, velocities and inputs on one thread: time a "
-        "point, and that of one call of the others, none of which has a batch, as a multiple of "
-        "it.",
+        f"A sweep of {COUNT:,} random configurations, velocities and inputs on one thread. The "
+        "columns are fflin's time per point, and the time per call of the others divided by it. "
+        "The others have no batch function.",
         ("robot", "n", "fflin [us a point]", *columns),
         tuple(
             (name, str(n), time, *(row.get(key, figure(None)) for key in columns))

@@ -41,15 +41,16 @@ def run() -> Table:
     notes |= dict.fromkeys(_of_duration("ets_vii", 1_000))
     return Table(
         "Campaign",
-        f"Runs of {DURATION:g} s in steps of {STEP:g} s under state feedback, each from another "
-        "attitude and with another mass of the base: the least time a step and run; its ratio to "
-        "four pin.aba called from Python, the least, median and largest of the rounds; peak memory "
-        "of a process that does nothing else. One thread but where threads, or workers, which are "
-        "processes, are named. `held`: the input is computed once a step, else at every stage. "
-        "MuJoCo's `rollout` on threads has no feedback, so its runs are a loop in Python; Drake's "
-        "MonteCarloSimulation goes on one thread in Python, and Basilisk's Controller here in one "
-        "process, without retained data, for which it waits a second a run. Those three do one run "
-        f"after the other: {OF_PEERS[0]} and {OF_PEERS[1]} show their growth, more are not timed.",
+        f"Runs of {DURATION:g} s in steps of {STEP:g} s under state feedback, each with a random "
+        "attitude and base mass. The columns are the shortest time per step and run; its ratio to "
+        "four calls of pin.aba from Python as minimum, median and maximum over the rounds; and "
+        "the peak memory of a process that runs only this campaign. Everything runs on one thread "
+        "unless threads or workers (processes) are named. `held`: the input is computed once per "
+        "step, otherwise at every stage. MuJoCo's `rollout` on threads has no feedback, so that "
+        "its runs are a loop in Python. Drake's MonteCarloSimulation uses one thread in Python. "
+        "Basilisk's Controller uses one process here, without retained data, and waits one second "
+        f"per run for it. These three simulate one run after the other: {OF_PEERS[0]} and "
+        f"{OF_PEERS[1]} runs show the growth, and more are not timed.",
         ("robot", "loop", "runs", "us", "least", "median", "most", "MiB"),
         tuple(rows),
         tuple(notes),

@@ -53,8 +53,8 @@ def run() -> Table:
     return Table(
         "Equipped satellite",
         f"One linearisation of {ROBOT} at an operating point with 12 thrusters on four links, 3 "
-        "wheels, and pose and velocity of the tool: time, and its ratio to the Pinocchio calls "
-        "that it makes.",
+        "wheels, and the pose and velocity of the tool as outputs. The columns are the time and "
+        "its ratio to the Pinocchio calls in it.",
         ("robot", "n", "fflin [us]", "fflin / Pinocchio calls"),
         ((ROBOT, str(robot.n), figure(own.least * 1e6), figure(own.ratio(times["bare"]))),),
     )

@@ -14,8 +14,8 @@ def run() -> Table:
     return compare(
         "at_rest",
         "Growth with the number of joints",
-        "One linearisation at rest of generated robots: chains, and trees where two joints hang "
-        "on every link. The peers' times as multiples of fflin's.",
+        "One linearisation at rest of generated robots: chains, and trees with two joints on "
+        "every link. The columns of the peers are their times divided by fflin's.",
         (random_point(generated(kind, n)) for kind in ("chain", "tree") for n in SIZES),
         fflin_call,
         too_slow=_too_slow,

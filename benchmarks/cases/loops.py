@@ -31,14 +31,15 @@ def run() -> Table:
         rows += measured(name, found)
     return Table(
         "Closed-loop step",
-        f"State feedback u = -K x, {DURATION:g} s in steps of {1e3 * STEP:g} ms, each coordinate "
-        "as if alone at 0.3 rad/s: the least time a step; its ratio to four pin.aba called from "
-        "Python, the least, median and largest of the rounds; the error at the end, relative to "
-        "the start, against DOP853 of Pinocchio's accelerations. `held`: the input is computed "
-        "once a step, else at every stage; `free`: no feedback, all in C. fflin and MuJoCo take "
-        "steps of fourth order, Drake of third, with its own gain in C++, which makes the frame "
-        "`world` of it. MuJoCo's feedback is in Python: a callback, or between the steps. Basilisk "
-        "runs its flight software, with the gains of the same motion to first order.",
+        f"State feedback u = -K x for {DURATION:g} s in steps of {1e3 * STEP:g} ms, with every "
+        "coordinate decoupled at 0.3 rad/s. The columns are the shortest time per step; its ratio "
+        "to four calls of pin.aba from Python as minimum, median and maximum over the rounds; and "
+        "the final error relative to the start, compared with DOP853 on Pinocchio's "
+        "accelerations. `held`: the input is computed once per step, otherwise at every stage. "
+        "`free`: no feedback, all in C. fflin and MuJoCo use integrators of order four. Drake "
+        "uses order three and its own gain in C++, in the frame `world`. MuJoCo's feedback is in "
+        "Python: a callback, or code between the steps. Basilisk runs its flight software with "
+        "gains that give the same motion to first order.",
         ("robot", "loop", "us", "least", "median", "most", "error"),
         tuple(rows),
         tuple(notes),

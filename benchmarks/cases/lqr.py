@@ -47,8 +47,8 @@ def run() -> Table:
         )
     return Table(
         "LQR",
-        f"The gain of the model at rest, weights on every state and input: time of {reference}, "
-        "the others' as multiples of it.",
+        "The gain of the model at rest with weights on every state and input. The first column is "
+        f"the time of {reference}; the times of the others are divided by it.",
         ("robot", "n", f"{reference} [ms]", *(key for key in solvers if key != reference)),
         tuple(rows),
         tuple(notes),

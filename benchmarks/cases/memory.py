@@ -17,7 +17,7 @@ def run() -> Table:
     )
     return Table(
         "Memory",
-        f"Peak resident memory of a process after the import, and after the first linear model of "
+        "Peak resident memory of a process after the import, and after the first linear model of "
         f"{ROBOT}.",
         ("package", "import [MiB]", "first model [MiB]", "first model / fflin's"),
         rows,

@@ -52,8 +52,9 @@ def run() -> Table:
         )
     return Table(
         "Growth with the number of points",
-        f"Linearisations of {ROBOT} at rest with a new Linearizer, its making included: time a "
-        "point; that of `linearize` as a multiple; the ratio to pin.computeMinverse.",
+        f"Linearisations of {ROBOT} at rest with a new Linearizer, including its construction. The "
+        "columns are the time per point, the time per call of `linearize` divided by it, and its "
+        "ratio to pin.computeMinverse.",
         ("points", "fflin [us a point]", "linearize, each afresh", "fflin / computeMinverse"),
         tuple(rows),
     )

@@ -59,11 +59,12 @@ def run() -> Table:
             raise WrongResultError(f"fflin on {name}: {own.unfinished} plans are not found")
     return Table(
         "Plans of a receding horizon",
-        f"A slew at the limits of torques, speeds and travels, at {1 / STEP:.0f} Hz over {SAMPLES} "
-        f"samples, {DURATION / STEP:.0f} plans: time of the first plan, the median and the 99th "
-        "percentile of all, from the robot's state to its inputs; how many are not finished; and "
-        "the largest difference of their inputs from fflin's. The others solve the same program, "
-        "`matrices`, scaled to a unit diagonal, OSQP from the plan before to its own accuracy.",
+        f"A slew at the limits of torques, speeds and joint positions, at {1 / STEP:.0f} Hz over "
+        f"{SAMPLES} samples, with {DURATION / STEP:.0f} plans. The columns are the time of the "
+        "first plan; the median and the 99th percentile of all plans, from the robot's state to "
+        "its inputs; the number of unfinished plans; and the largest difference of their inputs "
+        "from fflin's. The others solve the same program, `matrices`, scaled to a unit diagonal. "
+        "OSQP starts from the previous plan and stops at its own accuracy.",
         (
             "robot",
             "solver",

@@ -44,11 +44,11 @@ def run() -> Table:
             )
         )
     return Table(
-        "What masses change",
-        "Derivatives at rest over the ten dynamic parameters of every body, as ratios to one "
-        "`pin.computeMinverse`: of the accelerations over state and inputs, which are those of A "
-        "and B; of A, B, C, D and f0 over every named parameter; and with all that `sensitivity` "
-        "prepares.",
+        "Derivatives with respect to masses",
+        "Derivatives at rest with respect to the ten dynamic parameters of every body, as ratios "
+        "to one `pin.computeMinverse`. The columns are the derivatives of the accelerations with "
+        "respect to state and inputs, which determine A and B; of A, B, C, D and f0 for every "
+        "named parameter; and these with all preparations of `sensitivity`.",
         ("robot", "parameters", "inverse [us]", "slopes", "named", "matrices", "whole"),
         tuple(rows),
     )

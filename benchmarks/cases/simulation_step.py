@@ -47,9 +47,9 @@ def run() -> Table:
         rows.append((name, point.robot.n, figure(own.least / STEPS * 1e6), row))
     return Table(
         "Simulation step",
-        f"One of {STEPS} steps of {STEP * 1e3:g} ms at fourth order (Drake: third, its highest of "
-        f"fixed step), without inputs; fflin keeps the momentum besides: time of fflin, the "
-        "others' as multiples of it.",
+        f"One of {STEPS} steps of {STEP * 1e3:g} ms at order four (Drake: three, its highest order "
+        "with a fixed step), without inputs. fflin also conserves the momentum. The first column "
+        "is the time of fflin; the times of the others are divided by it.",
         ("robot", "n", "fflin [us]", *columns),
         tuple(
             (name, str(n), time, *(row.get(key, figure(None)) for key in columns))

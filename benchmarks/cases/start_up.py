@@ -30,8 +30,9 @@ def run() -> Table:
     )
     return Table(
         "Start-up",
-        f"Whole processes, in turns: Python and the import alone, and until the first linear model "
-        f"of {ROBOT} from its URDF (Pinocchio: the first M^-1).",
+        "Whole processes, in turns. The columns are the time of Python and the import alone, and "
+        f"the time until the first linear model of {ROBOT} from its URDF (Pinocchio: the first "
+        "M^-1).",
         ("package", "import [ms]", "first model [ms]", "first model / fflin's"),
         rows,
         tuple(notes),

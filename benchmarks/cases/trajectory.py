@@ -81,10 +81,10 @@ def run() -> Table:
     return Table(
         "Along a trajectory",
         f"planar_detumble over {KNOTS} knots of a motion of {DURATION:g} s: its linear models with "
-        "fflin's check of the motion, the regulator along it, and the closed loop from 1 deg, 3 "
-        "deg in the joints and 3 deg/s beside it: time of fflin, Drake's as a multiple. Errors are "
-        "relative to the largest gain or the largest entry of the last state, against a tight "
-        "reference.",
+        "fflin's check of the motion; the regulator along it; and the closed loop with an initial "
+        "error of 1 deg in attitude, 3 deg in the joints and 3 deg/s. The columns are fflin's "
+        "time and Drake's time divided by it. Errors are relative to the largest gain or the "
+        "largest entry of the final state, compared with a tight reference.",
         ("", "fflin [ms]", "error", "Drake", "error of Drake"),
         tuple(cells),
         tuple(notes),

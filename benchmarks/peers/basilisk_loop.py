@@ -26,7 +26,7 @@ def contenders(loop: Loop) -> list[Contender]:
 def mrp_law(loop: Loop) -> Loop:
     """Return the loop under Basilisk's law, which is the same to first order."""
     if not loop.wheels:
-        raise ValueError("its attitude loop turns one body by wheels, and no more")
+        raise ValueError("its attitude loop supports one body with wheels only")
     K = loop.K.copy()
     K[:, :3] *= 2.0  # a parameter is half of q_b
     return loop.but(K=K, held=True, mrp=True)

@@ -35,7 +35,7 @@ class DrakeLoop:
 
     def __init__(self, loop: Loop) -> None:
         if loop.wheels:
-            raise RuntimeError("a wheel is a body without mass, which Drake has not")
+            raise RuntimeError("a wheel is a body without mass, which Drake does not support")
         self.loop = loop
         self.here = here = DrakePoint(loop.point, rest=True)
         M = here.plant.CalcMassMatrix(here.context)

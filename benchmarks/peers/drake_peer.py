@@ -17,7 +17,7 @@ class DrakePoint:
 
     def __init__(self, point: Point, *, rest: bool) -> None:
         if not is_rigid(point.robot):
-            raise RuntimeError("Drake replaces the inertias that no rigid body can have")
+            raise RuntimeError("Drake replaces inertias that are not physically realisable")
         self.plant = plant = free_plant(plain_urdf(point.robot))
         self.context = plant.CreateDefaultContext()
         base = plant.GetBodyByName(BASE)

@@ -31,7 +31,7 @@ class MujocoLoop:
 
     def __init__(self, loop: Loop) -> None:
         if loop.wheels:
-            raise ValueError("a wheel is a body without mass, which MuJoCo's URDF has not")
+            raise ValueError("a wheel is a body without mass, which MuJoCo's URDF does not support")
         self.loop = loop
         here = MujocoPoint(loop.point, motors=False, any_inertia=True)
         self.model, self.data, self.order = here.model, here.data, here.order

@@ -1,7 +1,7 @@
-"""Pages that are run: what a run writes belongs to every build, whether it runs them again or not.
+"""Executed pages: every build contains the files that a run of a page wrote.
 
-Sphinx runs a page only when its source changed since the last build. What the run wrote is kept in
-`docs/_build/executed`, beside the page's doctree, and every build copies it into its site.
+Sphinx runs a page only if its source changed since the last build. The files of the run are kept
+in `docs/_build/executed`, beside the page's doctree, and every build copies them into its site.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from sphinx.environment import BuildEnvironment
 
 
 def kept(app: Sphinx) -> Path:
-    """Return the folder of what pages wrote, with a folder of its own for each page."""
+    """Return the folder of the files that pages wrote, with one folder for each page."""
     return Path(app.doctreedir) / "executed" / "pages"
 
 
 def keep_pictures(app: Sphinx) -> None:
-    """Keep the figures of the pages there too, not in a folder beside the site."""
+    """Keep the figures of the pages there too."""
     folder = str(kept(app).parent)
     app.env.mystnb_config = app.env.mystnb_config.copy(output_folder=folder)
 
 
 def forget(app: Sphinx, env: BuildEnvironment, page: str) -> None:
-    """Remove what a page wrote before it is run again, or when it is gone."""
+    """Remove the files of a page before it is run again, or when it is removed."""
     shutil.rmtree(kept(app) / page, ignore_errors=True)
 
 
 def announce(app: Sphinx, page: str, source: list[str]) -> None:
-    """Tell the kernel that is started for a page which page it runs."""
+    """Pass the name of the page to the kernel that runs it."""
     os.environ["FFLIN_DOCS_PAGE"] = page
 
 
 def deliver(app: Sphinx, error: Exception | None) -> None:
-    """Copy what all pages wrote into the site."""
+    """Copy the files of all pages into the site."""
     folder = Path(app.outdir) / "pages"
     shutil.rmtree(folder, ignore_errors=True)
     if error is None and kept(app).exists():
@@ -46,7 +46,7 @@ def deliver(app: Sphinx, error: Exception | None) -> None:
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register with Sphinx."""
-    # What Sphinx keeps for its next build is no part of the site.
+    # Files that Sphinx keeps for its next build are not part of the site.
     app.doctreedir = app.srcdir / "_build"
     here = str(Path(__file__).parent)
     # The kernels find the module `pages`, use one thread each, and print nothing about themselves.

@@ -1,4 +1,4 @@
-"""What the site takes from the code: the reference, the command line, numbered formulas."""
+"""Site content from the code: reference, command line, numbered equations, links to names."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fflin.commands import cli
 
 
 def titles() -> dict[str, list[str]]:
-    """Return the public names by title, as the stub lists them."""
+    """Return the public names by title, in the order of the stub."""
     found: dict[str, list[str]] = {}
     for line in Path(fflin.__file__).with_suffix(".pyi").read_text(encoding="utf-8").splitlines():
         if line.startswith("# "):
@@ -33,14 +33,14 @@ def titles() -> dict[str, list[str]]:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a page where it differs, so that what did not change is not read again."""
+    """Write a page only if it differs, so that Sphinx does not read unchanged pages again."""
     if not path.exists() or path.read_text(encoding="utf-8") != text:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
 
 
 def reference(app: Sphinx) -> None:
-    """Write a page for each title of the reference, with a table that leads to its names."""
+    """Write a page for each title of the reference, with a table of links to its names."""
     folder = Path(app.srcdir) / "reference"
     head = ".. currentmodule:: fflin\n\n.. autosummary::\n   :nosignatures:\n   :toctree: names\n\n"
     pages = {}
@@ -54,14 +54,14 @@ def reference(app: Sphinx) -> None:
     tables = "".join(text.replace("   :toctree: names\n", "") + "\n" for text in pages.values())
     write(
         folder / "index.rst",
-        "Reference\n#########\n\nEvery public name, as ``fflin.NAME``, by what it is for. Each has "
-        "a page with its equation,\nshapes, units, errors and an example.\n\n"
+        "Reference\n#########\n\nAll public names ``fflin.NAME``, grouped by task. Each name has a "
+        "page with its equation,\nshapes, units, errors and an example.\n\n"
         f".. toctree::\n   :hidden:\n\n{entries}\n{tables}",
     )
 
 
 class CommandHelp(SphinxDirective):
-    """The ``--help`` of every command, each under its name."""
+    """Directive that shows the ``--help`` of every command, each under its name."""
 
     def run(self) -> list[nodes.Node]:
         """Return a section for each command."""
@@ -86,7 +86,7 @@ def _help(text: str) -> nodes.literal_block:
 
 
 def keep_tags(app: Sphinx, doctree: nodes.document) -> None:
-    """Give formulas with a number of their own an environment that bears it."""
+    """Put equations with a tag into an environment that shows their number."""
     for node in doctree.findall(nodes.math_block):
         if r"\tag{" in node.astext():
             text = rf"\begin{{equation}}{node.astext()}\end{{equation}}"
@@ -95,7 +95,7 @@ def keep_tags(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def link_names(app: Sphinx, doctree: nodes.document) -> None:
-    """Let public names that stand as code, ``lqr`` or ``fflin.lqr(lin)``, lead to their pages."""
+    """Link public names in code, ``lqr`` or ``fflin.lqr(lin)``, to their pages."""
     page = app.env.current_document.docname
     if page.startswith("reference/"):
         return
@@ -113,19 +113,19 @@ def link_names(app: Sphinx, doctree: nodes.document) -> None:
 def short_signature(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, result: str
 ) -> tuple[str, str] | None:
-    """Leave out what a record is made of: its attributes are told, and a function makes it."""
+    """Hide the signature of a record: a function creates it, and its attributes are listed."""
     made = what == "class" and "\nParameters\n---" not in (inspect.getdoc(obj) or "")
     return ("", result) if made and dataclasses.is_dataclass(obj) else None
 
 
 def link_pages(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Let docstrings that name a page of the documents lead to it."""
+    """Link the names of documentation pages in docstrings."""
     for at, line in enumerate(lines):
         lines[at] = re.sub(r"docs/([\w/]+)\.md", r":doc:`/\1`", line)
 
 
 def keep_template() -> None:
-    """Let numpydoc compile its template once, not again for every docstring."""
+    """Make numpydoc compile its template once, not for every docstring."""
     kept: list[SandboxedEnvironment] = []
 
     def environment(loader: BaseLoader) -> SandboxedEnvironment:

@@ -1,4 +1,4 @@
-"""The commands that judge a linear model: structure, modes, its reach, and what masses change."""
+"""The commands `analyze`, `modes`, `validity`, `sensitivity` and `uncertain`."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ def add_commands(commands: Commands) -> None:
     """Add analyze, modes, validity, sensitivity and uncertain."""
     analyze = command(
         *(commands, "analyze", _analyze),
-        "show what the inputs can move, what is conserved, the modes, and what the outputs show",
+        "show controllability, conserved momenta, modes and observability of a linear model",
         "fflin analyze servicer_7dof --stiffness panel_left=100 --output joints",
     )
     add_point(analyze)
-    add_figure(analyze, "draw the modes")
+    add_figure(analyze, "plot the modes")
     modes = command(
         *(commands, "modes", _modes),
         "show natural frequencies, damping ratios, kinetic energies and effective masses",
         "fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100",
     )
     add_point(modes)
-    add_figure(modes, "draw frequencies, damping and shapes")
+    add_figure(modes, "plot frequencies, damping and shapes")
     add_options(modes, "--html >FILE: write a page that plays the mode shapes")
     validity = command(
         *(commands, "validity", _validity),
-        "measure how far from the point the linear model can be trusted and its regulator holds",
+        "measure how far from its point the linear model is accurate and its regulator settles",
         "fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
     )
     add_point(validity)
@@ -54,40 +54,47 @@ def add_commands(commands: Commands) -> None:
     add_options(
         validity,
         """
-        --attitude X = 90: largest turn of the base [deg]; 90 by default
+        --attitude X = 90: largest rotation of the base [deg]; 90 by default
         --offset X = 0.5: largest displacement of the base [m]; 0.5 by default
         --spread X = 1: largest displacement of a joint [rad|m]; 1 by default
-        --samples N = 100: random runs; 100 by default
-        --seed S = 0: seed of the random runs; 0 by default
-        --jobs N = 1: processes, at most one for each core; 1 by default
-        --limits urdf|none = none: cut the inputs to the limits of the robot, or not (default)""",
+        --samples N = 100: number of random runs; 100 by default
+        --seed S = 0: random seed of the runs; 0 by default
+        --jobs N = 1: number of processes, at most one for each core; 1 by default
+        --limits urdf|none = none: saturate the inputs at the limits of the robot, or not
+            (default)""",
     )
-    frames = "--frames hybrid|local|world: feed the base's rates and inputs back in these axes too"
+    frames = """--frames hybrid|local|world: also test the loop with base velocities and inputs in
+        these axes"""
     add_options(validity, frames, nargs="+", default=())
-    add_figure(validity, "draw it")
+    add_figure(validity, "plot the results")
     sensitivity = command(
         *(commands, "sensitivity", _sensitivity),
-        "show or save what masses, inertias, springs and thrusters change of A and B",
+        "show or save the derivatives of A and B with respect to masses, springs, thrusters ...",
         "fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
     )
     add_point(sensitivity)
-    add_options(sensitivity, "--dt H: of the model sampled, with inputs held over H [s]")
-    add_options(sensitivity, "--top N = 15: the N that change most; 15 by default")
-    add_options(sensitivity, "--only NAME: of these alone: mass, link_3, *.density")
-    add_output_file(sensitivity, "save dA, dB, df0 over each parameter: .npz, .mat or .json")
+    add_options(sensitivity, "--dt H: derivatives of the sampled model, with inputs held for H [s]")
+    add_options(
+        sensitivity, "--top N = 15: show the N parameters with the largest effect; 15 by default"
+    )
+    add_options(sensitivity, "--only NAME: show these parameters only: mass, link_3, *.density")
+    add_output_file(sensitivity, "save dA, dB, df0 for each parameter to FILE: .npz, .mat or .json")
     uncertain = command(
         *(commands, "uncertain", _uncertain),
-        "show or save the model at rest as an exact fraction of parameters in ranges",
+        "show or save the exact linear-fractional model (LFT) of parameters in ranges, at rest",
         "fflin uncertain servicer_7dof --vary base.mass=0.2 --vary panel_left.stiffness=80:120 "
         "-o uncertain.mat",
     )
     add_robot(uncertain)
-    add_options(uncertain, "--joint NAME=VALUE*: put a joint at VALUE [rad|m]; others at neutral")
+    add_options(
+        uncertain, "--joint NAME=VALUE*: position of a joint [rad|m]; others are at neutral"
+    )
     add_system(uncertain, axes=False)
-    vary = """--vary NAME=RANGE*: a parameter of `fflin sensitivity` or a pattern, and its range:
-        0.2, a share of its value, or LEAST:LARGEST; RANGE,tied is one for all of a pattern"""
+    vary = """--vary NAME=RANGE*: range of a parameter of `fflin sensitivity` or of a pattern: a
+        fraction of its value, such as 0.2, or LEAST:LARGEST; with RANGE,tied all parameters of
+        the pattern share one delta"""
     add_options(uncertain, vary, type=_range, required=True)
-    add_output_file(uncertain, "save A, B1 .. D22 and the blocks: .npz, .mat or .json")
+    add_output_file(uncertain, "save A, B1 .. D22 and the blocks to FILE: .npz, .mat or .json")
 
 
 def _range(text: str) -> tuple[str, Any]:
@@ -95,7 +102,9 @@ def _range(text: str) -> tuple[str, Any]:
     tied = value.endswith(",tied")
     ends = value.removesuffix(",tied").split(":")
     if not name or len(ends) > 2:
-        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=SHARE or NAME=LEAST:LARGEST")
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not of the form NAME=FRACTION or NAME=LEAST:LARGEST"
+        )
     found = tuple(map(number, ends)) if ends[1:] else number(ends[0])
     return name, {"range": found, "tied": True} if tied else found
 

@@ -1,4 +1,4 @@
-"""What the commands take: the robot, the point, and how their values are read."""
+"""Options that commands share: robot, operating point, system; parsers of their values."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ def number(text: str) -> float:
 
 
 def whole(text: str) -> int:
-    """Read a whole number that is not negative."""
+    """Read a non-negative integer."""
     if not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a non-negative integer")
     return int(text)
 
 
 def count_of(text: str) -> int:
-    """Read a whole number from 1 on."""
+    """Read a positive integer."""
     if not (count := whole(text)):
-        raise argparse.ArgumentTypeError("0 is too few, expected 1 or more")
+        raise argparse.ArgumentTypeError("0 is too small, expected 1 or more")
     return count
 
 
 def input_file(text: str) -> Path:
-    """Read the name of a file that the command reads."""
+    """Read the path of an input file."""
     if not text:
-        raise argparse.ArgumentTypeError("the name of the file is empty")
+        raise argparse.ArgumentTypeError("the file name is empty, expected a path")
     return Path(text)
 
 
 def input_name(text: str) -> str:
-    """Read the name of a file that the command reads, or of what is bundled."""
+    """Read the path of an input file, or a bundled name."""
     return text
 
 
 def output_file(text: str) -> Path:
-    """Read the name of a file that the command writes."""
+    """Read the path of an output file."""
     return input_file(text)
 
 
@@ -61,12 +61,12 @@ def assignment(text: str) -> tuple[str, float]:
     """Read NAME=VALUE."""
     name, separator, value = text.rpartition("=")
     if not separator or not name:
-        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=VALUE")
+        raise argparse.ArgumentTypeError(f"'{text}' is not of the form NAME=VALUE")
     return name, number(value)
 
 
 def passive(text: str) -> tuple[str | None, float | str]:
-    """Read NAME=VALUE, VALUE for all joints (name None), or urdf."""
+    """Read NAME=VALUE, or VALUE or urdf for all joints (name None)."""
     if "=" in text:
         return assignment(text)
     return None, text if text == "urdf" else number(text)
@@ -79,7 +79,7 @@ def orbit(text: str) -> dict[str, float | str]:
 
 
 def lock(text: str) -> tuple[str, float | None]:
-    """Read NAME=VALUE, or NAME for neutral (value None)."""
+    """Read NAME=VALUE, or NAME for the neutral position (value None)."""
     return assignment(text) if "=" in text else (text, None)
 
 
@@ -100,7 +100,7 @@ def command(
     summary: str,
     example: str,
 ) -> argparse.ArgumentParser:
-    """Add a command; `example` stands at the end of its help."""
+    """Add a command; its help ends with `example`."""
     command: argparse.ArgumentParser = commands.add_parser(
         name,
         help=summary,
@@ -112,7 +112,7 @@ def command(
 
 
 def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[Path]]:
-    """Return the files that the arguments have a command read, and those that it is to write."""
+    """Return the input files and the output files that the arguments name."""
     given: dict[Any, list[Path]] = {input_file: [], input_name: [], output_file: []}
     for action in arguments.command._actions:
         value = getattr(arguments, action.dest, None)
@@ -122,12 +122,12 @@ def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[Path]]:
 
 
 def add_options(group: Container, text: str, **more: Any) -> None:
-    """Add options, each a line ``--name METAVAR: help`` and those that go on with it.
+    """Add options; each is a line ``--name METAVAR: help`` with its continuation lines.
 
-    A metavar in _READ says how the value is read, one such as a|b what it may be, X,Y numbers;
-    FILE is read and >FILE written. Behind it stand ``*`` where the option is repeatable, ``!``
-    where it is required, or ``= default``. Without one it is a switch, ``--[no-]x`` of both ways.
-    What holds of all is in `more`.
+    A metavar in _READ selects the parser of the value, a|b lists the choices, and X,Y are numbers.
+    FILE is an input file and >FILE an output file. A suffix ``*`` marks a repeatable option, ``!``
+    a required one, and ``= default`` gives the default. An option without a metavar is a switch;
+    ``--[no-]x`` can be switched on and off. `more` applies to all options of the text.
     """
     for line in re.split(r"\n\s*(?=--)", text.strip()):
         found = _OPTION.fullmatch(" ".join(line.split()))
@@ -155,18 +155,18 @@ def add_options(group: Container, text: str, **more: Any) -> None:
 
 def add_robot(command: argparse.ArgumentParser) -> None:
     """Add ROBOT and --lock."""
-    what = "a name of `fflin robots`, or the path of a URDF or of a robot.toml"
+    what = "name of a robot in `fflin robots`, or path of a URDF or of a robot.toml"
     command.add_argument("robot", metavar="ROBOT", type=input_name, help=what)
     add_options(
         command,
         """
-        --lock NAME[=VALUE]*: weld a joint, at VALUE [rad|m] or at neutral; NAME may be a pattern,
-            'hinge_*', here and below""",
+        --lock NAME[=VALUE]*: lock a joint at VALUE [rad|m], or at its neutral position; NAME may
+            be a pattern such as 'hinge_*', here and in the options below""",
     )
 
 
 def add_point(command: argparse.ArgumentParser) -> None:
-    """Add the robot and what says the point that it is linearised about."""
+    """Add the robot and the options of its operating point."""
     add_robot(command)
     add_pose(command)
     add_system(command)
@@ -175,39 +175,43 @@ def add_point(command: argparse.ArgumentParser) -> None:
 
 
 def add_reference(command: argparse.ArgumentParser) -> None:
-    """Add what attitude and position are relative to."""
+    """Add the option for the reference of attitude and position."""
     add_options(
         command,
         """
-        --reference base|world = base: what attitude and position are relative to: the base where it
-            stands (default), or the world""",
+        --reference base|world = base: reference of attitude and position in the state: the base
+            pose of the operating point (default), or the world""",
     )
 
 
 def add_pose(command: Container) -> None:
-    """Add what says where the robot is and how it moves."""
+    """Add the options for the configuration and velocity of the robot."""
     add_options(
         command,
         """
-        --joint NAME=VALUE*: put a joint at VALUE [rad|m]; the others are at neutral
+        --joint NAME=VALUE*: position of a joint [rad|m]; other joints are at their neutral
+            position
         --rpy R,P,Y: base attitude: roll, pitch, yaw [deg] about fixed axes
         --position X,Y,Z: base position [m]
-        --velocity NAME=VALUE*: a velocity at the point: the rate [rad/s|m/s] of a joint or wheel,
-            or omega_b.x ... v_b.z of the base in base axes""",
+        --velocity NAME=VALUE*: velocity of a joint or wheel [rad/s|m/s], or omega_b.x ... v_b.z of
+            the base in base axes""",
     )
 
 
 def add_inputs_there(command: Container) -> None:
-    """Add what says the inputs at the point."""
+    """Add the options for the inputs at the operating point."""
     add_options(
         command,
         """
-        --effort NAME=VALUE*: an input at the point, by its name in u, such as tau_m.joint_1
-        --equilibrium: take the least inputs that balance springs, gravity and a steady motion at
-            the point, where passive joints sag on their springs; refused where there are none""",
+        --effort NAME=VALUE*: input at the operating point, by its name in u, such as
+            tau_m.joint_1
+        --equilibrium: use the smallest inputs that hold the operating point against springs,
+            gravity and steady motion. Passive joints sag on their springs. If no inputs hold the
+            point, the command reports an error""",
     )
-    text = """--relative-equilibrium N: in orbit, take the N-th of 24 attitudes (default 1) that the
-        field does not turn, with --equilibrium; attitude and position count from there"""
+    text = """--relative-equilibrium N: in orbit, use the N-th (default: first) of the 24 attitudes
+        without gravity-gradient torque, with the inputs of --equilibrium. Attitude and position
+        are relative to it"""
     add_options(command, text, nargs="?", const=1, choices=range(1, 25))
 
 
@@ -216,39 +220,40 @@ def add_orbit(command: Container) -> None:
     add_options(
         command,
         """
-        --orbit ALTITUDE[:BODY]: a circular orbit at so many metres over the earth (default), moon,
-            mars ...: the world is then the frame of the orbit""",
+        --orbit ALTITUDE[:BODY]: circular orbit at an altitude [m] above the earth (default), moon,
+            mars ...; the world is then the frame of the orbit""",
     )
 
 
 def add_system(command: Container, *, axes: bool = True) -> None:
-    """Add what acts on the robot, what is watched of it, and in which axes."""
+    """Add the options for forces, inputs, outputs and the axes of velocities."""
     add_orbit(command)
     add_options(
         command,
         """
         --stiffness [NAME=]VALUE*: stiffness of a joint [N m/rad|N/m], or one value for all joints
         --damping [NAME=]VALUE*: damping of a joint [N m s/rad|N s/m], or one value for all joints;
-            `urdf`: what the URDF says
-        --gravity X,Y,Z: uniform gravity in world axes [m/s^2]; none by default
-        --passive NAME*: a joint without a motor: it gets no torque by default
-        --inputs FILE.toml: what acts on the robot, as fflin.load_inputs reads it: a file, or the
-            name of a bundled one; `joints` or `base`: those alone; by default those of a
-            robot.toml, or torque and force on the base and every joint's
-        --output SPEC*: what is watched: state (default), base, joints, rates, joints:NAME,
+            `urdf` uses the damping in the URDF
+        --gravity X,Y,Z: uniform gravity in world axes [m/s^2]; zero by default
+        --passive NAME*: joint without a motor, which gets no torque input by default
+        --inputs FILE.toml: inputs of the robot: a file for fflin.load_inputs, a bundled name,
+            `joints` (joint torques only) or `base` (base torque and force only). The default is
+            the inputs of robot.toml, or base torque, base force and all joint torques
+        --output SPEC*: outputs of the model: state (default), base, joints, rates, joints:NAME,
             rates:NAME (a joint or a pattern), com, momentum, frame:NAME (pose and velocity),
-            pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME; relative:NAME:TO, as
-            another frame sees it""",
+            pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (NAME
+            relative to frame TO)""",
     )
     frame = """
-        --frame hybrid|local|world|lvlh|hill: axes of velocities and wrenches: angular in base axes
-            and linear in reference axes (hybrid, default), both in base axes (local), both in
-            reference axes (world); in orbit the world is along, minus normal, to the body (lvlh,
-            default), or from the body, along, normal (hill), with axes as hybrid"""
+        --frame hybrid|local|world|lvlh|hill: axes of velocities and wrenches. hybrid (default):
+            angular in base axes, linear in reference axes; local: all in base axes; world: all in
+            reference axes. In orbit the axes are as in hybrid, and the world is lvlh (default): x
+            along the orbit, y against its normal, z towards the body; or hill: x away from the
+            body, y along the orbit, z along its normal"""
     if axes:
         add_options(command, frame)
 
 
 def add_output_file(command: Container, what: str) -> None:
-    """Add -o FILE; `what` says which endings there are."""
+    """Add -o FILE with the help `what`, which lists the endings."""
     command.add_argument("-o", "--output-file", metavar="FILE", type=output_file, help=what)

@@ -1,4 +1,4 @@
-"""The command line: parses, runs a command, and turns errors into lines and exit codes."""
+"""Entry point: parse, run a command, convert errors to one line and an exit code."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from fflin.base.writing import files_of_command
 from fflin.commands import BAD_INPUT, DONE
 from fflin.commands.arguments import files_of
 
-# The commands by task, as the help lists them, each with its module.
+# The commands by task, in the order of the help, each with its module.
 TASKS = {
-    "look at robots": {"robots": "models", "info": "models", "init": "init", "view": "visual"},
+    "inspect robots": {"robots": "models", "info": "models", "init": "init", "view": "visual"},
     "make and check a linear model": {"linearize": "models", "check": "models"},
-    "judge it": {
+    "analyse a model": {
         **dict.fromkeys(("analyze", "modes", "validity", "sensitivity", "uncertain"), "analysis"),
         "funnel": "funnels",
     },
-    "close the loop": {"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
-    "go through many": {"sweep": "sweeps", "montecarlo": "montecarlo"},
+    "design and simulate": {"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
+    "many models or simulations": {"sweep": "sweeps", "montecarlo": "montecarlo"},
 }
 _MODULES = {name: module for names in TASKS.values() for name, module in names.items()}
 
@@ -35,11 +35,11 @@ _MODULES = {name: module for names in TASKS.values() for name, module in names.i
 class _Parser(argparse.ArgumentParser):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        # What is a negative number and no option; by default -1e-3 is taken for one.
+        # A negative number such as -1e-3 is a value, not an option.
         self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        # argparse ignores that a help cannot be written.
+        # argparse ignores errors when it writes a help.
         if file is not None:
             file.write(message)
             file.flush()
@@ -50,10 +50,10 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return 0 done, 1 a check fell short, 2 bad input."""
-    # What other packages warn of is shown at the end of what went well: an error says why.
+    """Run the command line; return 0 done, 1 a check failed, 2 invalid input."""
+    # Warnings of other packages are shown after success only: an error has its own reason.
     held: list[str] = []
-    told: set[str] = set()  # each once, however many models a command makes
+    told: set[str] = set()  # each once per command
 
     def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
         text = str(message)
@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     warnings.showwarning = show
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # Names may hold what the terminal cannot show.
+        # Names may contain characters that the terminal cannot show.
         sys.stdout.reconfigure(errors="backslashreplace")
     argv = sys.argv[1:] if argv is None else argv
     try:
@@ -78,11 +78,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         for line in held:
             _tell(line)
         return code
-    except (FflinError, FflinWarning) as error:  # a warning where Python is told to raise them
+    except (FflinError, FflinWarning) as error:  # a warning if Python raises warnings
         _tell(f"fflin: error: {error}")
         return BAD_INPUT
     except BrokenPipeError:
-        # The reader, such as head, has what it wanted; the interpreter must not complain either.
+        # The reader, such as head, closed the pipe; the interpreter must not report it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:
@@ -92,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _tell(line: str) -> None:
-    """Write a line to stderr; the exit code tells enough where that cannot be written."""
+    """Write a line to stderr; if stderr is closed, the exit code is the only report."""
     try:
         print(one_line(line), file=sys.stderr, flush=True)
     except OSError:
@@ -100,7 +100,7 @@ def _tell(line: str) -> None:
 
 
 def _parser(asked: str) -> argparse.ArgumentParser:
-    """Make the parser of the command that is asked for, or else of all of them."""
+    """Return the parser of one command, or of all commands."""
     parser = _Parser(
         prog="fflin",
         usage="fflin [-h] [--version] COMMAND ...",
@@ -113,7 +113,7 @@ def _parser(asked: str) -> argparse.ArgumentParser:
     )
     for name in [_MODULES[asked]] if asked in _MODULES else dict.fromkeys(_MODULES.values()):
         import_module(f"fflin.commands.{name}").add_commands(commands)
-    # argparse lists all in one group.
+    # argparse puts all commands in one group.
     left = {command.dest: command for command in commands._choices_actions}
     commands._choices_actions = []
     for task, names in TASKS.items():

@@ -1,4 +1,4 @@
-"""The command that measures the region around a trajectory from which its regulator holds."""
+"""The command `funnel`: the region of attraction along a trajectory."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from fflin.commands.regulator import add_weights
 from fflin.commands.tracking import add_trajectory
 from fflin.commands.visual import add_figure, check_figure, draw
 
-_KINDS = "attitude [deg], position [m], joints, turning, moving or rates"
+_KINDS = "attitude [deg], position [m], joints, turning (omega_b), moving (v_b) or rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
 
-# What `along` refuses of others' options.
+# Options of other commands, which `along` refuses.
 _NONE = "free gain controller target_joint target_velocity effort equilibrium"
 _NONE += " joint rpy position velocity"
 
@@ -26,7 +26,7 @@ def add_commands(commands: of.Commands) -> None:
     """Add funnel."""
     funnel = of.command(
         *(commands, "funnel", _funnel),
-        "measure from which errors along a trajectory its regulator still ends inside a goal",
+        "measure the errors along a trajectory from which its regulator reaches a goal",
         "fflin funnel arm.toml --trajectory plan.csv --schedule gains.npz --goal attitude=1",
     )
     of.add_robot(funnel)
@@ -36,20 +36,20 @@ def add_commands(commands: of.Commands) -> None:
     of.add_options(
         funnel,
         f"""
-        --schedule FILE: the gains, as tvlqr saves them; without it they are designed
+        --schedule FILE: gains saved by tvlqr; without it they are designed
         --html >FILE: write a page that plays the motion with the funnel as a tube
-        --goal NAME=VALUE*: largest error at the end: {_KINDS}
-        --within NAME=VALUE*: largest error on the way, as of --goal
-        --limits urdf|none = urdf: what cuts the inputs: the limits of the robot (default), or none
-        --knots N = 10: knots that are done; 10 by default
-        --samples N = 100: runs from each; 100 by default
-        --seed S = 0: seed of the runs; 0 by default
-        --confidence P = 0.95: of the intervals; 0.95 by default
-        --threads N: threads; by default one for each core
-        --step H: step of the integration [s]; chosen by default""",
+        --goal NAME=VALUE*: largest error allowed at the end: {_KINDS}
+        --within NAME=VALUE*: largest error allowed along the trajectory; names as in --goal
+        --limits urdf|none = urdf: saturate the inputs at the limits of the robot (default), or not
+        --knots N = 10: number of knots to test; 10 by default
+        --samples N = 100: runs from each knot; 100 by default
+        --seed S = 0: random seed of the runs; 0 by default
+        --confidence P = 0.95: confidence level of the intervals; 0.95 by default
+        --threads N: number of threads; by default one for each core
+        --step H: integration step [s]; chosen automatically by default""",
     )
-    add_figure(funnel, "draw it")
-    of.add_output_file(funnel, "save it to FILE: .npz, .mat or .json")
+    add_figure(funnel, "plot the funnel")
+    of.add_output_file(funnel, "save the funnel to FILE: .npz, .mat or .json")
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 
@@ -60,7 +60,7 @@ def _funnel(arguments: argparse.Namespace) -> int:
     from fflin.campaign.funnel import funnel
 
     if arguments.trajectory is None and arguments.schedule is None:
-        raise InputError("--trajectory and --schedule are missing; give either, or both")
+        raise InputError("neither --trajectory nor --schedule is given; give one of them, or both")
     check_figure(arguments.plot)
     for path, endings in ((arguments.html, (".html",)), (arguments.output_file, FORMATS)):
         if path:

@@ -1,4 +1,4 @@
-"""The command that writes a robot file to begin with."""
+"""The command `init`: write a first robot file."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ def add_commands(commands: Commands) -> None:
     """Add init."""
     init = command(
         *(commands, "init", _init),
-        "write a robot.toml with what a URDF suggests: inputs, limits, joints without a motor",
+        "write a first robot.toml from a URDF: inputs, limits, joints without a motor",
         "fflin init my.urdf && fflin simulate my.toml",
     )
     init.add_argument(
-        "robot", metavar="URDF", type=input_name, help="its path, or a name of `fflin robots`"
+        "robot",
+        metavar="URDF",
+        type=input_name,
+        help="path of a URDF, or name of a robot in `fflin robots`",
     )
-    add_output_file(init, "where to; by default the URDF's name with .toml, in this folder")
-    add_options(init, "--force: write over a file that is there")
+    add_output_file(init, "output file; by default the name of the URDF with .toml, in this folder")
+    add_options(init, "--force: replace an existing file")
 
 
 def _init(arguments: argparse.Namespace) -> int:
@@ -40,11 +43,11 @@ def _init(arguments: argparse.Namespace) -> int:
 
     found = find_robot(arguments.robot)
     if found.path.suffix.lower() == ".toml":
-        raise InputError(f"{found.path} is a robot file already; give a URDF")
+        raise InputError(f"{found.path} is already a robot file; give a URDF")
     target = arguments.output_file or Path(f"{found.name}.toml")
     check_place(target, (".toml",))
     if target.exists() and not arguments.force:
-        raise FileError(f"{target} is there already; name another with -o, or add --force")
+        raise FileError(f"{target} already exists; give another name with -o, or add --force")
     urdf = found.name
     if found.origin == "file":
         urdf = os.path.relpath(os.path.realpath(found.path), os.path.realpath(target.parent))
@@ -52,6 +55,6 @@ def _init(arguments: argparse.Namespace) -> int:
         warnings.simplefilter("ignore")
         robot = load(arguments.robot)
     write_whole({target: draft(robot, urdf).encode()})
-    load(target)  # warns of what the file leaves open
+    load(target)  # warns of settings that the file leaves open
     print(f"wrote {target}; try: fflin simulate {target}")
     return DONE

@@ -1,4 +1,4 @@
-"""Ctrl-C on the command line: one line and exit 130, whenever it comes."""
+"""Ctrl-C on the command line: one line and exit code 130 at any time."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from fflin.commands import INTERRUPTED
 
 
 def listen() -> None:
-    """Have Ctrl-C raise `KeyboardInterrupt` after imports and callbacks, where it would be lost."""
-    # Where it is ignored, as under nohup, it stays so.
+    """Raise `KeyboardInterrupt` after an import or callback in which it would be lost."""
+    # If SIGINT is ignored, as under nohup, it remains ignored.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _heard)
         sys.unraisablehook = _passed_over
 
 
 def leave(reason: KeyboardInterrupt) -> NoReturn:
-    """Say in a line that the command was stopped, and end without waiting for threads."""
+    """Report the stop in one line, and exit without waiting for threads."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        # In one piece, between what other processes write.
+        # One write, which output of other processes cannot split.
         sys.stderr.write(f"fflin: {reason}\n" if reason.args else "fflin: stopped\n")
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -49,7 +49,7 @@ def _passed_over(unraisable: Any) -> None:
 
 
 def _importer(frame: FrameType | None) -> FrameType | None:
-    """Return the code whose import runs in a frame, the outermost where imports are nested."""
+    """Return the frame whose import statement runs in `frame`, the outermost if nested."""
     importer = None
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
@@ -59,7 +59,7 @@ def _importer(frame: FrameType | None) -> FrameType | None:
 
 
 def _raise_in(frame: FrameType) -> None:
-    """Raise it in a frame as this comes to its next line, or to its end."""
+    """Raise `KeyboardInterrupt` in a frame at its next line or at its end."""
 
     def interrupt(*_: object) -> None:
         sys.settrace(None)

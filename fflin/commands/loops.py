@@ -1,4 +1,4 @@
-"""The loop that commands simulate, closed by what files hold or by design."""
+"""The loop that commands simulate, with a controller from files or by design."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 _WEIGHTS = ("weights", "q", "r", "bryson", "dt")
-_GROUPS = "where it starts", "where it is to be", "what regulates it", "the run", "the robot"
+_GROUPS = "start", "target", "controller", "simulation", "robot"
 _TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
 
 
 class Loop(NamedTuple):
-    """A policy, how it is simulated, and where it is one, its state feedback and model."""
+    """A policy and its simulation options; for state feedback also the feedback and its model."""
 
     policy: Any
     options: dict[str, Any]
@@ -40,20 +40,24 @@ class Loop(NamedTuple):
 
 
 def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
-    """Refuse options that say nothing beside others."""
+    """Refuse options that have no effect with others."""
     if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
         raise InputError(f"{', '.join(given)}: {why}; leave it out")
 
 
 def refuse_law(arguments: argparse.Namespace) -> None:
-    """Refuse what says how a regulator is, where there is none."""
+    """Refuse the options of a regulator together with --free."""
     _refuse(arguments, ("limit", "delay"), "--free has no input to limit or delay")
     names = (*_WEIGHTS, *_TARGETS[:2], "reduce", "allocate", "gain", "controller")
-    _refuse(arguments, names, "--free has no regulator to give weights, a target or thrusters")
+    _refuse(
+        arguments,
+        names,
+        "--free has no regulator, so that weights, a target or thrusters have no effect",
+    )
 
 
 def add_loop(command: argparse.ArgumentParser) -> Container:
-    """Add all that says the loop; return the group of the run's options."""
+    """Add the options of the loop; return the group of simulation options."""
     add_robot(command)
     start, goal, law, run, system = map(command.add_argument_group, _GROUPS)
     add_system(system)
@@ -61,17 +65,16 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
     add_options(
         start,
         """
-        --offset NAME=VALUE*: how far from the trajectory's start it starts, in the base's axes
-            there: a state, group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw
-            [deg]""",
+        --offset NAME=VALUE*: initial error from the start of the trajectory, in base axes: a
+            state, group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]""",
     )
     add_options(
         goal,
         """
-        --target-joint NAME=VALUE*: where a joint is to go [rad|m]; the others go to neutral, the
-            base to the world's origin
-        --target-velocity NAME=VALUE*: a velocity of the target, such as the speed of a wheel that
-            is to be held; it starts with it where --velocity does not say otherwise""",
+        --target-joint NAME=VALUE*: target position of a joint [rad|m]; the other joints go to
+            their neutral position, the base to the world's origin
+        --target-velocity NAME=VALUE*: target velocity, such as the speed of a wheel; also the
+            initial velocity unless --velocity is given""",
     )
     add_inputs_there(goal)
     add_trajectory(goal)
@@ -79,36 +82,36 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
     add_options(
         law,
         """
-        --schedule FILE: follow the trajectory with these gains, as tvlqr saves them; without it
-            they are designed
-        --gain FILE: regulate with this gain, as lqr saves it, about the point it was designed for
-        --controller FILE: close the loop with this linear system instead, u - u0 = system (y - y0)
-            about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts where it is sampled;
-            y is what --output says
-        --negative-feedback: it was designed for u - u0 = -system (y - y0)
-        --[no-]allocate: whether to design with torque and force on the base, and let the thrusters,
-            none of which pulls, give what comes nearest; by default where they push every way; else
-            a thrust below zero is cut
-        --free: let it move without a regulator or any input
-        --limits urdf|none = urdf: what cuts the inputs: efforts of the URDF, max and min of the
-            inputs and speeds of wheels (urdf, default), or only what --limit says (none)
-        --limit NAME=VALUE*: largest magnitude of an input, a group of them such as tau_m, or a
-            pattern; goes first
+        --schedule FILE: follow the trajectory with gains saved by tvlqr; without it they are
+            designed
+        --gain FILE: regulate with a gain saved by lqr, about the point of its design
+        --controller FILE: use a linear system as controller, u - u0 = system (y - y0) about the
+            target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled; --output
+            selects y
+        --negative-feedback: the controller was designed for u - u0 = -system (y - y0)
+        --[no-]allocate: design with torque and force on the base, and allocate the nearest wrench
+            to the thrusters, which cannot pull. This is the default if the thrusters can push in
+            every direction. Without it, negative thrust is set to zero
+        --free: simulate without a regulator and without inputs
+        --limits urdf|none = urdf: saturate the inputs at the efforts of the URDF, at max and min of
+            the inputs and at wheel speeds (urdf, default), or only at --limit (none)
+        --limit NAME=VALUE*: largest magnitude of an input, a group such as tau_m, or a pattern; it
+            takes precedence over --limits
         --delay T = 0: time from a sample to its effect [s]""",
     )
     add_options(
         run,
         """
-        --duration T: time [s]; by default that of the trajectory, or from 60 to 600, what the
-            linear loop takes to settle
-        --step H: step of the integration [s]; chosen by default
-        --method METHOD = cf4: cf4 (default), rkmk4 or semi_implicit_euler""",
+        --duration T: duration [s]; by default the duration of the trajectory, or the settling time
+            of the linear loop, between 60 and 600 s
+        --step H: integration step [s]; chosen automatically by default
+        --method METHOD = cf4: integrator: cf4 (default), rkmk4 or semi_implicit_euler""",
     )
     return run
 
 
 def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
-    """Return the loop that the options of `add_loop` say."""
+    """Return the loop of the options of `add_loop`."""
     from fflin.simulation.times import SHORTEST, time_to_settle
 
     given = once("--limit", arguments.limit)
@@ -120,12 +123,12 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         "duration": arguments.duration,
     }
     if not arguments.controller:
-        _refuse(arguments, ("negative_feedback",), "it is of a --controller")
+        _refuse(arguments, ("negative_feedback",), "it needs a --controller")
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
         return Loop(policy, options | start)
     if arguments.offset or arguments.hold:
-        raise InputError("--offset and --hold are of a --trajectory; give one, or leave them out")
+        raise InputError("--offset and --hold need a --trajectory; give one, or leave them out")
     if arguments.free:
         refuse_law(arguments)
         options["q0"], options["v0"] = start_of(robot, arguments)
@@ -143,7 +146,7 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
 def start_of(
     robot: Robot, arguments: argparse.Namespace, reference: Any = None
 ) -> tuple[Array, Array | None]:
-    """Return q (nq,) and v (nv,) that the arguments or the robot say."""
+    """Return the initial q (nq,) and v (nv,) of the arguments or of the robot."""
     q = configuration_of(robot, arguments, robot.start)
     if number := arguments.relative_equilibrium:
         import pinocchio as pin
@@ -155,7 +158,7 @@ def start_of(
 
 
 def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, LinearModel | None]:
-    """Return the policy, the feedback in it, and the model that foresees it at every row."""
+    """Return the policy, its feedback, and the model that predicts every row."""
     from fflin.control.linear_controller import LinearController
     from fflin.control.policies import Allocation, StateFeedback, thrusters_push_every_way
 
@@ -164,9 +167,11 @@ def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, 
     if arguments.gain:
         from fflin.control.gain import Gain
 
-        _refuse(arguments, (*_WEIGHTS, *_TARGETS), "--gain has its weights and its point")
+        _refuse(
+            arguments, (*_WEIGHTS, *_TARGETS), "--gain contains its weights and its operating point"
+        )
         gain = Gain.load(arguments.gain)
-        # Made for the motors and thrusters themselves, a gain needs nobody to share out a wrench.
+        # A gain designed for the motors and thrusters needs no allocation of a wrench.
         if arguments.allocate is None:
             allocate = allocate and "tau_b.x" in gain.input_names
         design = _without_thrusters(robot) if allocate else robot
@@ -175,7 +180,7 @@ def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, 
         design = _without_thrusters(robot) if allocate else robot
         lin = _about_target(design, arguments)
     if arguments.controller:
-        _refuse(arguments, (*_WEIGHTS, "gain", "reduce"), "--controller is what regulates")
+        _refuse(arguments, (*_WEIGHTS, "gain", "reduce"), "--controller replaces the regulator")
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback: Any = LinearController(arguments.controller, lin, sign=sign)
     else:
@@ -187,7 +192,7 @@ def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, 
 
 
 def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
-    """Return the feedback along a trajectory, and the start beside it."""
+    """Return the feedback along a trajectory, and its start options."""
     from fflin.control.gain_schedule import GainSchedule
     from fflin.control.policies import Allocation
     from fflin.control.tracking import TrajectoryFeedback
@@ -196,19 +201,19 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
     _refuse(
         arguments,
         ("free", "gain", "controller", "relative_equilibrium", *_TARGETS),
-        "a trajectory says where the robot is to be",
+        "the trajectory defines the target",
     )
     poses = ("joint", "rpy", "position", "velocity")
-    _refuse(arguments, poses, "it starts on the trajectory, or beside it by --offset")
+    _refuse(arguments, poses, "the start is on the trajectory, or displaced from it by --offset")
     design = _without_thrusters(robot) if arguments.allocate else robot
     if arguments.schedule is None:
         models = models_along(arguments, design)
         policy = TrajectoryFeedback(models, schedule_of(models, arguments))
     else:
-        _refuse(arguments, _WEIGHTS, "--schedule has its weights and its time between samples")
+        _refuse(arguments, _WEIGHTS, "--schedule contains its weights and its sample time")
         schedule = GainSchedule.load(arguments.schedule)
         if arguments.trajectory is None:
-            _refuse(arguments, ("hold",), "--schedule has its trajectory")
+            _refuse(arguments, ("hold",), "--schedule contains its trajectory")
             motion = schedule.trajectory(design)
         else:
             options = {"hold": arguments.hold, "frame": arguments.frame}
@@ -223,7 +228,7 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
 
 
 def _require_own(schedule: Any, motion: Any, arguments: argparse.Namespace) -> None:
-    """Refuse gains that are of another motion."""
+    """Refuse gains of another trajectory."""
     import numpy as np
 
     knots = (schedule.knots, motion.t), (schedule.q, motion.q), (schedule.v, motion.v)
@@ -233,12 +238,12 @@ def _require_own(schedule: Any, motion: Any, arguments: argparse.Namespace) -> N
     ):
         raise InputError(
             f"{arguments.schedule} has the gains of another motion than {arguments.trajectory}; "
-            "design them for this one (fflin tvlqr), or leave --trajectory out"
+            "design gains for this trajectory with fflin tvlqr, or leave --trajectory out"
         )
 
 
 def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> LinearModel:
-    """Return the model about the point of a gain, with the base at its reference there."""
+    """Return the model about the operating point of a gain, with the base at its reference."""
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
     from fflin.linear.fit import require_same
@@ -256,7 +261,7 @@ def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> Linea
 
 
 def require_held(robot: Robot, policy: Any, q: Array) -> None:
-    """Warn of what starts beside the target and is not fed back; refuse a start of nothing else."""
+    """Warn of initial errors without feedback; refuse a start with no other errors."""
     from fflin.control.policies import fed_back
     from fflin.dynamics.state import StateMap
 
@@ -267,11 +272,13 @@ def require_held(robot: Robot, policy: Any, q: Array) -> None:
     loose = [name for name in beside if name not in fed_back(policy)]
     if loose and loose == beside:
         raise InputError(
-            f"what starts beside the target is not regulated: {listed(loose)}; no input would act: "
-            "give inputs that move it, or another start"
+            f"the start differs from the target only in states that are not regulated: "
+            f"{listed(loose)}; no input would act: give inputs that move them, or another start"
         )
     if loose:
-        text = f"{listed(loose)} starts beside the target and is not regulated"
+        text = (
+            f"the start differs from the target in states that are not regulated: {listed(loose)}"
+        )
         warnings.warn(text, FflinWarning, stacklevel=2)
 
 
@@ -280,7 +287,9 @@ def _without_thrusters(robot: Robot) -> Robot:
 
     others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
     if len(others) == len(robot.inputs):
-        raise InputError(f"--allocate: '{robot.name}' has no thrusters; give --inputs with some")
+        raise InputError(
+            f"--allocate: '{robot.name}' has no thrusters; give --inputs with thrusters"
+        )
     missing = [
         kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)
     ]

@@ -1,4 +1,4 @@
-"""What the command line shows of robots, linear models and checks."""
+"""Reports of linear models and inputs on the command line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 
-# Below this rate [SI] nothing moves to speak of.
+# Rates [SI] below this value count as zero.
 _MOVES = 1e-9
 
 
@@ -34,7 +34,7 @@ def model_report(lin: LinearModel) -> str:
         head += f", sampled every {lin.dt:g} s"
     parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # Elsewhere the poles of a frozen model say nothing about stability. With A A = 0 all are zero.
+    # In motion the poles of a frozen model do not show stability. If A A = 0, all are zero.
     if stays and not lin.dt and (lin.A @ lin.A).any():
         from fflin.analysis.modes import modes
 
@@ -90,7 +90,7 @@ def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Seque
 
 
 def _units(lin: LinearModel) -> str:
-    """Say the units of states, inputs and outputs, once for each group of them."""
+    """Return the units of states, inputs and outputs, once for each group."""
     lines = [("x", lin.state_names, lin.state_units), ("u", lin.input_names, lin.input_units)]
     if lin.output_names != lin.state_names:
         lines.append(("y", lin.output_names, lin.output_units))

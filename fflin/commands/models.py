@@ -1,4 +1,4 @@
-"""The commands that show robots, and that make and check linear models."""
+"""The commands `robots`, `info`, `linearize` and `check`."""
 
 from __future__ import annotations
 
@@ -28,35 +28,45 @@ if TYPE_CHECKING:
 
 def add_commands(commands: Commands) -> None:
     """Add robots, info, linearize and check."""
-    command(commands, "robots", _robots, "list the robots that can be named", "fflin robots")
+    command(commands, "robots", _robots, "list the robots that load by name", "fflin robots")
     info = command(
-        commands, "info", _info, "show tree, masses, limits, settings", "fflin info servicer_7dof"
+        commands,
+        "info",
+        _info,
+        "show tree, masses, limits and settings of a robot",
+        "fflin info servicer_7dof",
     )
     add_robot(info)
     add_system(info, axes=False)
     linearize = command(
         *(commands, "linearize", _linearize),
-        "show or save A, B, C, D",
+        "show or save the linear model A, B, C, D about an operating point",
         "fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat",
     )
     add_point(linearize)
-    add_options(linearize, "--dt H: sample it, with inputs held over H [s]")
+    add_options(linearize, "--dt H: sample the model, with inputs held for H [s]")
     tools = "drake|mujoco|pinocchio|spart|euler|euler_rates"
-    add_options(linearize, f"--for {tools}: in that tool's coordinates, saved to FILE", dest="tool")
+    add_options(
+        linearize,
+        f"--for {tools}: convert the model to the coordinates of this tool; needs -o FILE",
+        dest="tool",
+    )
     add_trajectory(linearize)
     add_output_file(
-        linearize, "save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)"
+        linearize, "save to FILE: .npz, .mat, .json, or .csv (one file per matrix: NAME.A.csv, ...)"
     )
-    add_figure(linearize, "draw the pattern of A and B")
+    add_figure(linearize, "plot the pattern of A and B")
     check = command(
         *(commands, "check", _check),
-        "check A and B by two other routes; exit 1 where they do not hold",
+        "compare A and B with two independent computations; exit code 1 if they differ",
         "fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
     )
     add_point(check)
     add_trajectory(check)
-    add_options(check, "--tolerance X: relative, of every figure in place of its own")
-    add_figure(check, "draw the errors beside what they must not exceed")
+    add_options(
+        check, "--tolerance X: relative tolerance of every comparison; each has its own by default"
+    )
+    add_figure(check, "plot the errors and their tolerances")
 
 
 def _robots(_: argparse.Namespace) -> int:
@@ -68,7 +78,7 @@ def _robots(_: argparse.Namespace) -> int:
     for name in list_robots():
         try:
             with warnings.catch_warnings():
-                # `fflin info` shows them, robot by robot.
+                # `fflin info` shows the warnings of each robot.
                 warnings.simplefilter("ignore", FflinWarning)
                 entries.append((name, load(name), find_robot(name).origin))
         except FflinError as error:
@@ -96,7 +106,9 @@ def _info(arguments: argparse.Namespace) -> int:
 
 def _linearize(arguments: argparse.Namespace) -> int:
     if arguments.tool and (arguments.trajectory or not arguments.output_file):
-        raise InputError("--for is of the model at a point that is saved; give it with -o FILE")
+        raise InputError(
+            "--for saves a model at a point; give it with -o FILE and without --trajectory"
+        )
     if arguments.trajectory:
         return linearize_along(arguments)
     if arguments.output_file:

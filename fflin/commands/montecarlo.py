@@ -1,4 +1,4 @@
-"""The command that flies a loop many times with what is uncertain drawn at random."""
+"""The command `montecarlo`: many simulations of a loop with random parameters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fflin.commands.points import load_robot
 from fflin.commands.sweeps import executor_of, going_on
 from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 
-_ROWS = 240  # at which errors and inputs are kept for a figure
+_ROWS = 240  # of errors and inputs for a figure
 _PICTURES = ("html", "png", "gif")
 _PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
 
@@ -22,8 +22,8 @@ def add_commands(commands: Commands) -> None:
     """Add montecarlo."""
     montecarlo = command(
         *(commands, "montecarlo", _montecarlo),
-        "simulate a loop many times with what is uncertain drawn at random: quantiles, shares, "
-        "the worst runs and what they come from",
+        "simulate a loop many times with random parameters; show quantiles, fractions, the worst "
+        "runs and their causes",
         "fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png",
     )
     add_loop(montecarlo)
@@ -31,40 +31,40 @@ def add_commands(commands: Commands) -> None:
         "dispersions",
         metavar="DISPERSIONS",
         type=input_file,
-        help="what is drawn at random, a table [dispersions] in TOML as fflin.load_dispersions "
-        "reads it",
+        help="TOML file with a table [dispersions] of the random parameters, for "
+        "fflin.load_dispersions",
     )
     add_options(
-        montecarlo.add_argument_group("the runs, and who does them"),
+        montecarlo.add_argument_group("runs"),
         """
-        --runs N!: how many
-        --seed S = 0: of the draws; 0 by default
-        --until CONDITION: make no more runs once the share that meets it, 'attitude < 1 deg', is
-            known to --width
-        --width P = 0.02: of the interval of that share; 0.02 by default
-        --confidence P = 0.95: of all intervals; 0.95 by default
-        --workers N: share them among N processes
-        --threads N: or among N threads; by default as many as there are cores
-        --dask ADDRESS: or among the workers of a dask scheduler""",
+        --runs N!: number of runs
+        --seed S = 0: random seed; 0 by default
+        --until CONDITION: stop when the fraction of runs that meet a condition, such as
+            'attitude < 1 deg', is known to within --width
+        --width P = 0.02: width of the confidence interval for --until; 0.02 by default
+        --confidence P = 0.95: confidence level of all intervals; 0.95 by default
+        --workers N: distribute the runs over N processes
+        --threads N: distribute the runs over N threads; by default one for each core
+        --dask ADDRESS: distribute the runs over the workers of a dask scheduler""",
     )
-    shown = montecarlo.add_argument_group("what is kept and shown of them")
+    shown = montecarlo.add_argument_group("output of the campaign")
     add_options(
         shown,
         """
-        --goal CONDITION*: say the share of runs that meet it, 'attitude < 1 deg and settle < 60 s',
-            and draw its bounds
-        --worst K = 3: say the K worst runs; 3 by default
-        --json: print the figures as JSON
-        --plot >FILE: draw bands over time, histograms and the worst runs into FILE: .png, .pdf or
-            .svg""",
+        --goal CONDITION*: report the fraction of runs that meet a condition, such as
+            'attitude < 1 deg and settle < 60 s', and draw its bounds
+        --worst K = 3: list the K worst runs; 3 by default
+        --json: print the results as JSON
+        --plot >FILE: plot quantile bands over time, histograms and the worst runs to FILE: .png,
+            .pdf or .svg""",
     )
     add_output_file(
         shown,
-        "save the runs to FILE: .h5 (HDF5) or .npz; it grows as FILE.part, and the same command "
-        "goes on from what is there",
+        "save the runs to FILE: .h5 (HDF5) or .npz; the runs are collected in FILE.part, from "
+        "which the same command resumes",
     )
-    add_options(shown, "--force: replace a file of -o that holds anything but these runs")
-    add_pictures(shown, "that plays the worst run, with the paths of others as thin lines")
+    add_options(shown, "--force: replace the file of -o if it contains other data than these runs")
+    add_pictures(shown, "that plays the worst run, with the paths of other runs as thin lines")
 
 
 def _montecarlo(arguments: argparse.Namespace) -> int:

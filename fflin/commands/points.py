@@ -1,4 +1,4 @@
-"""The robot and the point that a command's arguments speak of."""
+"""The robot and the operating point of a command's arguments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def load_robot(arguments: argparse.Namespace) -> Robot:
-    """Load the robot with the passive joints, inputs, outputs, gravity and orbit that are given."""
+    """Load the robot with the passive joints, inputs, outputs, gravity and orbit as given."""
     from fflin.robot.loading import load, with_fields
 
     lock, passive = once("--lock", arguments.lock), getattr(arguments, "passive", [])
@@ -34,14 +34,16 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
         values = getattr(arguments, name, [])
         for_all = [value for joint, value in values if joint is None]
         if for_all and len(values) > 1:
-            raise InputError(f"--{name} is given for all joints and once more; give either")
+            raise InputError(
+                f"--{name} is given for all joints and for single joints; give only one of them"
+            )
         if values:
             fields[name] = for_all[0] if for_all else once(f"--{name}", values)
     if getattr(arguments, "inputs", None) is not None:
         inputs = _inputs(robot, arguments.inputs)
         try:
             robot = robot.replace(inputs=inputs)
-        except FflinError as error:  # a name or an inertia that does not suit this robot
+        except FflinError as error:  # a name or an inertia that this robot does not accept
             raise type(error)(f"{arguments.inputs}: {error}") from None
     if getattr(arguments, "output", []):
         from fflin.robot.outputs import parse_output
@@ -65,7 +67,7 @@ def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
 
 
 def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the pairs of a repeatable option; a name that is given twice is refused."""
+    """Return the pairs of a repeatable option; refuse a name that is given twice."""
     values = dict(pairs)
     if len(values) < len(pairs):
         names = [name for name, _ in pairs]
@@ -77,7 +79,7 @@ def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def configuration_of(
     robot: Robot, arguments: argparse.Namespace, start: Mapping[str, Any] | None = None
 ) -> Array:
-    """Return the configuration (nq,) that --joint, --rpy and --position say, before a start."""
+    """Return q (nq,) of --joint, --rpy and --position, which override a start."""
     import pinocchio as pin
 
     start = start or {}
@@ -97,7 +99,7 @@ def placed(
     base: pin.SE3 | None = None,
     start: Mapping[str, float] | None = None,
 ) -> Array:
-    """Return the configuration (nq,) with the joints that an option says; warn beyond limits."""
+    """Return q (nq,) with the joints of an option; warn outside limits."""
     from fflin.base.names import joints_by_name
     from fflin.dynamics.points import configuration
 
@@ -124,7 +126,7 @@ def placed(
 
 
 def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
-    """Return the robot, and its linear model about the point that is given."""
+    """Return the robot and its linear model about the given point."""
     import pinocchio as pin
 
     from fflin.linear.linearization import linearize
@@ -132,7 +134,9 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     robot = load_robot(arguments)
     q, v = configuration_of(robot, arguments), velocity_of(robot, arguments)
     if arguments.relative_equilibrium and (arguments.rpy or arguments.position):
-        raise InputError("--relative-equilibrium says where the base is, as --rpy, --position do")
+        raise InputError(
+            "--relative-equilibrium sets the base pose, as --rpy and --position do; give either"
+        )
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
     q, u, reference = held_at(robot, q, v, arguments, reference)
     return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
@@ -153,7 +157,7 @@ def velocity_of(
         if option == "velocity":
             values |= (start or {}).get("velocity", {})
         given = once(f"--{option.replace('_', '-')}", getattr(arguments, option))
-        velocity(robot, given)  # says what is wrong with it
+        velocity(robot, given)  # raises an error if it is invalid
         values |= rates_by_name(robot.joint_names, given)
     return velocity(robot, values) if values else None
 
@@ -165,7 +169,7 @@ def held_at(
     arguments: argparse.Namespace,
     reference: pin.SE3 | None = None,
 ) -> tuple[Array, Array | None, pin.SE3 | None]:
-    """Return q, u (nu,) and the reference with --effort or in one of the equilibria."""
+    """Return q, u (nu,) and the reference with --effort or in an equilibrium."""
     number = arguments.relative_equilibrium
     if not arguments.equilibrium and not number:
         from fflin.dynamics.points import effort
@@ -174,7 +178,9 @@ def held_at(
         return q, effort(robot, given) if given else None, reference
     if arguments.effort:
         which = "--relative-equilibrium" if number else "--equilibrium"
-        raise InputError(f"--effort and {which} both say the inputs at the point; give either")
+        raise InputError(
+            f"--effort and {which} both set the inputs at the point; give only one of them"
+        )
     from fflin.linear.equilibrium import equilibrium
 
     if number:
@@ -184,7 +190,7 @@ def held_at(
 
 
 def attitude(robot: Robot, q: Array, number: int, frame: Any) -> tuple[Array, pin.SE3]:
-    """Return q (nq,) and the base's placement in a relative equilibrium, from 1 on."""
+    """Return q (nq,) and the base placement of a relative equilibrium, numbered from 1."""
     import pinocchio as pin
 
     from fflin.analysis.relative_equilibria import relative_equilibria

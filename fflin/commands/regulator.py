@@ -1,4 +1,4 @@
-"""The command that designs a regulator."""
+"""The command `lqr`, and the design options that other commands share."""
 
 from __future__ import annotations
 
@@ -29,38 +29,39 @@ def add_commands(commands: Commands) -> None:
     """Add lqr."""
     lqr = command(
         *(commands, "lqr", _lqr),
-        "design the linear quadratic regulator: gain, poles, residual, margins",
+        "design a linear quadratic regulator; show gain, poles, residual and margins",
         "fflin lqr canadarm2 -o gain.npz",
     )
     add_point(lqr)
     add_weights(lqr)
     add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json")
-    add_figure(lqr, "draw the loop of each input with its margins, and the poles,")
+    add_figure(lqr, "plot the poles, and the loop of each input with its margins,")
 
 
 def add_weights(command: Container) -> None:
-    """Add what is regulated and at which cost: --q, --r, --bryson, --dt, --reduce and so on."""
+    """Add the options of the cost and the regulated states: --q, --r, --bryson, --dt and others."""
     add_options(
         command,
         """
-        --weights urdf|identity: what weighs what is not named: `urdf` (default), with which the
-            inputs keep within the limits of the URDF where the base is turned by 30 deg and the
-            joints by 0.3 rad, or `identity`, 1 on each
+        --weights urdf|identity: rule for all weights that are not given. `urdf` (default) keeps
+            the inputs within the limits of the URDF for displacements of 30 deg of the base and
+            0.3 rad of the joints; `identity` is 1 for each
         --q NAME=W*: weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b,
             q_m.hinge_*
         --r NAME=W*: weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*
-        --bryson NAME=VALUE*: largest acceptable value of a state, an input or a group: its weight
-            is 1/VALUE^2, and those of the rule are scaled alike
-        --dt H: design for inputs held over H [s]; the cost stays the continuous one
-        --reduce: regulate the part that the inputs can hold where momentum is conserved
-        --[no-]wheel-speeds: bring the speeds of reaction wheels back to the point's: by default
-            where thrusters or a torque on the base can make them; also those that turn nothing
-            else, or none""",
+        --bryson NAME=VALUE*: largest acceptable value of a state, an input or a group; its weight
+            is 1/VALUE^2, and the weights of the rule are scaled to match
+        --dt H: design for inputs held for H [s]; the cost remains the continuous cost
+        --reduce: if momentum is conserved, regulate only the states that the inputs can control
+        --[no-]wheel-speeds: return the speeds of reaction wheels to their values at the operating
+            point, or not. By default it does so if thrusters or a base torque can absorb their
+            torque. --wheel-speeds adds speeds that the wheels alone can change without rotating
+            the robot""",
     )
 
 
 def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearModel:
-    """Return the model that a regulator is designed for: with --reduce, the part it can hold."""
+    """Return the model of the design; with --reduce, its controllable part."""
     if not arguments.reduce:
         return lin
     from fflin.analysis.momentum import momentum_reduction
@@ -69,7 +70,7 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
 
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
-    """Return the regulator that the weights say, and warn of one that bears little."""
+    """Return the regulator of the weights; warn if its margins are small."""
     from fflin.control.gain import fragility
     from fflin.control.lqr import lqr, require_fixed_point
     from fflin.control.weight_rules import rule_weights
@@ -77,7 +78,7 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     try:
         require_fixed_point(lin)
     except EquilibriumError as error:
-        # It balances forces; a base that moves stays no fixed point.
+        # --equilibrium balances forces, but a moving base is not a fixed point.
         given = arguments.equilibrium or arguments.relative_equilibrium or lin.v.any()
         more = ", --relative-equilibrium" if lin.frame in ("lvlh", "hill") else ""
         raise EquilibriumError(str(error) if given else f"{error} (--equilibrium{more})") from None
@@ -110,7 +111,7 @@ def _lqr(arguments: argparse.Namespace) -> int:
     from fflin.control.gain import one_sided
 
     gain = gain_of(regulated_part(lin, arguments), arguments)
-    if pulling := one_sided(gain):  # a simulation says how much of it is cut
+    if pulling := one_sided(gain):  # a simulation reports how much of it is cut
         warnings.warn(pulling, FflinWarning, stacklevel=2)
     if arguments.output_file:
         gain.save(arguments.output_file)

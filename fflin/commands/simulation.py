@@ -1,4 +1,4 @@
-"""The command that closes the loop around the nonlinear robot."""
+"""The command `simulate`: the closed loop of a controller and the nonlinear robot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
 
-# The options that name a file to write.
+# The options that name an output file.
 _OUTPUTS = ("output_file", "plot", "html", "png", "gif")
 
 
@@ -27,17 +27,16 @@ def add_commands(commands: Commands) -> None:
     """Add simulate."""
     simulate = command(
         *(commands, "simulate", _simulate),
-        "let a regulator bring the nonlinear robot from where it is put to the target, or "
-        "along a trajectory",
+        "simulate the nonlinear robot with a regulator to a target or along a trajectory",
         "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png",
     )
-    run, shown = add_loop(simulate), simulate.add_argument_group("what is kept and shown of it")
-    add_options(run, "--every N: steps from one row to the next; chosen where there are many")
+    run, shown = add_loop(simulate), simulate.add_argument_group("output of the simulation")
+    add_options(run, "--every N: steps between saved rows; chosen automatically for long runs")
     add_options(
         shown,
         """
-        --plot >FILE: draw linear beside nonlinear into FILE: .png, .pdf or .svg
-        --show NAME*: what --plot draws: a state or input, a group or a pattern, such as q_m,
+        --plot >FILE: plot the nonlinear and the linear motion to FILE: .png, .pdf or .svg
+        --show NAME*: curves of --plot: a state, an input, a group or a pattern, such as q_m or
             '*.hinge_*'""",
     )
     add_output_file(shown, "save the motion to FILE: .npz, .mat, .json or .csv")
@@ -67,7 +66,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     interrupted = motion.stopped.startswith("interrupted")
     left = _leave_earlier(arguments) if interrupted else []
 
-    # Said when the files are there, which they are then even where nobody reads it to its end.
+    # Printed after the files are written, so that a closed pipe does not prevent them.
     lines = [motion_report(motion)]
     try:
         if arguments.output_file:
@@ -85,7 +84,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 
 def _leave_earlier(arguments: argparse.Namespace) -> list[str]:
-    """Write no part of a motion where there is an earlier file; return a line for each."""
+    """Do not replace earlier files by a part of a motion; return a line for each."""
     files = {name: path for name in _OUTPUTS if (path := getattr(arguments, name))}
     earlier = {name: path for name, path in files.items() if path.exists()}
     vars(arguments).update(dict.fromkeys(earlier))
@@ -93,11 +92,11 @@ def _leave_earlier(arguments: argparse.Namespace) -> list[str]:
 
 
 def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
-    """Return the motion that the arguments ask for."""
+    """Return the motion of the arguments."""
     from fflin.simulation.simulate import simulate
 
     loop = loop_of(robot, arguments)
-    # At every row, where a sampled model has the samples alone.
+    # The continuous model predicts every row, a sampled model only its samples.
     foresees: dict[str, Any] = {"linear": loop.lin} if loop.feedback else {}
     motion = simulate(robot, loop.policy, every=arguments.every, **loop.options, **foresees)
     if loop.feedback:
@@ -115,7 +114,7 @@ def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> 
     lin, names = policy.lin, motion.state_names
     deviation = motion.x[:, [names.index(name) for name in lin.state_names]] - lin.x0
     asked = (lin.u0 - deviation @ policy.K.T)[:, groups["thrust"]]
-    # What rounding asks of a thruster that has nothing to do is no thrust.
+    # Rounding error in the command of an idle thruster does not count.
     pulled = (asked < -1e-9 * abs(asked).max(initial=0.0)).any(axis=1).mean()
     if pulled > 0.0:
         warnings.warn(

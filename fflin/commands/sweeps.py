@@ -1,4 +1,4 @@
-"""The command that linearises about many points."""
+"""The command `sweep`: linear models about many points."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from fflin.batch.configurations import Configurations
     from fflin.robot.robot import Robot
 
-# Beyond this the user is asked whether it is meant.
+# Larger results [B] need --yes.
 _LARGE = 10e9
 
 _DASK_TIMEOUT = 10  # seconds
@@ -43,54 +43,56 @@ def add_commands(commands: Commands) -> None:
     """Add sweep."""
     sweep = command(
         *(commands, "sweep", _sweep),
-        "linearise about many points and save them all",
+        "linearise about many points and save all models",
         "fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5",
     )
     add_robot(sweep)
-    points = sweep.add_argument_group("points", "one of these; at rest, unless --velocity says so")
+    points = sweep.add_argument_group(
+        "points", "--grid, --random or --configurations; at rest unless --velocity is given"
+    )
     add_options(
         points,
-        """--grid JOINT=LO:HI:N*: N values of a joint [rad|m] from LO to HI; of several joints all
-            combinations, the last one varies fastest""",
+        """--grid JOINT=LO:HI:N*: N values of a joint [rad|m] from LO to HI; for several joints all
+            combinations, and the last joint varies fastest""",
         type=_axis,
     )
     add_options(
         points,
         """
-        --random N: N points drawn evenly from the joints' limits
-        --configurations FILE.npz: q (N, nq) in Pinocchio's order, as numpy.savez writes it, and if
-            it has them v (N, nv) and u (N, nu)
-        --seed S = 0: of --random; 0 by default""",
+        --random N: N points, uniformly distributed within the joint limits
+        --configurations FILE.npz: q (N, nq) in Pinocchio's order, saved by numpy.savez, and
+            optionally v (N, nv) and u (N, nu)
+        --seed S = 0: random seed of --random; 0 by default""",
     )
-    ranges = "--range JOINT=LO:HI*: of --random: range of a joint in place of its limits"
+    ranges = "--range JOINT=LO:HI*: with --random: range of a joint instead of its limits"
     add_options(points, ranges, type=_range)
     add_pose(sweep)
     add_options(
         sweep,
-        "--effort NAME=VALUE*: an input at all points, by its name in u, such as tau_m.joint_1",
+        "--effort NAME=VALUE*: input at all points, by its name in u, such as tau_m.joint_1",
     )
     add_system(sweep)
     add_reference(sweep)
     add_options(
         sweep,
         """
-        --workers N: share the work among N processes, at most one for each core
-        --dask ADDRESS: share it among the workers of a dask scheduler
-        --yes: do not stop at results of more than 10 GB""",
+        --workers N: distribute the work over N processes, at most one for each core
+        --dask ADDRESS: distribute the work over the workers of a dask scheduler
+        --yes: permit results of more than 10 GB""",
     )
     add_output_file(
         sweep,
-        "save to FILE: .h5 (HDF5) or .npz; it grows as FILE.part, and the same command goes on "
-        "from what is there",
+        "save to FILE: .h5 (HDF5) or .npz; the models are collected in FILE.part, from which the "
+        "same command resumes",
     )
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
-    """Split JOINT=A:B:... into its name and as many values as its form has."""
+    """Split JOINT=A:B:... into the name and the values of the form."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
     if not name or len(parts) != len(form.split(":")):
-        raise argparse.ArgumentTypeError(f"'{text}' is not {form}, as in {example}")
+        raise argparse.ArgumentTypeError(f"'{text}' is not of the form {form}, such as {example}")
     return name, parts
 
 
@@ -98,7 +100,7 @@ def _axis(text: str) -> tuple[str, tuple[float, float, int]]:
     name, parts = _parts(text, "JOINT=LO:HI:N", "joint_1=-1:1:21")
     low, high, count = number(parts[0]), number(parts[1]), count_of(parts[2])
     if not (low < high or (count == 1 and low == high)):
-        raise argparse.ArgumentTypeError(f"'{text}' is empty: LO must be less than HI")
+        raise argparse.ArgumentTypeError(f"'{text}' is empty; LO must be less than HI")
     return name, (low, high, count)
 
 
@@ -116,7 +118,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
 
     path = arguments.output_file
     if path is None:
-        raise InputError("-o says where the models go: a file .h5 or .npz")
+        raise InputError("-o is missing; give a file .h5 or .npz for the models")
     output_path(path)
     robot = load_robot(arguments)
     v = velocity_of(robot, arguments)
@@ -127,18 +129,20 @@ def _sweep(arguments: argparse.Namespace) -> int:
 
     def announce(count: int, *, at_rest: bool) -> None:
         nonlocal said
-        output_path(path)  # once more, when the inputs are known
+        output_path(path)  # again, when the inputs are known
         size = planned_bytes(robot, count, at_rest=at_rest, **options)
         said = f"{count:,} points of '{robot.name}', {readable(size)}"
         if size > _LARGE and not arguments.yes:
-            raise InputError(f"{said}: add --yes where it is meant, or choose fewer points")
+            raise InputError(
+                f"{said}: this is more than 10 GB; add --yes to permit it, or choose fewer points"
+            )
         check_room(count, size, path)
         part = part_of(path)
-        said += f" to {path}" + f", going on from {part}" * part.exists()
+        said += f" to {path}" + f", resuming from {part}" * part.exists()
 
     q, v, u = _points(robot, arguments, v, u, announce)
     with executor_of(arguments) as executor:
-        print(f"fflin: {said}", file=sys.stderr)  # all that was asked for is found good
+        print(f"fflin: {said}", file=sys.stderr)  # all options are valid
         with going_on(path, "points") as progress:
             work = {"executor": executor, "workers": arguments.workers, "progress": progress}
             batch = sweep(robot, q, v, u, **options, **work, out=path)
@@ -161,18 +165,27 @@ def _points(
 
     kinds = [bool(arguments.grid), arguments.random is not None, bool(arguments.configurations)]
     if sum(kinds) != 1:
-        raise InputError("give the points by one of --grid, --random and --configurations")
+        raise InputError(
+            "the points need exactly one of --grid, --random and --configurations; give one"
+        )
     if arguments.range and arguments.random is None:
-        raise InputError("--range is of --random; a grid has its own")
+        raise InputError("--range needs --random; --grid has its own ranges")
     if arguments.configurations:
         if arguments.joint:
-            raise InputError("--joint and --configurations both place joints; give either")
+            raise InputError(
+                "--joint and --configurations both set joint positions; give only one of them"
+            )
         if arguments.rpy or arguments.position:
-            raise InputError("--rpy, --position and --configurations all place the base; give one")
+            raise InputError(
+                "--rpy, --position and --configurations all set the base pose; give one"
+            )
         given = _given(arguments.configurations)
         for name, value in (("v", v), ("u", u)):
             if name in given and value is not None:
-                raise InputError(f"{arguments.configurations} has {name}, which an option says too")
+                raise InputError(
+                    f"{arguments.configurations} contains {name}, and an option gives it too; "
+                    "leave the option out"
+                )
         v, u = given.get("v", v), given.get("u", u)
         announce(len(given["q"]), at_rest=v is None and u is None)
         return as_configurations(robot, given["q"]), v, u
@@ -184,7 +197,9 @@ def _points(
         ranges = once("--range", arguments.range)
         twice = sorted(set(ranges) & set(fixed))
         if twice:
-            raise InputError(f"joint '{twice[0]}' is in --joint and in --range; give either")
+            raise InputError(
+                f"joint '{twice[0]}' is in --joint and in --range; give only one of them"
+            )
         ranges |= {name: (value, value) for name, value in fixed.items()}
         drawn = random_configurations(
             robot, arguments.random, seed=arguments.seed, ranges=ranges, base=base
@@ -194,7 +209,7 @@ def _points(
     axes = once("--grid", arguments.grid)
     for name in axes:
         robot.joint(name)
-    # Counted before it is made.
+    # The points are counted before the grid is created.
     announce(math.prod(count for _, _, count in axes.values()), at_rest=at_rest)
     values = {name: np.linspace(*axis) for name, axis in axes.items()}
     return grid(robot, values, joints=fixed, base=base), v, u
@@ -217,15 +232,15 @@ def _given(path: Path) -> dict[str, Array]:
     content = io.BytesIO(read_file(path, ".npz"))
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of headers that damage makes look old
+            warnings.simplefilter("ignore")  # about damaged headers, which look like an old format
             with np.load(content, allow_pickle=False) as file:
                 given = {key: file[key] for key in ("q", "v", "u") if key in file.files}
-    except Exception as error:  # each decoder of what may stand in a zip archive has its own
+    except Exception as error:  # each decoder of a zip archive raises its own errors
         raise FileError(
             f"{path}: not an npz file as numpy.savez writes it ({reason(error)})"
         ) from None
     if "q" not in given:
-        raise FileError(f"{path}: has no array named q, the configurations (N, nq)")
+        raise FileError(f"{path}: contains no array q; save the configurations as q (N, nq)")
     if given["q"].ndim != 2:
         raise InputError(f"{path}: q has shape {given['q'].shape}, expected (N, nq)")
     return given
@@ -233,7 +248,7 @@ def _given(path: Path) -> dict[str, Array]:
 
 @contextmanager
 def going_on(path: Path | None, what: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield what shows the progress to a file; say of Ctrl-C how far it came and what is kept."""
+    """Yield the progress callback; after Ctrl-C report the progress and the saved part."""
     from fflin.base.progress import Progress
     from fflin.batch.store import part_of
 
@@ -248,9 +263,9 @@ def going_on(path: Path | None, what: str) -> Iterator[Callable[[int, int], None
     except KeyboardInterrupt:
         said = "stopped" if not reached[1] else "stopped at {:,} of {:,} ".format(*reached) + what
         if not path:
-            said += "; nothing is kept, which -o FILE would do"
+            said += "; nothing is saved without -o FILE"
         elif part_of(path).exists():
-            said += f"; the same command goes on from {part_of(path)}"
+            said += f"; the same command resumes from {part_of(path)}"
         raise KeyboardInterrupt(said) from None
     finally:
         bar.close()
@@ -258,13 +273,13 @@ def going_on(path: Path | None, what: str) -> Iterator[Callable[[int, int], None
 
 @contextmanager
 def executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
-    """Yield the executor of a dask scheduler, or None where there is no address."""
+    """Yield the executor of a dask scheduler, or None without an address."""
     address = arguments.dask
     if address is None:
         yield None
         return
     if arguments.workers:
-        raise InputError("--workers and --dask both share the work; give either")
+        raise InputError("--workers and --dask both distribute the work; give only one of them")
     try:
         from distributed import Client
     except ImportError:

@@ -1,4 +1,4 @@
-"""What the commands do along a trajectory, and the regulator along one."""
+"""The command `tvlqr`, and the trajectory options of other commands."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def add_commands(commands: Commands) -> None:
     """Add tvlqr."""
     tvlqr = command(
         *(commands, "tvlqr", _tvlqr),
-        "design the regulator along a trajectory: the gains over time",
+        "design the time-varying regulator along a trajectory",
         "fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --dt 0.1 -o gains.npz",
     )
     add_robot(tvlqr)
@@ -37,36 +37,39 @@ def add_commands(commands: Commands) -> None:
     add_trajectory(tvlqr, required=True)
     add_weights(tvlqr)
     add_options(
-        tvlqr, "--qf NAME=VALUE*: weight at the end; by default that of the steady regulator there"
+        tvlqr,
+        "--qf NAME=VALUE*: weight at the end; by default the cost of the steady regulator there",
     )
     add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json")
 
 
 def add_trajectory(parser: Container, *, required: bool = False) -> None:
-    """Add --trajectory and --hold; then --frame is by default what the file says."""
-    trajectory = """--trajectory FILE: go along the motion in FILE, .npz, .mat, .json or .csv with
-        named columns, as fflin.Trajectory.load reads it; --frame says the axes that it is in, by
-        default what it says itself, else local"""
+    """Add --trajectory, --hold and --strict; the file then sets the default of --frame."""
+    trajectory = """--trajectory FILE: use the trajectory in FILE: .npz, .mat, .json, or .csv with
+        named columns, for fflin.Trajectory.load; --frame gives its axes, by default the frame in
+        the file, else local"""
     add_options(parser, trajectory, required=required)
     add_options(
         parser,
         """
-        --hold linear|previous: how the inputs of FILE go on between its knots, linear, or as they
-            were at the knot before; by default what it says itself, else linear
-        --strict: refuse a FILE that is no motion of the robot""",
+        --hold linear|previous: inputs of FILE between its knots: linear, or constant from the
+            previous knot; by default the setting in the file, else linear
+        --strict: refuse a FILE that does not satisfy the dynamics of the robot""",
     )
     parser.set_defaults(frame=None)
 
 
 def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> LinearTrajectory:
-    """Return the linear models along the trajectory that is given."""
+    """Return the linear models along the given trajectory."""
     from fflin.linear.linear_trajectory import linearize_trajectory
     from fflin.linear.trajectory import Trajectory
 
     for name in ("joint", "velocity", "effort", "equilibrium", "rpy", "position"):
         given = getattr(arguments, name, None)
         if given is True or any(given or ()):
-            raise InputError(f"--{name} says a point and --trajectory a motion; give either")
+            raise InputError(
+                f"--{name} gives a point and --trajectory a motion; give only one of them"
+            )
     robot, options = (
         robot or load_robot(arguments),
         {"hold": arguments.hold, "frame": arguments.frame},
@@ -96,7 +99,10 @@ def check_along(arguments: argparse.Namespace) -> int:
 
 def _tvlqr(arguments: argparse.Namespace) -> int:
     if arguments.reduce:
-        raise InputError("--reduce: over a finite time the inputs hold what they can; leave it out")
+        raise InputError(
+            "--reduce does not apply along a trajectory, since its cost over a finite time always "
+            "exists; leave it out"
+        )
     along = models_along(arguments)
     say(schedule_of(along, arguments, once("--qf", arguments.qf) or "steady"), arguments)
     return DONE
@@ -105,7 +111,7 @@ def _tvlqr(arguments: argparse.Namespace) -> int:
 def schedule_of(
     along: LinearTrajectory, arguments: argparse.Namespace, Qf: Any = "steady"
 ) -> GainSchedule:
-    """Return the regulator along a trajectory that the weights say."""
+    """Return the regulator of the weights along a trajectory."""
     from fflin.control.tvlqr import steady_end, tvlqr
     from fflin.control.weight_rules import pace_along, rule_weights
 
@@ -119,7 +125,7 @@ def schedule_of(
 
 
 def say(made: Any, arguments: argparse.Namespace, text: str = "") -> None:
-    """Save what was made where -o says so, and show it."""
+    """Save a result if -o is given, and print it."""
     if arguments.output_file:
         made.save(arguments.output_file)
     print(text or made)

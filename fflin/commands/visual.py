@@ -1,4 +1,4 @@
-"""The command that shows a robot, and the options of those that show a motion."""
+"""The command `view`, and the options of commands that display a motion."""
 
 from __future__ import annotations
 
@@ -31,35 +31,35 @@ def add_commands(commands: Commands) -> None:
     """Add view."""
     view = command(
         *(commands, "view", _view),
-        "show a robot live in the browser, with a slider for each joint",
+        "show a robot live in the browser with a slider for each joint",
         "fflin view servicer_7dof --joint joint_2=0.4",
     )
     add_robot(view)
     add_pose(view)
     add_orbit(view)
-    add_options(view, "--frame lvlh|hill: of an orbit, which the world is (lvlh by default)")
+    add_options(view, "--frame lvlh|hill: axes of the world in orbit; lvlh by default")
     _add_scene(view)
-    add_options(view, "--no-open: open no browser; the address is on stderr")
-    add_options(view, "--port N = 0: port on 127.0.0.1; a free one by default", type=int)
+    add_options(view, "--no-open: do not open a browser; the address appears on stderr")
+    add_options(view, "--port N = 0: port on 127.0.0.1; a free port by default", type=int)
 
 
-def add_pictures(command: Container, page: str = "that plays it without a network") -> None:
-    """Add the options of a command that makes a motion: files to show it in, and how."""
+def add_pictures(command: Container, page: str = "that plays the motion without a network") -> None:
+    """Add the options of pages, pictures and animations of a motion."""
     add_options(
         command,
         f"""
         --html >FILE: write a page {page}
-        --png >FILE: write a picture (takes Chromium): a strip of four, or at the --times that are
-            given
-        --gif >FILE: write an animated picture (takes Chromium)""",
+        --png >FILE: write a picture (needs Chromium): a strip of four images, or images at
+            the --times
+        --gif >FILE: write an animation (needs Chromium)""",
     )
-    add_options(command, "--times T: when [s] pictures are taken", nargs="+")
+    add_options(command, "--times T: times of the pictures [s]", nargs="+")
     _add_scene(command)
     add_options(
         command,
         """
-        --fps FPS = 30: frames per second of watching (default 30)
-        --speed SPEED: seconds of motion per second of watching (default 1)""",
+        --fps FPS = 30: frames per second of playback; 30 by default
+        --speed SPEED: playback speed, in seconds of motion per second; 1 by default""",
     )
 
 
@@ -67,19 +67,20 @@ def _add_scene(command: Container) -> None:
     add_options(
         command,
         """
-        --scene space|lab: sky and planet, or a floor with a grid (default where there is gravity)
-        --tool FRAME: frame whose axes and trail are drawn
-        --[no-]follow: whether the camera follows the base (default: on a long way)""",
+        --scene space|lab: sky and planet, or a floor with a grid (default with gravity)
+        --tool FRAME: draw the axes and the trail of this frame
+        --[no-]follow: let the camera follow the base, or not; by default it follows long
+            motions""",
     )
 
 
 def add_figure(command: Container, what: str) -> None:
     """Add --plot FILE."""
-    add_options(command, f"--plot >FILE: {what} into FILE: .png, .pdf or .svg")
+    add_options(command, f"--plot >FILE: {what} to FILE: .png, .pdf or .svg")
 
 
 def check_figure(path: Path | None) -> None:
-    """Refuse a figure that cannot be drawn or written, before anything is done for it."""
+    """Refuse a figure that cannot be drawn or written, before any computation."""
     if path is None:
         return
     from fflin.base.figures import FORMATS, require_matplotlib
@@ -90,7 +91,7 @@ def check_figure(path: Path | None) -> None:
 
 
 def draw(path: Path | None, figure: str, drawn: object) -> None:
-    """Draw what a public function of this name draws, where a path is given, and say so."""
+    """Draw with the public function of this name and report the file, if a path is given."""
     if path is not None:
         import fflin
 
@@ -99,7 +100,7 @@ def draw(path: Path | None, figure: str, drawn: object) -> None:
 
 
 def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
-    """Refuse what `show_motion` would, before a motion is made for it."""
+    """Refuse the options that `show_motion` refuses, before the simulation."""
     from fflin.view.visualize import check_outputs, check_rates, check_times, check_tool
 
     if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
@@ -116,7 +117,7 @@ def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
 def show_motion(
     robot: Robot, motion: Motion, arguments: argparse.Namespace, cloud: Campaign | None = None
 ) -> list[str]:
-    """Write what the options of `add_pictures` ask for, and return a line for each file."""
+    """Write the files of the options of `add_pictures`; return a line for each."""
     files = {name: path for name in _FILES if (path := getattr(arguments, name))}
     if not files:
         return []
@@ -134,7 +135,7 @@ def _view(arguments: argparse.Namespace) -> int:
     robot = load_robot(arguments)
     how: Any = {name: getattr(arguments, name) for name in (*_SHOWN, "port", "frame")}
     live = visualize(robot, open=False, q=configuration_of(robot, arguments, robot.start), **how)
-    assert isinstance(live, Live)  # for there is no motion
+    assert isinstance(live, Live)  # since there is no motion
     print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
     if not arguments.no_open:
         live.open()

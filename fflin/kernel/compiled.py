@@ -119,7 +119,7 @@ def _compile_alone(
     """Compile for a signature, or load the code that another process has compiled meanwhile."""
     with _between_processes(folder / f"{module}.{name}.lock"):
         if not _kept(folder, module, name):
-            _log.warning("fflin: compiling %s, once; it is kept in %s", what, folder)
+            _log.warning("fflin: compiling %s once; the code is stored in %s", what, folder)
         return compile(signature)
 
 
@@ -140,7 +140,7 @@ def _between_processes(path: Path) -> Iterator[None]:
         try:
             lock.acquire(timeout=_SILENCE)
         except Timeout:
-            _log.warning("fflin: waiting for another process that compiles in %s", path.parent)
+            _log.warning("fflin: waiting for another process, which compiles in %s", path.parent)
             lock.acquire(timeout=_LONGEST_WAIT)
     try:
         yield

@@ -576,7 +576,7 @@ def test_help_lists_every_command_once_by_its_task():
     assert sorted(names) == sorted({*names})
     assert {"robots", "check", "modes", "lqr", "simulate", "sweep", "view"} <= {*names}
     sections = [part for part in out.split("\n\n") if ":\n" in part]
-    close = next(part for part in sections if part.startswith("close the loop:"))
+    close = next(part for part in sections if part.startswith("design and simulate:"))
     assert "lqr" in close and "simulate" in close and "info" not in close
 
 

@@ -65,7 +65,7 @@ def test_every_option_that_takes_a_file_says_whether_it_is_written():
             takes = any(word in metavar for word in ("FILE", "ROBOT", "URDF", "DISPERSIONS"))
             assert takes == (action.type in kinds), (name, action.dest)
             if takes:
-                writes = words.startswith(("write", "save", "draw", "where to")) or "into" in words
+                writes = words.startswith(("write", "save", "plot", "output file"))
                 assert writes == (action.type is output_file), (name, action.dest)
                 count += 1
     assert count > 40

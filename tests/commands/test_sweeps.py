@@ -140,7 +140,7 @@ def test_ctrl_c_leaves_what_is_finished_and_no_process(workers, tmp_path):
     assert process.returncode == 130
     *_, last = error.splitlines()
     going_on = (
-        r"fflin: stopped at [\d,]+ of 100,000 points; the same command goes on from x.h5.part"
+        r"fflin: stopped at [\d,]+ of 100,000 points; the same command resumes from x.h5.part"
     )
     assert re.fullmatch(going_on, last)
     assert "Traceback" not in error

@@ -49,7 +49,7 @@ def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_pat
     compiled.compile("long")
     assert signatures == ["double", "long"]
     assert [record.message for record in caplog.records] == [
-        f"fflin: compiling the batch kernel, once; it is kept in {tmp_path}"
+        f"fflin: compiling the batch kernel once; the code is stored in {tmp_path}"
     ]
 
 
