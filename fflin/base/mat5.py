@@ -32,13 +32,13 @@ _LARGEST, _DEEPEST = 2**31, 16
 def read_mat(content: bytes) -> dict[str, Any]:
     """Return the variables: arrays, texts, lists of cells, structs as dicts; no others."""
     if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
-        hint = ", but of version 7.3; write it with save -v7" * (content[126:128] == b"IM")
+        hint = ", but of version 7.3; save it with the option -v7" * (content[126:128] == b"IM")
         raise ValueError(f"not a MATLAB file of level 5{hint}")
     order = "<" if content[126:128] == b"IM" else ">"
     variables: dict[str, Any] = {}
     for kind, data in _unpacked(content[HEADER:], order):
         if kind != _MATRIX:
-            raise ValueError(f"a variable has the type {kind}")
+            raise ValueError(f"a variable has the unknown data type {kind}")
         name, value = _matrix(data, order, 0)
         if value is not None:
             variables[name] = value
@@ -58,7 +58,7 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
     at, unpack = 0, _TAG[order].unpack_from
     while at < len(data):
         if at + 8 > len(data):
-            raise ValueError("it ends within an element")
+            raise ValueError("the file ends within an element")
         kind, size = unpack(data, at)
         if kind >> 16:  # a small one, which stands in its own tag
             kind, size, start, step = kind & 0xFFFF, kind >> 16, at + 4, 8
@@ -66,7 +66,7 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
             start = at + 8
             step = 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
         if start + size > len(data) or (step == 8 and size > 4):
-            raise ValueError("it ends within an element")
+            raise ValueError("the file ends within an element")
         yield kind, data[start : start + size]
         at += step
 
@@ -74,7 +74,7 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
     """Return the name and the value of an array, None where it is of a kind that is not read."""
     if depth > _DEEPEST:
-        raise ValueError("its cells are too deep")
+        raise ValueError("its cells are nested too deeply")
     if not data:
         return "", np.zeros((0, 0))
     parts = _elements(data, order)
@@ -87,7 +87,7 @@ def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
         name = _text(*next(parts), order)
         count = math.prod(shape)
         if len(shape) < 2 or min(shape) < 0 or count > 2**40:
-            raise ValueError(f"{name} has shape {shape}")
+            raise ValueError(f"{name} has the impossible shape {shape}")
         if kind == _CELL:
             return name, _cells(parts, count, order, depth)
         if kind == _STRUCT:
@@ -107,17 +107,17 @@ def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
             raise ValueError(f"{name} has {values.size} entries, expected {count}")
         return name, values.reshape(shape, order="F")
     except StopIteration:
-        raise ValueError("it ends within an array") from None
+        raise ValueError("the file ends within an array") from None
 
 
 def _cells(parts: Iterator[tuple[int, bytes]], count: int, order: str, depth: int) -> list[Any]:
     values = []
     for kind, data in parts:
         if kind != _MATRIX:
-            raise ValueError(f"a cell has the type {kind}")
+            raise ValueError(f"a cell has the unknown data type {kind}")
         values.append(_matrix(data, order, depth + 1)[1])
     if len(values) != count:
-        raise ValueError(f"it has {len(values)} cells, expected {count}")
+        raise ValueError(f"an array has {len(values)} cells, expected {count}")
     return values
 
 
@@ -133,18 +133,18 @@ def _rows(text: str, shape: tuple[int, ...]) -> str | list[str]:
 def _integers(kind: int, data: bytes, order: str) -> tuple[int, ...]:
     """Return what stands before the figures, 32 bits each."""
     if kind not in (5, 6) or len(data) % 4 or not data:
-        raise ValueError(f"its integers have the type {kind}")
+        raise ValueError(f"its integers have the unknown data type {kind}")
     return struct.unpack(f"{order}{len(data) // 4}i", data)
 
 
 def _numbers(kind: int, data: bytes, order: str) -> Any:
     if kind not in _TYPES:
-        raise ValueError(f"numbers have the type {kind}")
+        raise ValueError(f"its numbers have the unknown data type {kind}")
     return np.frombuffer(data, np.dtype(order + _TYPES[kind]))
 
 
 def _text(kind: int, data: bytes, order: str) -> str:
     if kind not in _TEXTS:
-        raise ValueError(f"a text has the type {kind}")
+        raise ValueError(f"a text has the unknown data type {kind}")
     wide = "" if kind in (1, 2, 16) else "-le" if order == "<" else "-be"
     return data.decode(_TEXTS[kind] + wide)
