@@ -1,4 +1,4 @@
-"""Accelerations and slopes by articulated bodies: the route by which models are checked."""
+"""Accelerations and derivatives by the articulated-body algorithm, to check linear models."""
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +13,7 @@ from fflin.robot.frames import ROOT
 
 
 class Aba:
-    """The nonlinear dynamics of a robot with all that acts on it, in base axes."""
+    """Nonlinear dynamics of a robot with all its forces, in base axes."""
 
     def __init__(self, state: StateMap) -> None:
         robot = state.robot

@@ -1,4 +1,4 @@
-"""How inputs act: the columns that take u to generalised forces, and the wrenches on links."""
+"""Generalised forces of the inputs: the columns that multiply u, and the wrenches on links."""
 
 from typing import Any, NamedTuple
 
@@ -18,14 +18,14 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Held(NamedTuple):
-    """Three inputs that are a vector on the base, held in reference axes."""
+    """Three inputs that form a vector on the base in reference axes."""
 
     columns: slice
     rows: slice
 
 
 class Actuation:
-    """The inputs of a robot, prepared."""
+    """Inputs of a robot, prepared for evaluation."""
 
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
@@ -124,5 +124,5 @@ class Actuation:
         return external
 
     def torques(self, u: Array) -> Array:
-        """Return the generalised forces (6 + n,) in base axes of all but those `wrenches`."""
+        """Return the generalised forces (6 + n,) in base axes of all inputs without `wrenches`."""
         return self.fixed @ u

@@ -1,4 +1,4 @@
-"""The attitude chart: the vector part of the base's quaternion, its kinematics, and the turn R."""
+"""Attitude chart: the vector part of the base quaternion, its kinematics, and the rotation R."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +14,7 @@ SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 
 @dataclass(frozen=True)
 class Chart:
-    """The attitude chart at one base attitude, relative to the reference, or at many."""
+    """Attitude chart at one or many base attitudes relative to the reference."""
 
     q_b: Array  # vector part (.., 3) of the quaternion of refMb
     q0: float | Array  # its scalar part (.., 1), positive
@@ -70,7 +70,7 @@ class Chart:
 
 
 class Standing(Chart):
-    """That of a base at the reference, or of many: R = Q = E and J = 2 E cost nothing."""
+    """Chart of one or many bases at the reference: R = Q = E and J = 2 E cost nothing."""
 
     N = 0.5 * np.eye(3)
 

@@ -1,4 +1,4 @@
-"""The accelerations at a point and their slopes, from CRBA's M and the derivatives of RNEA."""
+"""Accelerations at a point and their derivatives, from CRBA's M and the derivatives of RNEA."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from fflin.dynamics.tidal import Tide
 
 
 class Rates(NamedTuple):
-    """The acceleration of the base origin and the joints, in base axes, and what it depends on."""
+    """Acceleration of the base origin and the joints, in base axes, and its derivatives."""
 
     c: Array  # (6 + n,) of (3.1): without gravity and omega x v_b
     by_q_m: Array  # D_m (6 + n, n) of (3.3)
@@ -27,7 +27,7 @@ class Rates(NamedTuple):
 
 
 class Gyroscopic(NamedTuple):
-    r"""The torques :math:`-\omega \times h` of stored momentum, and their slopes."""
+    r"""Gyroscopic torques :math:`-\omega \times h` of stored momentum, and their derivatives."""
 
     wrenches: pin.StdVec_Force  # on every joint, in its frame
     force: Array  # what they are as a generalised force (nv,)
@@ -37,7 +37,7 @@ class Gyroscopic(NamedTuple):
 
 
 class Accelerations:
-    """``M nudot + b = B u`` of a robot, solved and differentiated in base axes."""
+    """Solution of ``M nudot + b = B u`` of a robot, with its derivatives, in base axes."""
 
     def __init__(self, state: StateMap, actuation: Actuation, data: pin.Data) -> None:
         robot = state.robot

@@ -1,4 +1,4 @@
-"""The states of a whole motion at once, linear feedback of a state, and errors from a motion."""
+"""States of a whole motion at once, linear state feedback, and errors from a reference motion."""
 
 from collections.abc import Callable
 from itertools import compress

@@ -43,7 +43,7 @@ class CircularOrbit:
     Pinocchio's world is this frame, and velocities are relative to it. The gravity gradient is
     linear in the position x relative to the origin: the force per mass is
     :math:`n^2 (3 r r^T - E) x`, with the unit vector r away from the central body and the identity
-    E. The relative error is of the order of \|x\| over the orbit's radius.
+    E. The relative error is of the order of the distance divided by the orbit's radius.
 
     Parameters
     ----------
