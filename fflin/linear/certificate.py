@@ -1,4 +1,4 @@
-"""A second route to A and B, by Pinocchio's ABA derivatives, and how far two routes differ."""
+"""Independent computation of A and B by Pinocchio's ABA derivatives, and its residuals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ROUNDING_SHARE = 1e-3
 
 
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
-    """Compute the figures that prove a continuous-time model of this robot."""
+    """Return the residuals of a continuous-time model of this robot."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     aba = Aba(state)
     A, B, _ = aba_route(state, aba, lin.q, lin.v, lin.u0, moving=lin.moving)
@@ -40,13 +40,13 @@ def certify(robot: Robot, lin: LinearModel) -> Certificate:
 
 
 def scaled_condition(M: Array) -> float:
-    """Condition number of M scaled to a unit diagonal."""
+    """Return the condition number of M scaled to a unit diagonal."""
     scale = 1.0 / np.sqrt(M.diagonal())
     return float(np.linalg.cond(scale[:, None] * M * scale))
 
 
 def inertia_residual(M: Array, inverse: Array) -> float:
-    """Largest entry of ``M M^-1 - E`` with M scaled to a unit diagonal."""
+    """Return the largest entry of ``M M^-1 - E`` with M scaled to a unit diagonal."""
     scale = np.sqrt(M.diagonal())
     residual = M @ inverse - np.eye(len(M))
     return float(np.abs(residual * scale / scale[:, None]).max())

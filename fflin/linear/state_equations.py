@@ -1,6 +1,6 @@
-"""A, B and f0 of the accelerations and their slopes, at a point or at many.
+"""A, B and f0, assembled from accelerations and their derivatives at one or many points.
 
-Numbers of equations are those of docs/derivation.md.
+Equation numbers refer to docs/derivation.md.
 """
 
 from functools import partial

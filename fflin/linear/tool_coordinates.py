@@ -1,4 +1,4 @@
-"""How tools write a free flyer, said in a line of `TOOLS`, and the slopes of such coordinates."""
+"""Conventions of tools for a free flyer, one row of `TOOLS` each, and their derivatives."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ class ToolCoordinates:
         self._wrench = wrench = acting.fixed[:6]  # of the inputs
         if wrench[LINEAR].any() and not wrench[ANGULAR].any() and self._X[LINEAR, ANGULAR].any():
             raise InputError(
-                "spart's force acts at the root link's centre of mass, and a BaseForce alone takes "
-                "no moment about the link's origin; give the robot a BaseTorque too"
+                "a force of spart acts at the root link's centre of mass, and a BaseForce alone "
+                "cannot give its moment about the link's origin; give the robot a BaseTorque too"
             )
         # Which of the robot's inputs stands where among the tool's.
         self._inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
@@ -144,10 +144,12 @@ class ToolCoordinates:
             return pin.rpy.rpyToMatrix(*attitude)
         if self.convention.stored == "matrix":
             R0 = pin.SE3(attitude.reshape(3, 3).T, np.zeros(3))
-            return placement("R0, q[:9] by columns,", R0).rotation
+            return placement("R0 (q[:9] by columns)", R0).rotation
         length = float(np.linalg.norm(attitude))
         if abs(length - 1.0) > NORM_TOLERANCE:
-            raise InputError(f"the quaternion w, x, y, z has length {length:.9g}, expected 1")
+            raise InputError(
+                f"the quaternion w, x, y, z has length {length:.9g}, expected 1; normalise it"
+            )
         return turning.rotation_matrix(np.roll(attitude, -1) / length)
 
     def _attitude(self, q: Array) -> tuple[Array, Array]:
@@ -216,7 +218,7 @@ class ToolCoordinates:
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
-    """Return those of a tool."""
+    """Return the tool's coordinates."""
     if not isinstance(tool, str) or tool not in TOOLS:
         raise unknown("tool", str(tool), TOOLS)
     if tool[:5] != "euler":
@@ -250,7 +252,10 @@ def _left(P: Array) -> Array:
 def _angles(R: Array) -> Array:
     """Return roll, pitch and yaw of R = R_z(yaw) R_y(pitch) R_x(roll), along a complex step too."""
     if np.hypot(R[0, 0].real, R[1, 0].real) < SMALLEST_Q0:
-        raise ChartError("the pitch is 90 deg, where roll and yaw of Euler's angles turn alike")
+        raise ChartError(
+            "the pitch is 90 deg, where roll and yaw cannot be distinguished; use a tool without "
+            "Euler angles, or another attitude"
+        )
     angles: Array = pin.rpy.matrixToRpy(R.real)
     if np.iscomplexobj(R):
         W = R.real.T @ R.imag

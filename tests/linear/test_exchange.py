@@ -348,7 +348,7 @@ def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
     refused(r"w, x, y, z has length 1.1, expected 1", back, robot, "drake", q)
     q = lin.to("spart").q.copy()
     q[0] = -1.0
-    refused(r"the rotation of R0, q\[:9\] by columns, is not one", back, robot, "spart", q)
+    refused(r"the matrix R of R0 \(q\[:9\] by columns\) is not a rotation", back, robot, "spart", q)
     up = fflin.configuration(
         robot, {}, pin.SE3(pin.rpy.rpyToMatrix(0.3, np.pi / 2, 0.0), np.zeros(3))
     )
@@ -362,10 +362,10 @@ def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
     refused(r"not of 'cubesat'", to, fflin.load("cubesat"), lin, "drake")
     arm = robot.replace(inputs=[fflin.JointTorque("*")])
     reduced = fflin.momentum_reduction(fflin.linearize(arm))
-    refused(r"lin has not all states", to, arm, reduced, "drake")
+    refused(r"lin lacks some states", to, arm, reduced, "drake")
     servicer = fflin.load("servicer_7dof").replace(inputs=[fflin.BaseForce()])
     if np.abs(Formulas(servicer, "spart", servicer.neutral()).centre.translation).max():
-        refused(r"a BaseForce alone takes no moment", fflin.linearize(servicer).to, "spart")
+        refused(r"a BaseForce alone cannot give its moment", fflin.linearize(servicer).to, "spart")
     assert rng and free_body((1.0, 2.0, 3.0)).n == 0
 
 
