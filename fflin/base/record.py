@@ -223,8 +223,8 @@ class Design(FrozenArrays):
     Attributes
     ----------
     verified : bool
-        Whether a digest confirms that the data are unchanged. False if the file has no SHA-256
-        digest, and for every design that is made from such data.
+        True for a result of this session, or read from a file with a valid SHA-256 digest. False
+        for a file without a digest, and for every result made from its data.
     """
 
     # Names of the arrays of one dimension, which Matlab does not know.

@@ -67,11 +67,11 @@ class TomlFile:
         for place, value in _values(self.record):
             if type(value) is int and value.bit_length() > _BITS_LIMIT:
                 name = ".".join(map(str, place))
-                message = f"{name} is too long an integer; write it as a float, such as 1e30"
+                message = f"{name} is an integer with too many digits; write a float, such as 1e30"
                 raise self.error(message, *place)
 
     def line(self, *place: str | int) -> int:
-        """Return the line of a place, or that of the table that holds it."""
+        """Return the line number of a key, or of the table that holds it."""
         way = ".".join(map(str, place))
         while way and way not in self._lines:
             way = way.rpartition(".")[0]

@@ -115,7 +115,7 @@ def numbers(name: str, value: Any, of_what: str, each: str) -> dict[str, float]:
 
 
 def dimension(name: str, value: Any) -> int:
-    """Return how many indices an array has, or raise `InputError` where it is none."""
+    """Return the number of dimensions of an array, or raise `InputError`."""
     return _as_array(name, value).ndim
 
 
@@ -140,7 +140,7 @@ def is_rotation(R: Array) -> bool:
 
 
 def as_double(name: str, value: ArrayLike) -> Array:
-    """Return a new array of native floats, or raise `InputError` where it is none of numbers."""
+    """Return a new array of native floats, or raise `InputError` if an entry is not a number."""
     refuse_masked(name, value)
     array = _as_array(name, value)
     if array.dtype.kind not in "fiu":

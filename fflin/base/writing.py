@@ -30,7 +30,7 @@ _of_command: ContextVar[CommandFiles | None] = ContextVar("files of a command", 
 
 
 def as_path(path: Any) -> Path:
-    """Return a path, or raise `InputError` where it is none."""
+    """Return a path, or raise `InputError` if the value is not a path."""
     if not isinstance(path, str | os.PathLike) or "\0" in str(path):
         raise InputError(f"{path!r} is not a path")
     if not str(path):
@@ -39,7 +39,7 @@ def as_path(path: Any) -> Path:
 
 
 def check_ending(path: Path, endings: tuple[str, ...]) -> None:
-    """Raise `FileError` where the name of a file ends in none of those that are known."""
+    """Raise `FileError` if the name of a file has none of the given endings."""
     if path.suffix not in endings:
         raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {', '.join(endings)}")
 

@@ -48,14 +48,14 @@ class Chart:
         return times(self.R, vectors)
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
-        """Return the slope (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
+        """Return the derivative (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
         return -0.5 * (crossed + self._over_q0(omega))
 
     def _over_q0(self, omega: Array) -> Array:
         return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
 
     def over_q_b(self, by_turn: Array) -> Array:
-        """Return slopes (.., k, 3) over turns of the base in its axes as slopes over q_b (1.3)."""
+        """Return derivatives (.., k, 3) over base rotations as derivatives over q_b (1.3)."""
         return by_turn @ self.J
 
     def to_reference(
@@ -90,7 +90,7 @@ class Standing(Chart):
         return -0.5 * crossed
 
     def over_q_b(self, by_turn: Array) -> Array:
-        """Return twice the slopes."""
+        """Return twice the derivatives."""
         return 2.0 * by_turn
 
     def to_reference(

@@ -98,9 +98,9 @@ class Inertia:
         worst = int((inertias / allowed).argmin())
         warnings.warn(
             f"M of '{name}': {coordinate_names(self._state.robot)[worst]} has an inertia of only "
-            f"{inertias[worst]:.1e}; from mass and position of its links up to "
-            f"{allowed[worst]:.1e} is expected. B has entries of {1.0 / inertias[worst]:.1e}. Give "
-            "the links their inertia, check that joints are placed in metres, or lock the joint",
+            f"{inertias[worst]:.1e}; mass and position of its links allow up to "
+            f"{allowed[worst]:.1e}. B has entries of {1.0 / inertias[worst]:.1e}. Give the links "
+            "their inertia, check that joints are placed in metres, or lock the joint",
             FflinWarning,
             stacklevel=6,
         )

@@ -38,7 +38,7 @@ class Integrator:
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of v and its rates l in what moves q after each stage, and in the new v."""
+        """Return the weights of v and its rates l in each stage's step of q, and in the new v."""
         raise NotImplementedError
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
@@ -65,7 +65,7 @@ class CommutatorFree4(Integrator):
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of v, l1, ..., l4."""
+        """Return the weights of v, l1, ..., l4."""
         h, half, twelfth = dt, 0.5 * dt, dt * dt / 12.0
         way = [
             [half, 0.0, 0.0, 0.0, 0.0],
@@ -93,7 +93,7 @@ class RungeKuttaMuntheKaas4(Integrator):
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of a stage's rate in what moves q to the next, and of CF4 in the new v."""
+        """Return the weights of a stage's rate in the next step of q, and of CF4 in the new v."""
         return np.array([[0.5 * dt], [0.5 * dt], [dt]]), CommutatorFree4.shares(dt)[1]
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
@@ -127,7 +127,7 @@ class SemiImplicitEuler(Integrator):
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of v and its rate."""
+        """Return the weights of v and its rate."""
         return np.array([[dt, dt * dt], [0.0, 0.0]]), np.array([[1.0, dt]])
 
 

@@ -102,7 +102,7 @@ class OrbitField:
         return [self._none, *map(pin.Force, force, torque)]
 
     def slopes(self, data: pin.Data) -> Array:
-        """Return the slopes (nv, nv) over q of the forces of `wrenches`, the base not shifted."""
+        """Return the derivatives (nv, nv) over q of the forces of `wrenches`, base unmoved."""
         # Of a joint that turns by t, in its axes: those of R^T tide R are T [t]x - [t]x T.
         model, (R, place) = self.robot.model, self._places(data)
         joints, local = range(ROOT, model.njoints), pin.ReferenceFrame.LOCAL
@@ -128,7 +128,7 @@ class OrbitField:
         return q, v
 
     def add_turning(self, q: Array, v: Array, by_q: Array, by_v: Array) -> None:
-        """Make slopes in state order at `near` those of the relative rates at q and v."""
+        """Convert derivatives in state order at `near` to the relative rates at q and v."""
         R, place = self.base(q)
         fall = R.T @ (self.pull @ place - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
         spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))

@@ -97,7 +97,7 @@ class Accelerations:
     def _bias_slopes(
         self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None
     ) -> tuple[Array, Array]:
-        """Return the slopes of M a + b - B u + passive forces over q_m and nu (3.3), (7.1)."""
+        """Return the derivatives of M a + b - B u + passive forces over q_m and nu (3.3), (7.1)."""
         model, data, state = self._model, self._data, self._state
         # Constant in the frames of their links, so that RNEA's derivatives hold -d(B u)/dq.
         wrenches = gyroscopic.wrenches if gyroscopic else self._actuation.wrenches(u)
@@ -114,7 +114,7 @@ class Accelerations:
         return by_q, by_v
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
-        """Return the torques of stored momentum, their wrenches with those of the inputs."""
+        """Return the torques of stored momentum; the wrenches include the inputs'."""
         model, data, nv = self._model, self._data, len(v)
         # With the angular Jacobian J of a link in its axes, h x omega is J^T [h]x J v (6.3).
         wrenches = self._actuation.wrenches(u)

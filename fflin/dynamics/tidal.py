@@ -43,7 +43,7 @@ class Tide(NamedTuple):
         return total
 
     def slopes(self, model: pin.Model, data: pin.Data, q: Array) -> tuple[Array, Array]:
-        """Return the slopes of `force` over the joints (nv, nv) and over turns (nv, 3)."""
+        """Return the derivatives of `force` over the joints (nv, nv) and rotations (nv, 3)."""
         by_q, by_turn = np.zeros((model.nv, model.nv)), np.zeros((model.nv, 3))
         v, still = np.zeros(model.nv), np.zeros(model.nv)
         for share, v[PIN_ANGULAR] in self.turns:

@@ -85,7 +85,7 @@ def compare(
     steps: Array | None = None,
     rounding: float = 0.0,
 ) -> list[tuple[str, float]]:
-    """Return how far A and B are from those of another route, block by block: "A[q_b, q_m]"."""
+    """Return the errors of A and B against other matrices, by block: "A[q_b, q_m]"."""
     # Relative to the largest entry of its block, rows of accelerations being scaled by the mobility
     # sqrt((M^-1)_ii), so that a light joint does not hide a heavy one, and B by that of its input;
     # where large terms cancel in a block, to those, which a route by steps has there.
@@ -157,7 +157,7 @@ def _cancelling_terms(
 
 
 def speeds(state: StateMap, v: Array) -> tuple[Array, float, float]:
-    """Return speeds (6 + n,) without those of wheels, the largest rate, and wheels' momentum."""
+    """Return speeds (6 + n,) without wheels, the largest rate, and the wheels' momentum."""
     speed, robot = np.abs(state.velocities(v)), state.robot
     inertia = np.array([robot.wheels.get(name, 0.0) for name in robot.joint_names])
     momentum = float(inertia @ speed[6:])

@@ -241,7 +241,7 @@ def from_tool(
 
 
 def _bridge(robot: Robot, lin: LinearModel, tool: str) -> tuple[Any, Slopes, Slopes, Array]:
-    """Return a tool's coordinates, the slopes of a model's own and of these, and the rate of y."""
+    """Return a tool's coordinates, the derivatives of the model's and the tool's, and dy/dt."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError("lin lacks some states of the robot; use the full model of the robot")
@@ -263,7 +263,7 @@ def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Arra
 
 
 def _step(tool: str, dt: Any) -> float:
-    """Return a time step, 0 where there is none."""
+    """Return the time step, 0 if none is given."""
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(

@@ -169,6 +169,6 @@ def placed(t: Array, time: float) -> tuple[int, float]:
 
 
 def _cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
-    """Return the coefficients (N - 1, 4, nv) of cubics over [0, 1] with these values and slopes."""
+    """Return the coefficients (N - 1, 4, nv) of cubics over [0, 1] from values and derivatives."""
     way = last - first
     return np.stack((first, rate, 3 * way - 2 * rate - end_rate, rate + end_rate - 2 * way), axis=1)

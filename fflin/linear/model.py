@@ -102,8 +102,8 @@ class LinearModel(FrozenArrays):
     fflin_version, pinocchio_version : str
         Versions of the packages that made the model.
     verified : bool
-        Whether a digest confirms that the data are unchanged. False if the file has no SHA-256
-        digest, and for every design that is made from such data.
+        True for a model of this session, or read from a file with a valid SHA-256 digest. False
+        for a file without a digest, and for every result made from its data.
     weights : mapping
         Default weights of `lqr`, as `Robot.replace` takes them.
     mean_motion : float
@@ -426,6 +426,6 @@ def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
 
 
 def same_certificate(whole: LinearModel, fingerprint: str, made: LinearModel) -> Certificate:
-    """Return the certificate of what a model was made of, which that of a fingerprint has too."""
+    """Return the certificate of the source of a model, if its matrices are unchanged."""
     made.require(fingerprint)
     return whole.certificate

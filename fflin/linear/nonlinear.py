@@ -168,7 +168,7 @@ def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None
 
 
 def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, bends: Any) -> Array:
-    """Return the slopes of f, of rows, at a point by central differences of the given steps."""
+    """Return the Jacobian of f, a function of rows, by central differences of the given steps."""
     curved, straight = np.diag(steps)[bends], np.diag(steps)[~bends]
     ways = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
     first, last = np.split(f(np.concatenate((point + ways, point - ways))), 2)

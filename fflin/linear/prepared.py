@@ -82,7 +82,7 @@ class Prepared:
 def prepare(
     robot: Robot, *, frame: Frame | None, reference: pin.SE3 | None, moving: bool
 ) -> Prepared:
-    """Prepare a robot; arguments and errors are those of `Linearizer`."""
+    """Prepare a robot; arguments and errors are as in `Linearizer`."""
     moving = truth("moving", moving)
     if moving:
         refuse_orbit(robot, "models with moving=True")

@@ -48,7 +48,7 @@ TOOLS = {
 
 
 class Slopes(NamedTuple):
-    """Slopes of coordinates x' and inputs u' at a point, over y (15.1) and u in base axes."""
+    """Derivatives of coordinates x' and inputs u' at a point, over y (15.1) and u in base axes."""
 
     P: Array  # of x' over y (15.2)
     rate: Array  # of P along the motion
@@ -120,7 +120,7 @@ class ToolCoordinates:
         return q, v
 
     def to_pinocchio(self, q: Any, v: Any) -> tuple[Array, Array]:
-        """Return Pinocchio's q and v of those of the tool; v None is rest."""
+        """Return Pinocchio's q and v from the tool's q and v; v None means rest."""
         robot, state, size = self.state.robot, self.state, 6 + len(self.joints)
         v = np.zeros(size) if v is None else vector("v", v, size, "the tool's: base, then joints")
         if self.convention.stored == "xyzw":
@@ -169,11 +169,11 @@ class ToolCoordinates:
         return turn
 
     def _held(self, parts: Array) -> Array:
-        """Return the slopes (6, 3) over a turn of what is held in the world, in base axes (4.4)."""
+        """Return the derivatives (6, 3) over a rotation of world-fixed vectors, base axes (4.4)."""
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
     def slopes(self, q: Array, nu: Array, u: Array, rates: Array) -> Slopes:
-        """Return the slopes at a point; nu (6 + n,), u (nu,), rates of nu (6 + n,) in base axes."""
+        """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) in base axes."""
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
         still, R_now = self._attitude(q)
         # A step along the motion; errors and tangents go along with a reference that moves.
@@ -264,7 +264,7 @@ def _angles(R: Array) -> Array:
 
 
 def _of_angles(angles: Array, omega: Any = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
-    """Return G, the rates of the angles being G omega, and the slope of G omega over them."""
+    """Return G, with angle rates G omega, and the derivative of G omega over the angles."""
     (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
     G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
     _, pitch, yaw = G @ omega

@@ -60,8 +60,7 @@ class Trajectory(Design):
         Axes in which the inputs on the base are given and held. local: base axes. hybrid: force in
         world axes, torque in base axes. world: both in world axes.
     verified : bool
-        Whether a digest confirms that the data are unchanged; False if they come from a file
-        without a SHA-256 digest.
+        False for data from a file without a SHA-256 digest, in which damage cannot be detected.
 
     Raises
     ------

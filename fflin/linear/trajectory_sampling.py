@@ -28,8 +28,8 @@ def transitions(
     if times[-1] != along.t[-1]:
         duration = along.t[-1] - along.t[0]
         raise InputError(
-            f"dt is {dt:g} s, expected a time of which the {duration:g} s of the trajectory are a "
-            "multiple"
+            f"dt is {dt:g} s, but the duration of the trajectory, {duration:g} s, is not a "
+            "multiple of it; give a dt that divides the duration"
         )
     nx, nu = 12 + 2 * along.robot.n, along.u.shape[1]
 

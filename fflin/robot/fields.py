@@ -195,7 +195,7 @@ def kept_start(start: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any
 
 
 def _weights(value: Any, joints: Sequence[str], inputs: Sequence[Input]) -> dict[str, Any]:
-    """Return the weights of a robot's regulator, whose names are those of states and inputs."""
+    """Return the weights of a robot's regulator, by names of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)
     if str(weights.get("rule", RULES[0])) not in RULES:
         raise unknown("rule of weights", weights["rule"], RULES)

@@ -116,7 +116,7 @@ def _joined(
 def _in_order(
     model: pin.Model, joint: int, other: pin.Model, root: int = ROOT
 ) -> Iterator[tuple[pin.Model, int]]:
-    """Yield the joints depth first, those of the other after all that hang on the joint."""
+    """Yield the joints depth first; the other model's joints follow all that hang on the joint."""
     yield model, root
     for child in model.children[root]:
         yield from _in_order(model, joint, other, child)

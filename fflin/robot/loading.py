@@ -107,7 +107,7 @@ def load(
 
 
 def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
-    """Return a robot with fields, those of joints beside what it has of others."""
+    """Return a robot with new fields; fields of joints are merged with the robot's."""
     if not fields:
         return robot
     if robot.passive and isinstance(given := fields.get("passive"), list | tuple):

@@ -208,7 +208,7 @@ class Robot(Coordinates):
         return robot
 
     def with_mass_properties(self, bodies: Mapping[str, Any]) -> Robot:
-        """Return the same robot with other masses.
+        """Return the same robot with other masses, centres of mass or inertias.
 
         Parameters
         ----------
@@ -301,7 +301,7 @@ class Robot(Coordinates):
         return f"Robot('{self.name}', n={self.n}, mass={self.mass:.6g} kg)"
 
     def joint(self, name: str) -> Joint:
-        """Return the independent joint of that name.
+        """Return the independent joint with the given name.
 
         Raises
         ------

@@ -19,7 +19,7 @@ Part = TypeVar("Part", Link, JointElement)
 
 
 class Urdf(NamedTuple):
-    """What a URDF describes, checked: the joints connect the links into one tree."""
+    """Checked content of a URDF: the joints connect the links into one tree."""
 
     name: str  # empty where the file gives none
     links: dict[str, Link]  # by name, in the order of the file

@@ -58,7 +58,7 @@ class Element:
         return [child for child in self.children if child.tag == tag]
 
     def find(self, tag: str, of: str) -> Element | None:
-        """Return the one child of that tag, None if there is none; `of` names this element."""
+        """Return the only child with a tag, or None; `of` names this element in errors."""
         found = self.find_all(tag)
         if len(found) > 1:
             raise found[1].error(
@@ -91,7 +91,9 @@ class Element:
                     f"<{self.tag}> of {of} has an unknown attribute {quoted(name)}; known: "
                     f"{', '.join(names)}; correct it or remove it"
                 )
-            self.note(f"attribute {quoted(name)} of <{self.tag}> is ignored: URDF does not know it")
+            self.note(
+                f"attribute {quoted(name)} of <{self.tag}> is ignored: it is not part of URDF"
+            )
 
     def text(self, name: str, of: str) -> str:
         """Return an attribute that must be there and hold something."""
