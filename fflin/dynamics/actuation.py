@@ -111,7 +111,7 @@ class Actuation:
         return self.in_base_axes(Chart(q[:, 3:6], q[:, 6:7], R), u)
 
     def over_inputs(self, chart: Chart, by_u: Array, *, out: Array | None = None) -> Array:
-        """Return derivatives (.., k, nu) over `in_base_axes` converted to derivatives over u (4.7)."""
+        """Convert derivatives (.., k, nu) over `in_base_axes` to derivatives over u: (4.7)."""
         return chart.to_reference(self._held, by_u.mT, out=None if out is None else out.mT).mT
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:

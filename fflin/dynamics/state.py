@@ -242,7 +242,7 @@ class StateMap:
         return q[0], v[0]
 
     def points(self, x: Array) -> tuple[Chart, Array, Array]:
-        """Return charts, configurations and velocities of states (N, nx), as `to_pinocchio`."""
+        """Return the charts, configurations and velocities of many states (N, nx)."""
         g = self.groups
         if not np.isfinite(x).all():
             raise InputError("x has entries that are not finite; give finite numbers")

@@ -27,7 +27,7 @@ class ToolModel(Design):
     r"""Linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The state x holds q and v of the tool. If q is on a manifold (mujoco, pinocchio, spart), x holds
-    the tangent displacement from the point, in the order of v, in place of q.
+    a displacement instead of q: the tangent vector from the point, in the order of v.
 
     Attributes
     ----------

@@ -106,7 +106,7 @@ class LinearTrajectory(Trajectory):
         return Linearizer(self.robot, moving=True, engine="python")
 
     def matrices(self, t: float) -> tuple[Array, Array]:
-        """Return A (nx, nx) and B (nx, nu) at a time; between knots they are taken at `point`."""
+        """Return A (nx, nx) and B (nx, nu) at a time t [s], between knots evaluated at `point`."""
         t = self._within(t)
         k, share = placed(self.t, t)
         if self.dt or share in (0.0, 1.0):

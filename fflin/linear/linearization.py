@@ -48,7 +48,7 @@ class Linearizer:
     At other points :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
     :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`, then transformed to the chart and
     the velocity frame. The dynamics do not depend on the position and linear velocity of the base
-    (Galilean invariance). They are evaluated without both, so a distant base costs no digits.
+    (Galilean invariance). They are evaluated without both, so a distant base loses no accuracy.
     docs/derivation.md has the equations. Section 14 covers a robot in orbit, whose rates are
     relative to the orbit's frame.
 

@@ -119,7 +119,7 @@ def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None
     - Rotations of frames are relative to the point of linearisation.
     - Angles of continuous joints are unwrapped to be nearest to that point.
 
-    A controller of the model therefore takes ``y - lin.y0``.
+    The input of a controller designed for the model is therefore ``y - lin.y0``.
 
     Parameters
     ----------

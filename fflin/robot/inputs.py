@@ -219,10 +219,10 @@ class ReactionWheel(WrenchInput):
     power is u times the speed of the wheel relative to this link. Mass and inertia of the carrier
     in the URDF must include the wheel, as if it were welded.
 
-    With an ``inertia`` J, the speed of the wheel is a state. The robot has one more joint: a
-    continuous joint with the wheel's name, after all joints that hang on its carrier. J a a^T
-    moves from the carrier's inertia to the wheel; mass and transverse inertia stay with the
-    carrier.
+    With an ``inertia`` J, the speed of the wheel is a state. The robot has one more joint, a
+    continuous joint with the wheel's name. In the state it follows all joints that its carrier
+    carries. J a a^T moves from the carrier's inertia to the wheel; mass and transverse inertia
+    stay with the carrier.
 
     Without ``inertia``, the wheel is not a joint. The carrier feels the torque -u a, and the
     gyroscopic torque :math:`-\omega \times h a` of the wheel's ``momentum`` h. This is the limit

@@ -39,8 +39,8 @@ class Robot(Coordinates):
     ----------
     model : pin.Model
         Pinocchio model with a free-flyer root joint and zero gravity. Mimic joints are ordinary
-        joints in it, and so are input wheels with an inertia. Read only: if the model was changed,
-        the robot is refused; make a new one with `from_model`.
+        joints in it, and so are input wheels with an inertia. Do not change it: a robot whose
+        model was changed is refused. Make a new robot with `from_model` instead.
     name : str
         Name or file stem by which the robot was loaded.
     urdf : Path or None
