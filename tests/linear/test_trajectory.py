@@ -139,9 +139,9 @@ def test_intervals_are_integrated_once(monkeypatch):
     ("name", "row", "value", "where"),
     [
         ("v", 20, 1e200, "at t = 0.1 s: v has an entry of 1e+200"),
-        ("v", 20, 1e45, "from t = 0.1 to 0.105 s it overflows"),
-        ("u", 20, 1e200, "from t = 0.095 to 0.1 s it overflows"),
-        ("t", 80, 1e300, "from t = 0.395 to 1e+300 s it overflows"),
+        ("v", 20, 1e45, "from t = 0.1 to 0.105 s the integration overflows"),
+        ("u", 20, 1e200, "from t = 0.095 to 0.1 s the integration overflows"),
+        ("t", 80, 1e300, "from t = 0.395 to 1e+300 s the integration overflows"),
     ],
 )
 def test_what_overflows_is_refused_with_its_place(name, row, value, where, monkeypatch):

@@ -170,7 +170,7 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
     notes = (
         (negligible, f"{lost}negligible compared with the links it is fixed to"),
         # One principal moment is more than the sum of the others.
-        (unequal, f"inertia is not physically realisable: {enumerated(unequal)}"),
+        (unequal, f"unphysical inertia: {enumerated(unequal)}"),
         (weightless, f"inertia without mass: {named('link', weightless)}"),
     )
     return [f"{origin}: {text}" for names, text in notes if names]

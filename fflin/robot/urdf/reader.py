@@ -83,17 +83,10 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
     damping = {joint.name: joint.damping for joint in moving if joint.damping}
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
-    resistances = {
-        "damping": ("damping", damping, "; damping='urdf' includes it"),
-        "Coulomb friction": ("friction", friction, ""),
-    }
+    resistances = {"damping": ("damping", damping), "Coulomb friction": ("friction", friction)}
     advice = [
-        Advice(
-            key,
-            tuple(values),
-            f"{path.stem}: {what} is not in the model: {enumerated(list(values))}{hint}",
-        )
-        for what, (key, values, hint) in resistances.items()
+        Advice(key, tuple(values), f"{path.stem}: {what} unused: {enumerated(list(values))}")
+        for what, (key, values) in resistances.items()
         if values
     ]
     unlimited: dict[tuple[str, ...], list[str]] = {}
@@ -103,10 +96,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     for zero, of in unlimited.items():
         if zero:
             joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
-            text = (
-                f"{path.stem}: {', '.join(of)} limit 0 of {joints} is read as no limit; list "
-                "joints without a motor in passive"
-            )
+            text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
             advice.append(Advice("passive", zero, text))
     weights = {name: link for name, link in urdf.links.items() if link.mass}
     of_links, said = (weights, tuple(urdf.joints)), (tuple(notes), tuple(advice))
