@@ -1,4 +1,4 @@
-"""What every room stands on and that knows no robot.
+"""Foundations that depend on no robot.
 
 Errors, files and records, rotations, tables and figures, checks of arguments. Imports no other
 room.

@@ -13,7 +13,7 @@ _INDENTED = re.compile(r"[ \t]*\r?\n[ \t]+")
 
 
 def one_line(text: str) -> str:
-    """Return a message in one line: what a name holds is escaped, and what is too long is cut."""
+    """Return a message in one line: control characters are escaped, long text is cut."""
     text = _INDENTED.sub(" ", text)
     text = _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
     text = _LONG_NAME.sub(lambda found: _cut(found[0], 60), text)
@@ -26,7 +26,7 @@ def _cut(text: str, size: int) -> str:
 
 
 class FflinError(Exception):
-    """Base of every error that a public call of fflin raises on purpose; reads as one line.
+    """Base class of every error that fflin raises deliberately; its message is one line.
 
     Examples
     --------
@@ -42,7 +42,7 @@ class FflinError(Exception):
 
 
 class InputError(FflinError, ValueError):
-    """An argument has a wrong size, type or value.
+    """Error for an argument of the wrong size, type or value.
 
     Examples
     --------
@@ -54,7 +54,7 @@ class InputError(FflinError, ValueError):
 
 
 class UnknownNameError(FflinError, LookupError):
-    """A robot, joint or frame of that name does not exist.
+    """Error for the name of a robot, joint, frame or other item that does not exist.
 
     Examples
     --------
@@ -66,7 +66,7 @@ class UnknownNameError(FflinError, LookupError):
 
 
 class FileError(FflinError, OSError):
-    """A file cannot be read or written.
+    """Error for a file that cannot be read or written.
 
     Examples
     --------
@@ -78,7 +78,7 @@ class FileError(FflinError, OSError):
 
 
 class UrdfError(FflinError, ValueError):
-    """A robot description is malformed or describes what cannot exist.
+    """Error for a robot description that is malformed or physically impossible.
 
     Examples
     --------
@@ -92,7 +92,7 @@ class UrdfError(FflinError, ValueError):
 
 
 class ModelError(FflinError, ValueError):
-    """A model is not one free-flying tree of one-degree-of-freedom joints.
+    """Error for a model that is not one free-flying tree of one-degree-of-freedom joints.
 
     Examples
     --------
@@ -105,7 +105,7 @@ class ModelError(FflinError, ValueError):
 
 
 class SingularInertiaError(FflinError, ArithmeticError):
-    """The joint-space inertia matrix cannot be inverted.
+    """Error for a joint-space inertia matrix that cannot be inverted.
 
     Examples
     --------
@@ -117,7 +117,7 @@ class SingularInertiaError(FflinError, ArithmeticError):
 
 
 class ChartError(FflinError, ValueError):
-    """The base is turned by pi from the reference, where the attitude chart ends.
+    """Error for a base attitude 180 deg from the reference, where the attitude chart is singular.
 
     Examples
     --------
@@ -128,12 +128,12 @@ class ChartError(FflinError, ValueError):
     >>> fflin.linearize(robot, q, reference=pin.SE3.Identity())
     Traceback (most recent call last):
         ...
-    fflin.base.errors.ChartError: the base is turned by 180 deg from the reference, where the ...
+    fflin.base.errors.ChartError: the base is rotated by 180 deg from the reference, where the ...
     """
 
 
 class EquilibriumError(FflinError, ValueError):
-    """A point is no fixed point where one is needed, or no input makes it one.
+    """Error for a point that must be a fixed point and is not, or that no input makes one.
 
     Examples
     --------
@@ -146,12 +146,12 @@ class EquilibriumError(FflinError, ValueError):
 
 
 class StabilizabilityError(FflinError, ValueError):
-    """The inputs cannot hold what does not settle by itself.
+    """Error for modes that do not decay by themselves and that the inputs cannot control.
 
     Attributes
     ----------
     margin : Margin or None
-        Distance from doubt of the decisions behind it; None where they were not made.
+        How far the rank decisions behind the error are from doubt; None if none was made.
 
     Examples
     --------
@@ -166,12 +166,12 @@ class StabilizabilityError(FflinError, ValueError):
 
 
 class DetectabilityError(FflinError, ValueError):
-    """The outputs do not show what does not settle by itself.
+    """Error for modes that do not decay by themselves and that the outputs do not observe.
 
     Attributes
     ----------
     margin : Margin or None
-        Distance from doubt of the decisions behind it; None where they were not made.
+        How far the rank decisions behind the error are from doubt; None if none was made.
 
     Examples
     --------
@@ -187,7 +187,7 @@ class DetectabilityError(FflinError, ValueError):
 
 
 class MissingPackageError(FflinError, ImportError):
-    """An optional package is needed and not installed.
+    """Error for an optional package that is needed but not installed.
 
     Examples
     --------
@@ -197,14 +197,14 @@ class MissingPackageError(FflinError, ImportError):
 
 
 class SweepError(FflinError, RuntimeError):
-    """Some chunks of a sweep have no result.
+    """Error for a sweep in which some chunks of points have no result.
 
     Attributes
     ----------
     failed : tuple
-        (start, stop, reason) of each: its points, stop not among them.
+        (start, stop, reason) of each failed chunk; its points are start to stop - 1.
     batch : LinearBatch or None
-        The others, in order, where they are in memory.
+        Results of the other chunks, in order; None if the sweep was written to a file.
 
     Examples
     --------
@@ -213,7 +213,7 @@ class SweepError(FflinError, RuntimeError):
     >>> try:
     ...     batch = fflin.sweep(robot, points)
     ... except fflin.SweepError as error:
-    ...     batch = error.batch  # of the chunks that went well
+    ...     batch = error.batch  # the chunks that succeeded
     >>> len(batch)
     3
     """
@@ -226,7 +226,7 @@ class SweepError(FflinError, RuntimeError):
 
 
 class FflinWarning(UserWarning):
-    """Something about a robot that its user should know and that is no error.
+    """Warning about something that the user should know and that is not an error.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What every figure has: its style, its colours, and the file it is saved to."""
+"""Figures: their style, their colours, and the file that each is saved to."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def drawing(path: str | Path | None, width: float, height: float, **options: Any
 
 
 def require_matplotlib() -> None:
-    """Raise `MissingPackageError` where matplotlib is not installed or cannot be loaded."""
+    """Raise `MissingPackageError` if matplotlib is not installed or cannot be loaded."""
     try:
         import matplotlib  # noqa: F401
     except ImportError:
@@ -95,4 +95,6 @@ def require_matplotlib() -> None:
         ) from None
     except ValueError as error:  # of the environment's MPLBACKEND, or of a settings file
         said = str(error).partition(";")[0]
-        raise MissingPackageError(f"matplotlib cannot be loaded: {said}; mend MPLBACKEND") from None
+        raise MissingPackageError(
+            f"matplotlib cannot be loaded: {said}; correct MPLBACKEND"
+        ) from None

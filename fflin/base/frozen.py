@@ -1,4 +1,4 @@
-"""Results that nobody changes by accident: their arrays are read-only."""
+"""Results with read-only arrays, so that nobody changes them by accident."""
 
 from dataclasses import fields
 from typing import Any

@@ -1,4 +1,4 @@
-"""Intervals of a share, a quantile and a mean of independent draws, and rank correlation.
+"""Confidence intervals of a fraction, a quantile and a mean, and rank correlation.
 
 C. J. Clopper and E. S. Pearson, Biometrika 26(4), 1934; H. A. David and H. N. Nagaraja, Order
 Statistics, 3rd edition, 2003, section 7.1.
@@ -13,7 +13,7 @@ from fflin.base.validation import Array
 
 
 class Estimate(NamedTuple):
-    """A figure, and the least and largest that it may be at a confidence."""
+    """Estimated value, with the lower and upper ends of its confidence interval."""
 
     value: float
     low: float

@@ -61,7 +61,8 @@ def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
         groups = list(dict.fromkeys(group_of(names[i]) for i in found))
         if len(groups) > 1:
             written = " or ".join(f"{group}.{key}" for group in groups)
-            raise InputError(f"{kind} '{key}' may be of {', '.join(groups)}; write {written}")
+            fits = ", ".join(groups)
+            raise InputError(f"{kind} '{key}' is ambiguous: it is in {fits}; write {written}")
     if not found:
         known = dict.fromkeys((*filter(None, map(group_of, names)), *names))
         raise unknown(kind, key, known)

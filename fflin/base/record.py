@@ -1,11 +1,16 @@
-"""Records on disk: names with arrays, texts, lists of texts, figures, and groups of figures.
+"""Records on disk: names with arrays, texts, lists of texts, numbers, and groups of numbers.
 
-Models, gains, schedules, filters and motions are such records, and whoever reads .npz, .mat or
-.json can read them. Each file carries a SHA-256 of its content, so that one that was damaged or
-edited is refused: the entry ``sha256`` of .npz (of the other entries) and .json (of the text
-before it), the header's text of .mat (of all that follows). One without it is read as it is, and
-what is made of it is not ``verified``, nor written with one. A .mat file is checked before SciPy
-reads it, since SciPy can crash on a damaged one.
+Models, gains, schedules, filters and motions are such records; any program that reads .npz, .mat
+or .json can read them. Each file carries a SHA-256 digest, so that a damaged or edited file is
+refused:
+
+- .npz: the entry ``sha256``, the digest of the other entries;
+- .json: the entry ``sha256``, the digest of the text before it;
+- .mat: the text of the header, the digest of all that follows it. It is compared before SciPy
+  reads the file, since SciPy can crash on a damaged one.
+
+A file without a digest is read as it is. The result is then not ``verified``, and it is saved
+without a digest.
 """
 
 from __future__ import annotations
@@ -34,8 +39,8 @@ SEAL = "sha256"
 Record = dict[str, Any]
 Kind = TypeVar("Kind", bound="Design")
 
-DAMAGED = f"its content is not what its {SEAL} says: it was damaged or edited"
-NOT_VERIFIED = f"not verified: read from a file without a {SEAL}, which could tell damage"
+DAMAGED = f"its content does not match its {SEAL}: the file was damaged or edited"
+NOT_VERIFIED = f"not verified: the file has no {SEAL}, so that damage cannot be detected"
 
 _BLOCK = 2**22
 _LARGEST = 1e300
@@ -45,7 +50,7 @@ _MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)  # a header
 
 
 class NoRoomError(FileError):
-    """What a file holds does not fit into the memory."""
+    """Error for a file whose content does not fit into memory."""
 
 
 def write_record(path: Path, record: Mapping[str, Any], *, sealed: bool) -> None:
@@ -75,7 +80,7 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise FileError(f"{path}: cannot be read: No such file or directory") from None
     except Exception as error:  # each decoder has its own dozen
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
-            raise NoRoomError(f"{shown(path)}: does not fit into the memory") from None
+            raise NoRoomError(f"{shown(path)}: does not fit into memory") from None
         raise FileError(f"{shown(path)}: not a {what} saved by fflin ({reason(error)})") from None
 
 
@@ -83,7 +88,9 @@ def require_finite(record: Mapping[str, Any]) -> None:
     """Raise `InputError` where a figure is not finite."""
     for key, value in record.items():
         if isinstance(value, np.ndarray | float) and not np.isfinite(value).all():
-            raise InputError(f"{key} has entries that are not finite; it is not saved")
+            raise InputError(
+                f"{key} has entries that are not finite; only finite values can be saved"
+            )
 
 
 def text(value: Any) -> str:
@@ -211,10 +218,10 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
     if found:
         body = content[: len(content) - len(found.group())]
         if hashlib.sha256(body).hexdigest().encode() != found.group(1):
-            raise ValueError(f"{DAMAGED}; without the line {SEAL} it is read as it is")
+            raise ValueError(f"{DAMAGED}; to read it as it is, delete the line {SEAL}")
     record: Record = json.loads(content)
     if record.pop(SEAL, None) is not None and not found:
-        raise ValueError(f"its {SEAL} does not stand as it was written; take it out")
+        raise ValueError(f"its line {SEAL} is not in the form that fflin writes; delete it")
     return record, bool(found)
 
 
@@ -228,13 +235,13 @@ FORMATS = tuple(_CODECS)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Design(FrozenArrays):
-    """A result of arrays, names and figures that saves and loads; the arrays are read-only.
+    """Result of arrays, names and numbers that can be saved and loaded; its arrays are read-only.
 
     Attributes
     ----------
     verified : bool
-        Whether it is as it was made; False of a file that has no digest to tell damage by, and of
-        what is designed from it.
+        True for a result of this session, or read from a file with a valid SHA-256 digest. False
+        for a file without a digest, and for every result made from its data.
     """
 
     # Names of the arrays of one dimension, which Matlab does not know.
@@ -248,14 +255,14 @@ class Design(FrozenArrays):
         return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
 
     def save(self, path: str | Path) -> None:
-        """Write it to a .npz, .mat or .json file, whole or not at all.
+        """Write the result to a .npz, .mat or .json file; the file is written atomically.
 
         Raises
         ------
         FileError
-            If the ending is another or the file cannot be written.
+            If the path has another ending or the file cannot be written.
         InputError
-            If a figure is not finite.
+            If a value is not finite.
         """
         record: Record = {"kind": type(self).__name__}
         for item in _saved(type(self)):
@@ -267,12 +274,12 @@ class Design(FrozenArrays):
 
     @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:
-        """Read what `save` wrote; every figure is the same to the last bit.
+        """Read a file that `save` wrote; every value is restored bit for bit.
 
         Raises
         ------
         FileError
-            If the file cannot be read, is damaged or is another thing.
+            If the file cannot be read, is damaged or holds another kind of result.
         """
         return cls._read(path)
 

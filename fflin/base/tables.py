@@ -1,4 +1,4 @@
-"""Text tables: aligned, folded to the terminal's width, plain where it is not a terminal."""
+"""Text tables: aligned, folded to the terminal's width, plain if the output is not a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One thread for many small matrices, which several threads of BLAS only wait for each other at."""
+"""BLAS limited to one thread: for many small matrices, several threads only wait for each other."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -9,7 +9,7 @@ T = TypeVar("T")
 
 
 def in_one_thread(function: Callable[P, T]) -> Callable[P, T]:
-    """Let BLAS have one thread within a function."""
+    """Limit BLAS to one thread within a function."""
 
     @wraps(function)
     def limited(*args: P.args, **kwargs: P.kwargs) -> T:

@@ -1,4 +1,4 @@
-"""TOML files, and the lines on which what they hold stands."""
+"""TOML files, and the line number of each of their keys."""
 
 import re
 import sys
@@ -39,7 +39,7 @@ _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
 
 
 class TomlFile:
-    """What a file holds, and the lines of places such as ``input``, 3, ``axis``."""
+    """Content of a TOML file, with the lines of places such as ``input``, 3, ``axis``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -51,11 +51,14 @@ class TomlFile:
             raise InputError(f"{path}:{line}: is not UTF-8 text; save it as UTF-8") from None
         for number, written in enumerate(text.split("\n"), start=1):
             if written.count(".") > _DOTS_LIMIT:
-                raise InputError(f"{path}:{number}: has more than {_DOTS_LIMIT} dots; shorten it")
+                raise InputError(
+                    f"{path}:{number}: line with more than {_DOTS_LIMIT} dots; shorten it"
+                )
         try:
             self.record: dict[str, Any] = tomllib.loads(text)
         except RecursionError:
-            raise InputError(f"{path}: is nested too deeply; expected tables of values") from None
+            message = f"{path}: tables are nested too deeply; expected tables of values"
+            raise InputError(message) from None
         except ValueError as error:
             raise InputError(_explain(path, text, str(error))) from None
         # Keys may be quoted: what stands on one line is left, and is no line of its own.
@@ -64,10 +67,11 @@ class TomlFile:
         for place, value in _values(self.record):
             if type(value) is int and value.bit_length() > _BITS_LIMIT:
                 name = ".".join(map(str, place))
-                raise self.error(f"{name} is too long an integer; write a float, 1e30", *place)
+                message = f"{name} is an integer with too many digits; write a float, such as 1e30"
+                raise self.error(message, *place)
 
     def line(self, *place: str | int) -> int:
-        """Return the line of a place, or that of the table that holds it."""
+        """Return the line number of a key, or of the table that holds it."""
         way = ".".join(map(str, place))
         while way and way not in self._lines:
             way = way.rpartition(".")[0]
@@ -140,5 +144,5 @@ def _explain(path: Path, text: str, problem: str) -> str:
     what, line, column = found.groups() if found else (problem, None, None)
     if line is None:
         place = f"{path}:{text.rstrip().count(chr(10)) + 1}" if found else str(path)
-        return f"{place}: not TOML: {what}; mend it"
-    return f"{path}:{line}: not TOML: {what} at column {column}; mend it there"
+        return f"{place}: not TOML: {what}; correct it"
+    return f"{path}:{line}: not TOML: {what} at column {column}; correct it there"

@@ -1,4 +1,4 @@
-"""Checks of what callers pass in, made once at the public door."""
+"""Checks of arguments, made once where a public call begins."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def share(name: str, value: Any) -> float:
     """Return a number between 0 and 1, or raise `InputError`."""
     found = number(name, value)
     if not 0.0 < found < 1.0:
-        raise InputError(f"{name} is {found:g}, expected a share between 0 and 1")
+        raise InputError(f"{name} is {found:g}, expected a fraction between 0 and 1")
     return found
 
 
@@ -68,7 +68,7 @@ def refuse_masked(name: str, value: Any) -> None:
     """Raise `InputError` where an entry is masked, which NumPy makes NaN or takes as it is."""
     ma: Any = sys.modules.get("numpy.ma")  # what is masked has loaded it
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
-        raise InputError(f"{name} has masked entries; fill them first")
+        raise InputError(f"{name} has masked entries; fill them in first")
 
 
 def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
@@ -86,9 +86,9 @@ def truth(name: str, value: Any) -> bool:
 def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
     """Return a whole number within limits, or raise `InputError` that says what was given."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
-        raise InputError(f"{name} is {value!r}, expected a whole number from {least} on")
+        raise InputError(f"{name} is {value!r}, expected a whole number of at least {least}")
     if not least <= value <= largest:
-        bound = f"from {least} on" if value < least else f"of at most {largest:,}"
+        bound = f"of at least {least}" if value < least else f"of at most {largest:,}"
         raise InputError(f"{name} is {value}, expected a whole number {bound}")
     return int(value)
 
@@ -115,7 +115,7 @@ def numbers(name: str, value: Any, of_what: str, each: str) -> dict[str, float]:
 
 
 def dimension(name: str, value: Any) -> int:
-    """Return how many indices an array has, or raise `InputError` where it is none."""
+    """Return the number of dimensions of an array, or raise `InputError`."""
     return _as_array(name, value).ndim
 
 
@@ -127,7 +127,9 @@ def placement(name: str, value: Any) -> pin.SE3:
     if not np.isfinite(value.homogeneous).all():
         raise InputError(f"{name} has entries that are not finite")
     if not is_rotation(value.rotation):
-        raise InputError(f"the rotation of {name} is not one: R^T R and det R must be 1")
+        raise InputError(
+            f"the matrix R of {name} is not a rotation; expected R^T R = I and det R = 1"
+        )
     return pin.SE3(pin.Quaternion(value.rotation).normalized().matrix(), value.translation)
 
 
@@ -138,7 +140,7 @@ def is_rotation(R: Array) -> bool:
 
 
 def as_double(name: str, value: ArrayLike) -> Array:
-    """Return a new array of native floats, or raise `InputError` where it is none of numbers."""
+    """Return a new array of native floats, or raise `InputError` if an entry is not a number."""
     refuse_masked(name, value)
     array = _as_array(name, value)
     if array.dtype.kind not in "fiu":

@@ -1,9 +1,10 @@
-"""The one rule for files.
+"""Atomic writing of files.
 
-What is written takes a new name or the place of a regular file; it is whole, or what was there
-stays; an old file keeps its mode, and a new one has what the umask leaves. Where the target is a
-link, the file that it leads to is written, and the link stays. A command writes over none of the
-files that it reads.
+- A file is written completely or, if anything fails, not at all; the old file then stays.
+- The target is a new name or a regular file. An old file keeps its mode; the umask sets the mode
+  of a new one.
+- If the target is a link, the file that it leads to is written, and the link stays.
+- A command never overwrites a file that it reads.
 """
 
 import os
@@ -18,7 +19,7 @@ from fflin.base.errors import FileError, InputError
 
 
 class CommandFiles(NamedTuple):
-    """What a command was told to write and has not written yet, and what it reads."""
+    """Output files that a command has still to write, and input files that it has read."""
 
     outputs: set[Path]
     inputs: set[str]
@@ -29,16 +30,16 @@ _of_command: ContextVar[CommandFiles | None] = ContextVar("files of a command", 
 
 
 def as_path(path: Any) -> Path:
-    """Return a path, or raise `InputError` where it is none."""
+    """Return a path, or raise `InputError` if the value is not a path."""
     if not isinstance(path, str | os.PathLike) or "\0" in str(path):
         raise InputError(f"{path!r} is not a path")
     if not str(path):
-        raise InputError("the path is empty; name a file")
+        raise InputError("the path is empty; give the name of a file")
     return Path(path)
 
 
 def check_ending(path: Path, endings: tuple[str, ...]) -> None:
-    """Raise `FileError` where the name of a file ends in none of those that are known."""
+    """Raise `FileError` if the name of a file has none of the given endings."""
     if path.suffix not in endings:
         raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {', '.join(endings)}")
 
@@ -92,8 +93,8 @@ def remember(*paths: str | Path) -> None:
 def _require_other(target: Path, inputs: Iterable[str | Path]) -> None:
     for path in inputs:
         if _same_file(path, target):
-            said = f"{target} is the input file {os.path.abspath(path)}"
-            raise FileError(f"{said}; name another to write")
+            said = f"output {target} is the input file {os.path.abspath(path)}"
+            raise FileError(f"{said}; give another output file")
 
 
 def _same_file(path: str | Path, other: Path) -> bool:
@@ -185,7 +186,8 @@ def check_distinct(*targets: Path | None) -> None:
         for first in seen:
             same = os.path.realpath(first) == os.path.realpath(target)
             if same or _same_file(first, target):
-                raise FileError(f"{target} and {first} are one file; name another for each output")
+                said = f"outputs {target} and {first} are the same file"
+                raise FileError(f"{said}; give each output its own file")
         seen.append(target)
 
 
@@ -201,7 +203,7 @@ def reason(error: Exception) -> str:
     said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     if isinstance(error, KeyError) and said.strip("'").isidentifier():
         said = f"it has no entry {said}"
-    ends = "it ends too early" if isinstance(error, EOFError) else type(error).__name__
+    ends = "the file ends too early" if isinstance(error, EOFError) else type(error).__name__
     return " ".join(said.split()) or ends
 
 

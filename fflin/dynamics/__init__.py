@@ -1,1 +1,1 @@
-"""The nonlinear robot: state, forces, inertia, accelerations and their slopes, outputs."""
+"""Nonlinear dynamics: state, forces, inertia, accelerations and their derivatives, outputs."""

@@ -1,4 +1,4 @@
-"""Accelerations and slopes by articulated bodies: the route by which models are checked."""
+"""Accelerations and derivatives by the articulated-body algorithm, to check linear models."""
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +13,7 @@ from fflin.robot.frames import ROOT
 
 
 class Aba:
-    """The nonlinear dynamics of a robot with all that acts on it, in base axes."""
+    """Nonlinear dynamics of a robot with all its forces, in base axes."""
 
     def __init__(self, state: StateMap) -> None:
         robot = state.robot
@@ -109,7 +109,7 @@ class Aba:
         return total
 
     def _turning(self, joint: int, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the slopes (3, nv) over v and q of the angular velocity of a link in its axes."""
+        """Return the derivatives (3, nv) over v and q of a link's angular velocity in its axes."""
         # A turn of a joint l that carries it, about s in its axes, changes it by omega_p x s, with
         # omega_p the angular velocity of what carries l; a turn of the base changes nothing.
         model, data = self._model, self._data
@@ -146,7 +146,7 @@ class Aba:
     def _constrained_slopes(
         self, q: Array, v: Array, external: pin.StdVec_Force, tau: Array, S: Array
     ) -> tuple[Array, Array, Array]:
-        """Return the slopes where joints mimic others: S^T M a = S^T (tau - b)."""
+        """Return the derivatives for robots with mimic joints: S^T M a = S^T (tau - b)."""
         # The forces that keep the joints in step drop out of this equation. ABA needs a regular M,
         # which it is not where one of these joints carries no mass. So each gets, as a rotor, an
         # inertia as large as the one that they share, and what the rotors add to S^T M' S is

@@ -1,4 +1,4 @@
-"""How inputs act: the columns that take u to generalised forces, and the wrenches on links."""
+"""Generalised forces of the inputs: the columns that multiply u, and the wrenches on links."""
 
 from typing import Any, NamedTuple
 
@@ -18,14 +18,14 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Held(NamedTuple):
-    """Three inputs that are a vector on the base, held in reference axes."""
+    """Three inputs that form a vector on the base in reference axes."""
 
     columns: slice
     rows: slice
 
 
 class Actuation:
-    """The inputs of a robot, prepared."""
+    """Inputs of a robot, prepared for evaluation."""
 
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
@@ -111,7 +111,7 @@ class Actuation:
         return self.in_base_axes(Chart(q[:, 3:6], q[:, 6:7], R), u)
 
     def over_inputs(self, chart: Chart, by_u: Array, *, out: Array | None = None) -> Array:
-        """Return slopes (.., k, nu) over `in_base_axes` as slopes over u: F_u^T of (4.7)."""
+        """Convert derivatives (.., k, nu) over `in_base_axes` to derivatives over u: (4.7)."""
         return chart.to_reference(self._held, by_u.mT, out=None if out is None else out.mT).mT
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
@@ -124,5 +124,5 @@ class Actuation:
         return external
 
     def torques(self, u: Array) -> Array:
-        """Return the generalised forces (6 + n,) in base axes of all but those `wrenches`."""
+        """Return the generalised forces (6 + n,) in base axes of all inputs without `wrenches`."""
         return self.fixed @ u

@@ -1,4 +1,4 @@
-"""A rigid grasp: the robot that carries its payload, and the velocities just after."""
+"""Rigid grasp of a payload: the combined robot, and its velocities just after the impact."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ from fflin.robot.robot import Robot
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Capture(Impact):
-    """A robot with what it has grasped, and the impact; see also `Impact`.
+    """Robot with a grasped payload, and the impact of the grasp; see also `Impact`.
 
     Attributes
     ----------
     impulse : ndarray (6,)
-        On the robot, at the payload's frame and in its axes: force [N s], then torque [N m s].
+        Impulse on the robot, at the origin and in the axes of the payload's frame: force [N s],
+        then torque [N m s].
     payload : Robot
-        What was grasped, as a robot; its configuration and velocity just before are
+        The grasped payload as a robot. Its configuration and velocity just before the impact are
         ``payload_q`` (nq,) and ``payload_v`` (nv,).
     prefix : str
-        What its frame is called in the robot that carries it.
+        Name of the payload's frame in the combined robot.
 
     Examples
     --------
@@ -48,11 +49,11 @@ class Capture(Impact):
 
     @property
     def told(self) -> str:
-        """What happened and what it took, in a line."""
+        """Event, impulse and lost energy, in one line."""
         force, torque = (np.linalg.norm(each) for each in np.split(self.impulse, 2))
         return (
-            f"{self.event}: the grasp pulled by {force:.4g} N s and {torque:.4g} N m s; "
-            f"{self.energy_lost:.4g} J were lost"
+            f"{self.event}: impulse at the grasp {force:.4g} N s and {torque:.4g} N m s, "
+            f"{self.energy_lost:.4g} J lost"
         )
 
 
@@ -68,32 +69,34 @@ def capture(
     payload_v: Array | None = None,
     prefix: str = "payload",
 ) -> Capture:
-    r"""Grasp a payload rigidly, at once and for good.
+    r"""Grasp a payload rigidly, instantly and permanently.
 
-    The joints are free during the impact, since motors give finite torques. With the
-    Jacobian G of both motions over that of the robot that carries its payload,
-    :math:`M_+ \nu_+ = G^T \mathrm{diag}(M, M_p) (\nu_-, V_p)`: the M-orthogonal projection on what
-    the weld allows, which keeps both momenta.
+    The joints are free during the impact, because motors give only finite torques. The velocity
+    just after the impact solves :math:`M_+ \nu_+ = G^T \mathrm{diag}(M, M_p) (\nu_-, V_p)`. Here G
+    is the Jacobian of the velocities of robot and payload with respect to the velocity of the
+    combined robot. This is the M-orthogonal projection onto the motions that the weld allows. It
+    conserves linear and angular momentum.
 
     Parameters
     ----------
     robot : Robot
     frame : str
-        The frame that grasps.
+        Name of the grasping frame.
     payload : pin.Inertia or Robot
-        A body, in its own frame; or a robot, held by its base, with joints of its own, whose
-        springs and dampers stay and whose motors do not.
-    q, v : array_like, optional
-        Of the robot just before; neutral and at rest by default.
+        A rigid body, in its own frame, or a robot, grasped at its base. The joints of a payload
+        robot keep their springs and dampers and lose their motors.
+    q, v : array_like (nq,), (nv,), optional
+        Configuration and velocity of the robot just before the impact; neutral and at rest by
+        default.
     placement : pin.SE3, optional
-        Of the payload's frame in the grasping one; the identity by default.
+        Placement of the payload's frame in the grasping frame; the identity by default.
     payload_q : array_like (nq,), optional
-        Configuration of a payload with joints; of its base nothing is taken. Neutral by default.
+        Configuration of a payload with joints, neutral by default. Its base pose is ignored.
     payload_v : array_like (6,) or (nv,), optional
-        Twist of its frame, linear [m/s] and angular [rad/s], in its own axes, as Pinocchio's LOCAL,
-        and the speeds of its joints; at rest by default.
+        Twist of the payload's frame in its own axes (Pinocchio's LOCAL), linear [m/s], then
+        angular [rad/s], followed by the joint rates; at rest by default.
     prefix : str
-        What the payload's frame is called, and its joints and links before a dot.
+        Name of the payload's frame. The payload's joints and links are named PREFIX.NAME.
 
     Returns
     -------
@@ -104,15 +107,20 @@ def capture(
     UnknownNameError
         If there is no such frame.
     InputError
-        If a size or value is wrong, the payload is no body, its names are taken, its gravity or
-        orbit is another, or a wheel of it stores momentum without an inertia.
+        If one of these holds:
+
+        - a size or value is wrong;
+        - the payload's inertia is not physically realisable;
+        - the robot already has names with this prefix;
+        - robot and payload have different gravity or orbits;
+        - a wheel of the payload has momentum but no inertia.
     ModelError
         If a robot was changed after it was made.
 
     References
     ----------
-    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989, for free joints; the
-    impact is that of two bodies that stay together.
+    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989, for free joints. The
+    impact is the perfectly inelastic collision of two bodies.
 
     Examples
     --------
@@ -133,11 +141,14 @@ def capture(
     for field in ("gravity", "orbit") if isinstance(payload, Robot) else ():
         own, theirs = (getattr(each, field) for each in (robot, other))
         if own != theirs:
-            raise InputError(f"the robot's {field} is {own}, the payload's {theirs}; give both one")
+            raise InputError(
+                f"the robot's {field} is {own}, but the payload's is {theirs}; give both the same "
+                f"{field}"
+            )
     if other.stored_momentum:
         raise InputError(
-            "a wheel of the payload stores momentum and has no inertia, so that it is no joint and "
-            "would be lost; give it an inertia, and its speed in payload_v"
+            "a wheel of the payload has momentum but no inertia, so its momentum would be lost; "
+            "give the wheel an inertia, and its speed in payload_v"
         )
     at = pin.SE3.Identity() if placement is None else checked_placement("placement", placement)
     q = robot.neutral() if q is None else robot.checked_configuration(q)

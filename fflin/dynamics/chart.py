@@ -1,4 +1,4 @@
-"""The attitude chart: the vector part of the base's quaternion, its kinematics, and the turn R."""
+"""Attitude chart: the vector part of the base quaternion, its kinematics, and the rotation R."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +14,7 @@ SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 
 @dataclass(frozen=True)
 class Chart:
-    """The attitude chart at one base attitude, relative to the reference, or at many."""
+    """Attitude chart at one or many base attitudes relative to the reference."""
 
     q_b: Array  # vector part (.., 3) of the quaternion of refMb
     q0: float | Array  # its scalar part (.., 1), positive
@@ -48,14 +48,14 @@ class Chart:
         return times(self.R, vectors)
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
-        """Return the slope (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
+        """Return the derivative (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
         return -0.5 * (crossed + self._over_q0(omega))
 
     def _over_q0(self, omega: Array) -> Array:
         return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
 
     def over_q_b(self, by_turn: Array) -> Array:
-        """Return slopes (.., k, 3) over turns of the base in its axes as slopes over q_b (1.3)."""
+        """Return derivatives (.., k, 3) over base rotations as derivatives over q_b (1.3)."""
         return by_turn @ self.J
 
     def to_reference(
@@ -70,7 +70,7 @@ class Chart:
 
 
 class Standing(Chart):
-    """That of a base at the reference, or of many: R = Q = E and J = 2 E cost nothing."""
+    """Chart of one or many bases at the reference: R = Q = E and J = 2 E cost nothing."""
 
     N = 0.5 * np.eye(3)
 
@@ -90,7 +90,7 @@ class Standing(Chart):
         return -0.5 * crossed
 
     def over_q_b(self, by_turn: Array) -> Array:
-        """Return twice the slopes."""
+        """Return twice the derivatives."""
         return 2.0 * by_turn
 
     def to_reference(

@@ -1,4 +1,4 @@
-"""Impacts: what a robot becomes at once, as one whose joints jam, and the velocities just after."""
+"""Impacts: instant changes of a robot, such as a jammed joint, and the velocities just after."""
 
 from __future__ import annotations
 
@@ -21,24 +21,26 @@ from fflin.robot.robot import ROOT, Robot
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Impact(FrozenArrays):
-    """What a robot has become at once, and the impact; `Motion.then` goes on with it.
+    """Robot after an instant change, with the impact; `Motion.then` continues a motion with it.
 
     Attributes
     ----------
     robot : Robot
-        From then on, to be linearised, regulated and simulated like any other.
+        The robot after the impact, to be linearised, controlled and simulated like any other.
     q, v : ndarray (nq,), (nv,)
-        Of that robot, just after.
+        Configuration and velocity of this robot just after the impact.
     impulse : ndarray (k,)
-        Of `jam` on each joint, torque [N m s] or force [N s]; of `capture` see `Capture`.
+        From `jam`: impulse on each jammed joint, torque [N m s] or force [N s]. From `capture`:
+        see `Capture`.
     energy_lost : float
-        [J], never negative.
+        Kinetic energy lost in the impact [J], never negative.
     momentum : ndarray (6,)
-        Linear [N s], and angular [N m s] about the world's origin, of all together before.
+        Total momentum before the impact: linear [N s], then angular [N m s] about the world's
+        origin.
     momentum_after : ndarray (6,)
-        The same after: they differ by rounding.
+        Total momentum after the impact, which is the same to machine precision.
     event : str
-        What happened, in words.
+        Short description of the event.
 
     Examples
     --------
@@ -68,8 +70,8 @@ class Impact(FrozenArrays):
 
     @property
     def told(self) -> str:
-        """What happened and what it took, in a line."""
-        felt = f"impulse {np.abs(self.impulse).max(initial=0.0):.4g}"
+        """Event, impulse and lost energy, in one line."""
+        felt = f"largest impulse {np.abs(self.impulse).max(initial=0.0):.4g}"
         return f"{self.event}: {felt}, {self.energy_lost:.4g} J lost"
 
 
@@ -80,31 +82,32 @@ def jam(
     q: Array | None = None,
     v: Array | None = None,
 ) -> Impact:
-    r"""Stop joints or wheels at once and for good, where they are.
+    r"""Stop joints or wheels instantly and permanently at their present positions.
 
-    The other joints are free during the impact: :math:`M_+ \nu_+ = G^T M \nu`, (13.1) with G of
-    the robot whose joints stand still. Both momenta are kept. A joint whose motor fails and that
-    goes on freely is ``robot.replace(passive=[joint])``, without an impact.
+    The other joints are free during the impact. The velocity just after it solves
+    :math:`M_+ \nu_+ = G^T M \nu` (13.1), with the Jacobian G of the robot whose jammed joints are
+    fixed. Linear and angular momentum are conserved. If a motor fails but its joint still moves
+    freely, use ``robot.replace(passive=[joint])`` instead; there is then no impact.
 
     Parameters
     ----------
     robot : Robot
     joints : str or sequence of str
-        Names or patterns; what mimics a joint stops with it.
-    q, v : array_like, optional
-        Just before; neutral and at rest by default.
+        Names or patterns of joints; the mimic joints of a joint stop with it.
+    q, v : array_like (nq,), (nv,), optional
+        Configuration and velocity just before the impact; neutral and at rest by default.
 
     Returns
     -------
     Impact
-        Its robot has these joints welded and is without their inputs.
+        Result whose robot has these joints welded and no inputs on them.
 
     Raises
     ------
     UnknownNameError
         If there is no such joint.
     InputError
-        If a size or value is wrong, or no joint or no input is left to name.
+        If a size or value is wrong, no joint is named, or the robot would have no input left.
     ModelError
         If the robot was changed after it was made.
 

@@ -1,4 +1,4 @@
-"""The joint-space inertia M in state order, and its inverse."""
+"""Joint-space inertia matrix M in state order, and its inverse."""
 
 import warnings
 from weakref import WeakKeyDictionary
@@ -97,10 +97,10 @@ class Inertia:
         name, allowed = self._state.robot.name, self._in_order
         worst = int((inertias / allowed).argmin())
         warnings.warn(
-            f"M of '{name}': {coordinate_names(self._state.robot)[worst]} moves an inertia of "
-            f"{inertias[worst]:.1e} only, where mass and place of its links would allow "
-            f"{allowed[worst]:.1e}, and B is as large as {1.0 / inertias[worst]:.1e}; give the "
-            "links their inertia, see whether joints are placed in metres, or lock it",
+            f"M of '{name}': {coordinate_names(self._state.robot)[worst]} has an inertia of only "
+            f"{inertias[worst]:.1e}; mass and position of its links allow up to "
+            f"{allowed[worst]:.1e}. B has entries of {1.0 / inertias[worst]:.1e}. Give the links "
+            "their inertia, check that joints are placed in metres, or lock the joint",
             FflinWarning,
             stacklevel=6,
         )
@@ -124,11 +124,12 @@ class Inertia:
             raise SingularInertiaError(
                 f"M of '{name}' is singular at this configuration: {involved} can move together "
                 "without moving mass; choose another configuration, give the links an inertia, or "
-                "lock one of them"
+                "lock one of the joints"
             )
         warnings.warn(
             f"M of '{name}' is ill-conditioned: A and B have a relative error of about "
-            f"{coupling * _EPS:.0e}; {involved} hardly move mass against each other",
+            f"{coupling * _EPS:.0e}; {involved} move hardly any mass relative to each other; "
+            "check the inertias of their links",
             FflinWarning,
             stacklevel=6,
         )

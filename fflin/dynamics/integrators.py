@@ -1,4 +1,4 @@
-"""Steps of fixed size of a motion on the manifold, by name, of an acceleration f(t, q, v)."""
+"""Fixed-step integrators on the configuration manifold, for an acceleration f(t, q, v)."""
 
 from collections.abc import Callable
 from typing import ClassVar, TypeAlias
@@ -15,7 +15,7 @@ _integrate = pin.integrate
 
 
 class Integrator:
-    """Steps of one size of one model."""
+    """Integrator with one step size for one model."""
 
     # Of the stages: their times in a step of length 1,
     nodes: ClassVar[tuple[float, ...]]
@@ -38,7 +38,7 @@ class Integrator:
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of v and its rates l in what moves q after each stage, and in the new v."""
+        """Return the weights of v and its rates l in each stage's step of q, and in the new v."""
         raise NotImplementedError
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
@@ -55,7 +55,7 @@ class Integrator:
 
 
 class CommutatorFree4(Integrator):
-    """CF4 of Celledoni, Marthinsen and Owren: order 4, with two exponentials at the end (11.1)."""
+    """CF4 of Celledoni, Marthinsen and Owren: order 4, two exponentials at the end (11.1)."""
 
     nodes = (0.0, 0.5, 0.5, 1.0)
     weights = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
@@ -65,7 +65,7 @@ class CommutatorFree4(Integrator):
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of v, l1, ..., l4."""
+        """Return the weights of v, l1, ..., l4."""
         h, half, twelfth = dt, 0.5 * dt, dt * dt / 12.0
         way = [
             [half, 0.0, 0.0, 0.0, 0.0],
@@ -84,7 +84,7 @@ class CommutatorFree4(Integrator):
 
 
 class RungeKuttaMuntheKaas4(Integrator):
-    """Order 4 in the tangent at q, with the inverse of dexp at each stage."""
+    """RKMK4: order 4 in the tangent space at q, with the inverse of dexp at each stage."""
 
     nodes = CommutatorFree4.nodes
     weights, moments = CommutatorFree4.weights, CommutatorFree4.moments
@@ -93,7 +93,7 @@ class RungeKuttaMuntheKaas4(Integrator):
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of a stage's rate in what moves q to the next, and of CF4 in the new v."""
+        """Return the weights of a stage's rate in the next step of q, and of CF4 in the new v."""
         return np.array([[0.5 * dt], [0.5 * dt], [dt]]), CommutatorFree4.shares(dt)[1]
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
@@ -119,7 +119,7 @@ class RungeKuttaMuntheKaas4(Integrator):
 
 
 class SemiImplicitEuler(Integrator):
-    """Order 1: the new velocity moves the configuration."""
+    """Semi-implicit Euler: order 1, the new velocity moves the configuration."""
 
     nodes, weights, moments = (0.0,), (1.0,), (1.0,)
     reach = 2.0
@@ -127,7 +127,7 @@ class SemiImplicitEuler(Integrator):
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of v and its rate."""
+        """Return the weights of v and its rate."""
         return np.array([[dt, dt * dt], [0.0, 0.0]]), np.array([[1.0, dt]])
 
 

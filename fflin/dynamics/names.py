@@ -27,7 +27,7 @@ PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 
 
 def unknown_frame(frame: object) -> InputError:
-    """Build the error for what is no frame of velocities."""
+    """Build the error for an unknown velocity frame."""
     return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
 
 
@@ -40,17 +40,17 @@ def frame_of(robot: Robot, frame: object) -> Frame:
     if (frame in ORBITAL) != bool(robot.orbit):
         suits = " or ".join(ORBITAL) if robot.orbit else "hybrid, local or world"
         raise InputError(
-            f"frame is '{frame}', and '{robot.name}' is in {'an' if robot.orbit else 'no'} orbit; "
-            f"take {suits}{'' if robot.orbit else ', or give it one (orbit=, --orbit)'}"
+            f"frame is '{frame}', but '{robot.name}' is in {'an' if robot.orbit else 'no'} orbit; "
+            f"use {suits}{'' if robot.orbit else ', or give the robot an orbit (orbit=, --orbit)'}"
         )
     return cast("Frame", frame)
 
 
 def refuse_orbit(robot: Any, what: str) -> None:
-    """Raise `InputError` where a robot is in orbit, of which something is not."""
+    """Raise `InputError` if a robot is in orbit, which `what` does not support."""
     if getattr(robot, "orbit", None):
         raise InputError(
-            f"{what} are of robots that float free, and '{robot.name}' is in orbit; take "
+            f"{what} are defined only without an orbit, but '{robot.name}' is in orbit; use "
             "robot.replace(orbit=None)"
         )
 

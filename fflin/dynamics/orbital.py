@@ -1,4 +1,4 @@
-"""A circular orbit's frame: rates relative to it, and the field that is felt in it (14.1)."""
+"""Frame of a circular orbit: relative rates, and the gravity-gradient field (14.1)."""
 
 import math
 import warnings
@@ -21,7 +21,7 @@ _AXES = {
 
 
 def mean_motion(robot: Robot) -> float:
-    """Return that of a robot's orbit [rad/s], 0 where it has none."""
+    """Return the mean motion of a robot's orbit [rad/s], 0 without an orbit."""
     return robot.orbit.mean_motion if robot.orbit else 0.0
 
 
@@ -30,11 +30,12 @@ _COARSE, _USELESS = 0.01, 0.5
 
 
 class OrbitField:
-    """What an orbit does to a robot whose world is the orbit's frame.
+    """Acceleration field of an orbit, for a robot whose world is the orbit's frame.
 
-    The frame turns with `rate` (3,) [rad/s], and pulls with `tide` x per mass at the place x; what
-    is at rest in it feels `pull` x, n^2 (3 r r^T - z z^T) x. `axes` (3, 3) are the unit vectors
-    away from the body, along the orbit and along its normal.
+    The frame rotates with `rate` (3,) [rad/s]. At position x the gravity gradient is `tide` x per
+    mass; a point at rest in the frame has the acceleration `pull` x, n^2 (3 r r^T - z z^T) x. The
+    columns of `axes` (3, 3) are the unit vectors away from the central body, along the orbit and
+    along its normal.
     """
 
     def __init__(self, robot: Robot, frame: str) -> None:
@@ -66,11 +67,11 @@ class OrbitField:
         distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
         error = 1.5 * distance / (self.robot.orbit.radius if self.robot.orbit else math.inf)
         said = (
-            f"'{self.robot.name}' reaches {distance / 1e3:.4g} km from its orbit's point, where "
-            f"the field, taken linear in the distance, is off by up to {100.0 * error:.2g} %"
+            f"'{self.robot.name}' extends to {distance / 1e3:.4g} km from the origin of its orbit "
+            f"frame, where the linear gravity gradient has an error of up to {100.0 * error:.2g} %"
         )
         if error > _USELESS:
-            raise InputError(f"{said}; give it an orbit nearer to it")
+            raise InputError(f"{said}; give it an orbit nearer to the robot")
         if error > _COARSE:
             warnings.warn(said, FflinWarning, stacklevel=7)
 
@@ -101,7 +102,7 @@ class OrbitField:
         return [self._none, *map(pin.Force, force, torque)]
 
     def slopes(self, data: pin.Data) -> Array:
-        """Return the slopes (nv, nv) over q of the forces of `wrenches`, the base not shifted."""
+        """Return the derivatives (nv, nv) over q of the forces of `wrenches`, base unmoved."""
         # Of a joint that turns by t, in its axes: those of R^T tide R are T [t]x - [t]x T.
         model, (R, place) = self.robot.model, self._places(data)
         joints, local = range(ROOT, model.njoints), pin.ReferenceFrame.LOCAL
@@ -127,7 +128,7 @@ class OrbitField:
         return q, v
 
     def add_turning(self, q: Array, v: Array, by_q: Array, by_v: Array) -> None:
-        """Make slopes in state order at `near` those of the relative rates at q and v."""
+        """Convert derivatives in state order at `near` to the relative rates at q and v."""
         R, place = self.base(q)
         fall = R.T @ (self.pull @ place - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
         spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))

@@ -1,4 +1,4 @@
-"""What each kind of output measures: its value, and by a route apart its derivatives."""
+"""Value of each kind of output and, computed independently, its derivatives."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
@@ -16,7 +16,7 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Sensed(NamedTuple):
-    """Outputs and their derivatives (ny, nv) at a point, zero where they are states."""
+    """Outputs and their derivatives (ny, nv) at a point; zero for outputs that are states."""
 
     y: Array
     by_q: Array  # over the tangent of q that pin.integrate moves along
@@ -30,7 +30,7 @@ class Sensed(NamedTuple):
 
 
 class Point(NamedTuple):
-    """The robot with its base at the origin, and what was left out of it."""
+    """Robot with its base moved to the origin and to rest, and the removed base motion."""
 
     model: pin.Model
     data: pin.Data
@@ -50,7 +50,7 @@ class Point(NamedTuple):
 
 
 class World(NamedTuple):
-    """The robot where it is, after Pinocchio's forward kinematics of second order."""
+    """Robot at its actual pose, after Pinocchio's second-order forward kinematics."""
 
     model: pin.Model
     data: pin.Data

@@ -1,4 +1,4 @@
-"""The outputs of a robot, prepared: names and units, and evaluation by either route."""
+"""Outputs of a robot, prepared: names, units, and two independent evaluations."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,7 @@ _STANDING: tuple[Array, Array] = (np.eye(3), np.zeros(3))
 
 
 class Sensing:
-    """The outputs of a robot, prepared; with `own_reference` relative to the base itself."""
+    """Outputs of a robot, prepared; with `own_reference` relative to the base itself."""
 
     # Neither where the base is nor how fast it moves along changes what happens on the robot
     # (Galilei). So Pinocchio is asked about the robot with its base at the origin, in its own axes,
@@ -56,12 +56,12 @@ class Sensing:
         self.units = tuple(unit for _, unit in signals)
         twice = [name for index, name in enumerate(self.names) if name in self.names[:index]]
         if twice:
-            raise InputError(f"output '{twice[0]}' is asked for twice; leave one of them out")
+            raise InputError(f"output '{twice[0]}' is given twice; remove one")
         inertial = [x.WORD for x in outputs if x.WORD in ("accelerometer", "momentum")]
         if robot.orbit and inertial:
             raise InputError(
-                f"output {inertial[0]} is of axes that do not turn, and the world of "
-                f"'{robot.name}' turns with its orbit; leave it out"
+                f"output {inertial[0]} needs inertial axes, but the world of '{robot.name}' "
+                "rotates with its orbit; remove this output"
             )
         # Where one does, D is not zero.
         self.needs_acceleration = any(output.FEELS_ACCELERATION for output in outputs)
@@ -109,7 +109,7 @@ class Sensing:
 
 
 class Measuring:
-    """The outputs y by elementary kinematics, to check C and D; turns are counted from q."""
+    """Outputs y by elementary kinematics, to check C and D; rotations are relative to q."""
 
     def __init__(self, state: StateMap, q: Array) -> None:
         self.state = state
@@ -146,7 +146,7 @@ def state_indices(state: StateMap, output: Output) -> list[int]:
     if isinstance(output, BasePose):
         return list(range(groups.q_b.start, groups.r_b.stop))
     if not isinstance(output, JointOutput):
-        raise InputError(f"{output!r} is no output, as FramePose('tool') would be")
+        raise InputError(f"{output!r} is not an output; expected one such as FramePose('tool')")
     group = groups.q_m if isinstance(output, JointPositions) else groups.qdot_m
     names = robot.joint_names
     asked = names if output.joints is None else output.joints

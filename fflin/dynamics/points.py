@@ -1,4 +1,4 @@
-"""Configurations, velocities and inputs of a point by name."""
+"""Configurations, velocities and inputs, built from values by name."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -22,13 +22,13 @@ LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
 def configuration(
     robot: Robot, joints: Mapping[str, float] | None = None, base: pin.SE3 | None = None
 ) -> Array:
-    """Build a Pinocchio configuration.
+    """Return a Pinocchio configuration, from joint values by name and a base placement.
 
     Parameters
     ----------
     robot : Robot
     joints : mapping, optional
-        {joint: value [rad|m]} of independent joints; the others stay at neutral. A name may be
+        {joint: value [rad|m]} of independent joints; all others are at neutral. A name may be
         a pattern, ``hinge_*``.
     base : pin.SE3, optional
         Placement of the base in the world; the identity by default.
@@ -42,7 +42,7 @@ def configuration(
     UnknownNameError
         If there is no such joint.
     InputError
-        If a value is not a finite number, or a joint mimics another.
+        If a value is not a finite number, or a named joint mimics another.
 
     Examples
     --------
@@ -90,7 +90,7 @@ def point_of(
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:
-            raise InputError("x0 is given with q0 or v0; give either")
+            raise InputError("x0 is given together with q0 or v0; give x0 alone, or q0 and v0")
         return state.to_pinocchio(x0)
     if q0 is None and v0 is None:
         return default()
@@ -99,15 +99,15 @@ def point_of(
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
-    """Build a Pinocchio velocity.
+    """Return a Pinocchio velocity, from joint rates and base velocities by name.
 
     Parameters
     ----------
     robot : Robot
     values : mapping
-        {joint: rate [rad/s|m/s]}, and omega_b.x, .y, .z [rad/s] and v_b.x, .y, .z [m/s] of the
-        base in base axes; the others are zero. A name may be a pattern, ``hinge_*``, or a
-        group, ``qdot_m``.
+        {name: rate}, with joint names [rad/s|m/s], and omega_b.x, .y, .z [rad/s] and v_b.x, .y, .z
+        [m/s] of the base in base axes. All others are zero. A name may be a pattern, ``hinge_*``,
+        or a group, ``qdot_m``.
 
     Returns
     -------
@@ -136,13 +136,13 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
 
 
 def effort(robot: Robot, values: Mapping[str, float]) -> Array:
-    """Build an input over the robot's inputs.
+    """Return an input vector u, from values by name.
 
     Parameters
     ----------
     robot : Robot
     values : mapping
-        {name of an input, group or pattern, such as ``tau_m``: value}; the others are zero.
+        {name of an input, group or pattern, such as ``tau_m``: value}; all others are zero.
 
     Returns
     -------

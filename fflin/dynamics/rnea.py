@@ -1,4 +1,4 @@
-"""The accelerations at a point and their slopes, from CRBA's M and the derivatives of RNEA."""
+"""Accelerations at a point and their derivatives, from CRBA's M and the derivatives of RNEA."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from fflin.dynamics.tidal import Tide
 
 
 class Rates(NamedTuple):
-    """The acceleration of the base origin and the joints, in base axes, and what it depends on."""
+    """Acceleration of the base origin and the joints, in base axes, and its derivatives."""
 
     c: Array  # (6 + n,) of (3.1): without gravity and omega x v_b
     by_q_m: Array  # D_m (6 + n, n) of (3.3)
@@ -27,7 +27,7 @@ class Rates(NamedTuple):
 
 
 class Gyroscopic(NamedTuple):
-    r"""The torques :math:`-\omega \times h` of stored momentum, and their slopes."""
+    r"""Gyroscopic torques :math:`-\omega \times h` of stored momentum, and their derivatives."""
 
     wrenches: pin.StdVec_Force  # on every joint, in its frame
     force: Array  # what they are as a generalised force (nv,)
@@ -37,7 +37,7 @@ class Gyroscopic(NamedTuple):
 
 
 class Accelerations:
-    """``M nudot + b = B u`` of a robot, solved and differentiated in base axes."""
+    """Solution of ``M nudot + b = B u`` of a robot, with its derivatives, in base axes."""
 
     def __init__(self, state: StateMap, actuation: Actuation, data: pin.Data) -> None:
         robot = state.robot
@@ -97,7 +97,7 @@ class Accelerations:
     def _bias_slopes(
         self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None
     ) -> tuple[Array, Array]:
-        """Return the slopes of M a + b - B u + passive forces over q_m and nu (3.3), (7.1)."""
+        """Return the derivatives of M a + b - B u + passive forces over q_m and nu (3.3), (7.1)."""
         model, data, state = self._model, self._data, self._state
         # Constant in the frames of their links, so that RNEA's derivatives hold -d(B u)/dq.
         wrenches = gyroscopic.wrenches if gyroscopic else self._actuation.wrenches(u)
@@ -114,7 +114,7 @@ class Accelerations:
         return by_q, by_v
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
-        """Return the torques of stored momentum, their wrenches with those of the inputs."""
+        """Return the torques of stored momentum; the wrenches include the inputs'."""
         model, data, nv = self._model, self._data, len(v)
         # With the angular Jacobian J of a link in its axes, h x omega is J^T [h]x J v (6.3).
         wrenches = self._actuation.wrenches(u)

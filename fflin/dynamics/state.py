@@ -1,4 +1,4 @@
-"""The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, frames and chart."""
+"""State X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, frames and chart."""
 
 from copy import copy
 from itertools import compress
@@ -20,9 +20,10 @@ from fflin.robot.robot import Robot
 class StateMap:
     r"""Map between Pinocchio's (q, v) and the state of the linear model.
 
-    The state is :math:`X = (q_b, r_b, q_m, \omega_b, v_b, \dot q_m)` of dimension 12 + 2n:
-    with :math:`{}^{ref}M_b = {}^oM_{ref}^{-1}\,{}^oM_b`, q_b is the vector part of its quaternion,
-    taken so that the scalar part is not negative, and r_b its translation.
+    The state is :math:`X = (q_b, r_b, q_m, \omega_b, v_b, \dot q_m)` of dimension 12 + 2n. Let
+    :math:`{}^{ref}M_b = {}^oM_{ref}^{-1}\,{}^oM_b` be the base placement relative to the reference.
+    Then r_b is its translation, and q_b is the vector part of its quaternion, with the sign for
+    which the scalar part is not negative.
 
     Parameters
     ----------
@@ -30,31 +31,36 @@ class StateMap:
     reference : pin.SE3, optional
         Placement oMref that the attitude and position are relative to; identity by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
-        Axes of the velocities. hybrid: omega_b in base axes, v_b = d r_b/dt in reference axes.
-        local: both in base axes. world: both in reference axes. All at the base origin. Of a robot
-        in orbit lvlh (default) or hill, the frame that Pinocchio's world is, with axes as hybrid.
+        Axes of the base velocities omega_b and v_b, both at the base origin:
+
+        - hybrid (default): omega_b in base axes, v_b = d r_b/dt in reference axes;
+        - local: both in base axes;
+        - world: both in reference axes;
+        - lvlh (default in orbit) or hill, only for a robot in orbit: Pinocchio's world is this
+          frame of the orbit, and the axes are as in hybrid.
 
     Attributes
     ----------
     nx : int
-        12 + 2n.
+        Number of states, 12 + 2n.
     names, units : tuple of str
-        Of the nx states.
+        Names and units of the nx states.
     groups : Groups
         Slices of q_b, r_b, q_m, omega_b, v_b, qdot_m in the state.
     axes : tuple of bool
-        Whether (omega_b, v_b) stand in reference axes.
+        Whether omega_b and v_b are in reference axes.
     in_reference : tuple of slice
-        Rows of those that do, in any (6 + n) velocity or wrench.
+        Rows of the base velocities in reference axes, in any (6 + n) velocity or wrench.
     S : ndarray (nv, 6 + n) or None
-        With v = S nu, where joints mimic others; None where v is nu in another order.
+        Matrix of v = S nu if the robot has mimic joints; otherwise None, and v is a permutation of
+        nu.
     unbounded : ndarray of int
-        Which of the n joints turn without end.
+        Indices of the continuous joints among the n joints.
     origin_quaternion : ndarray (4,)
-        Attitude of `origin`.
+        Attitude of `origin` as a quaternion x, y, z, w.
     orbit : tuple of ndarray (3,), (3, 3), or None
-        Of a robot in orbit the rate at which the reference turns and the field that is felt at
-        rest in it, in its axes.
+        For a robot in orbit: the rotation rate of the reference, and the matrix of the
+        acceleration field of points at rest in it, both in its axes.
 
     Raises
     ------
@@ -111,7 +117,7 @@ class StateMap:
         self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
 
     def about(self, reference: pin.SE3) -> "StateMap":
-        """Return the map relative to another placement, with the same frame."""
+        """Return the same map relative to another placement, with the same velocity frame."""
         other = copy(self)
         other._refer(reference)
         return other
@@ -129,12 +135,12 @@ class StateMap:
 
     @property
     def reference(self) -> pin.SE3:
-        """The placement oMref, a copy."""
+        """Copy of the reference placement oMref."""
         return pin.SE3(self._reference)
 
     @property
     def origin(self) -> pin.SE3:
-        """Where the base is, seen from the reference, at q[:7] = 0, 0, 0, 0, 0, 0, 1."""
+        """Placement of the base relative to the reference at q[:7] = 0, 0, 0, 0, 0, 0, 1."""
         return pin.XYZQUATToSE3(np.concatenate((self._position, self.origin_quaternion)))
 
     def chart(self, q: Array) -> Chart:
@@ -143,20 +149,20 @@ class StateMap:
         Raises
         ------
         ChartError
-            If the base is turned by pi from the reference.
+            If the base is rotated by pi from the reference.
         """
         quaternion = turning.quaternion_product(self.origin_quaternion, q[3:7])
         quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
         q0 = float(quaternion[3])
         if q0 < SMALLEST_Q0:
             raise ChartError(
-                "the base is turned by 180 deg from the reference, where the attitude chart "
+                "the base is rotated by 180 deg from the reference, where the attitude chart "
                 "(quaternion vector part) is singular; give a reference nearer to the base"
             )
         return Chart(quaternion[:3], q0, turning.rotation_matrix(quaternion))
 
     def rotation(self, q: Array) -> Array:
-        """Return refMb.rotation (3, 3) at a valid configuration, at any turn."""
+        """Return the rotation matrix (3, 3) of refMb at a valid configuration, for any attitude."""
         turned: Array = pin.XYZQUATToSE3(q[:7]).rotation
         return turned if self._aligned else self._rotation.dot(turned)
 
@@ -165,7 +171,7 @@ class StateMap:
         return turning.rotation_matrix(q[3:7]).T @ self._gravity if self._falls else self._gravity
 
     def scalar(self, q: Array) -> float:
-        """Return q0 at a valid configuration, with the sign of the quaternion in q."""
+        """Return the quaternion's scalar part q0 at a valid q, with the sign it has in q."""
         return float(turning.quaternion_product(self.origin_quaternion, q[3:7])[3])
 
     def to_state(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
@@ -178,8 +184,9 @@ class StateMap:
         v : array_like (nv,)
             Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
         near : array_like (nx,), optional
-            A state; the angle of each continuous joint is taken on the turn nearest to it.
-            By default it lies in (-pi, pi].
+            State to which the angles of continuous joints are unwrapped: a multiple of 2 pi is
+            added to each angle so that it is nearest to this state. By default angles are in
+            (-pi, pi].
 
         Returns
         -------
@@ -188,7 +195,7 @@ class StateMap:
         Raises
         ------
         ChartError
-            If the base is turned by pi from the reference.
+            If the base is rotated by pi from the reference.
         InputError
             If a size is wrong or an entry is not finite.
         """
@@ -199,7 +206,7 @@ class StateMap:
         return self.read(q, v, near=near)
 
     def read(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
-        """Do as `to_state` for arguments that are valid."""
+        """Return the state of `to_state` for arguments known to be valid."""
         q_m, nu = self.joint_positions(q), self.velocities(v)
         x = self.compose(self.chart(q), self.positions(q), q_m, nu)
         if near is not None and self.unbounded.size:
@@ -208,7 +215,7 @@ class StateMap:
         return x
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
-        """Return the state (.., nx) of its parts, velocities nu (.., 6 + n) in base axes."""
+        """Return the state (.., nx) from its parts, with velocities nu (.., 6 + n) in base axes."""
         in_frame = self.to_frame(chart, nu[..., None])[..., 0]
         return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
@@ -227,7 +234,7 @@ class StateMap:
         Raises
         ------
         ChartError
-            If q_b is as long as 1 or longer: a turn of pi and no attitude beyond it.
+            If the norm of q_b is 1 (a rotation by pi) or exceeds 1 (no attitude).
         InputError
             If the size is wrong or an entry is not finite.
         """
@@ -235,15 +242,15 @@ class StateMap:
         return q[0], v[0]
 
     def points(self, x: Array) -> tuple[Chart, Array, Array]:
-        """Do what `to_pinocchio` does for rows of states (N, nx); return the charts too."""
+        """Return the charts, configurations and velocities of many states (N, nx)."""
         g = self.groups
         if not np.isfinite(x).all():
-            raise InputError("x has entries that are not finite")
+            raise InputError("x has entries that are not finite; give finite numbers")
         square = 1.0 - (x[:, g.q_b] ** 2).sum(axis=1, keepdims=True)
         if not (square >= SMALLEST_Q0**2).all():
             raise ChartError(
                 f"|q_b| is {np.sqrt(1.0 - square.min()):.9g}, expected less than 1: at 1 the base "
-                "is turned by 180 deg from the reference, where the attitude chart is singular"
+                "is rotated by 180 deg from the reference, where the attitude chart is singular"
             )
         relative = np.concatenate((x[:, g.q_b], np.sqrt(square)), axis=1)
         chart = Chart(relative[:, :3], relative[:, 3:], turning.rotation_matrices(relative))
@@ -260,47 +267,47 @@ class StateMap:
         return chart, q, self.spread(self.to_base(chart, x[:, 6 + self.robot.n :, None])[..., 0])
 
     def velocities(self, v: Array) -> Array:
-        """Return (omega_b, v_b, qdot_m) (.., 6 + n) in base axes of Pinocchio's v (.., nv)."""
+        """Return (omega_b, v_b, qdot_m) (.., 6 + n) in base axes from Pinocchio's v (.., nv)."""
         return v.take(self._order, axis=-1)
 
     def spread(self, nu: Array) -> Array:
-        """Return Pinocchio's v (.., nv) of (omega_b, v_b, qdot_m) in base axes: v = S nu."""
+        """Return Pinocchio's v = S nu (.., nv) from nu = (omega_b, v_b, qdot_m) in base axes."""
         v = nu.take(self._place, axis=-1)
         for joint, leader, multiplier, _ in self.robot.followers:
             v[..., joint.idx_v] = multiplier * v[..., leader.idx_v]
         return v
 
     def lift(self, forces: Array) -> Array:
-        """Return a tau (nv, ...) whose generalised forces (6 + n, ...) in base axes are given."""
+        """Return a tau (nv, ...) with the given generalised forces (6 + n, ...) in base axes."""
         tau = np.zeros((self.robot.nv, *forces.shape[1:]))
         tau[self._order] = forces
         return tau
 
     def forces(self, tau: Array) -> Array:
-        """Return the generalised forces (6 + n, ...) in base axes of tau (nv, ...): S^T tau."""
+        """Return the generalised forces S^T tau (6 + n, ...) in base axes, from tau (nv, ...)."""
         return tau.take(self._order, axis=0) if self.S is None else self.S.T @ tau
 
     def columns(self, matrix: Array) -> Array:
-        """Take the columns (..., nv) over Pinocchio's v to state order: matrix S."""
+        """Return the product matrix S: columns (..., nv) over Pinocchio's v, in state order."""
         return matrix.take(self._order, axis=1) if self.S is None else matrix @ self.S
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
-        """Take a matrix (nv, nv) over Pinocchio's v to state order: S^T matrix S (7.3)."""
+        """Return S^T matrix S (7.3): a matrix (nv, nv) over Pinocchio's v, in state order."""
         if self.S is not None:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
         return matrix.take(self._flat, out=out, mode="clip")
 
     def to_frame(self, chart: Chart, vectors: Array) -> Array:
-        """Turn velocities or wrenches (.., 6 + n, k) from base axes to the frame's: F of (4.6)."""
+        """Transform velocities or wrenches (.., 6 + n, k) from base to frame axes: F of (4.6)."""
         return chart.to_reference(self.in_reference, vectors)
 
     def to_base(self, chart: Chart, vectors: Array) -> Array:
-        """Turn velocities or wrenches (.., 6 + n, k) from the frame's axes to the base's: F^T."""
+        """Transform velocities or wrenches (.., 6 + n, k) from frame to base axes: F^T."""
         return chart.to_base(self.in_reference, vectors)
 
     def joint_positions(self, q: Array) -> Array:
-        """Return q_m (.., n), one angle or length a joint, of valid configurations (.., nq)."""
+        """Return the joint positions q_m (.., n) [rad|m] at valid configurations (.., nq)."""
         angles = q.take(self._idx_q, axis=-1)
         if self._cos.size:
             sines, cosines = q.take(self._sin, axis=-1), q.take(self._cos, axis=-1)
@@ -308,7 +315,7 @@ class StateMap:
         return angles
 
     def joints_apart(self, before: Array, q: Array) -> Array:
-        """Return by how much q_m (n,) is more at one valid configuration (nq,) than at another."""
+        """Return the difference of q_m (n,) at q from q_m at `before`; both are valid (nq,)."""
         apart = q.take(self._idx_q) - before.take(self._idx_q)
         if self._cos.size:
             s, c, s_0, c_0 = (x.take(at) for x in (q, before) for at in (self._sin, self._cos))
@@ -316,5 +323,5 @@ class StateMap:
         return apart
 
     def positions(self, q: Array) -> Array:
-        """Return r_b (.., 3) at valid configurations (.., nq)."""
+        """Return the base positions r_b (.., 3) [m] at valid configurations (.., nq)."""
         return self._position + q[..., :3] @ self._rotation.T

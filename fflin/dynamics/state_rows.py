@@ -1,4 +1,4 @@
-"""The states of a whole motion at once, linear feedback of a state, and errors from a motion."""
+"""States of a whole motion at once, linear state feedback, and errors from a reference motion."""
 
 from collections.abc import Callable
 from itertools import compress
@@ -114,7 +114,7 @@ def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
 
 
 def moving_errors(frame: str, x: Array, target: Array) -> Array:
-    """Return the errors (N, nx) of states from those of a moving reference, in its axes (9.5)."""
+    """Return the errors (N, nx) of states from a moving reference, in its axes (9.5)."""
     e, (turn, R), (turn_target, R_target) = x - target, _turned(x), _turned(target)
     # The vector part of target^-1 x, on the side that is nearer.
     q_b, q_target, scalar = x[:, :3], target[:, :3], (turn * turn_target)

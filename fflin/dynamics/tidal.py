@@ -1,4 +1,4 @@
-"""The pull of an orbit's field and its slopes by RNEA, as three turns make it (14.4)."""
+"""Gravity-gradient force of an orbit and its derivatives, from three rotations by RNEA (14.4)."""
 
 from typing import NamedTuple
 
@@ -15,10 +15,11 @@ _SHARES = (2.0, -1.0, -1.0)
 
 
 class Tide(NamedTuple):
-    """An orbit's field at one attitude and place of the base, in base axes.
+    """Gravity-gradient field of an orbit at one base pose, in base axes.
 
-    A turn about a unit vector s accelerates what it carries by [s]x^2 x, so that n^2 times twice
-    that of the radial direction less those of the other two is the field n^2 (3 r r^T - E) x.
+    A rotation about a unit vector s at unit rate gives a point at x the acceleration [s]x^2 x.
+    Twice this term of the radial direction minus the terms of the other two directions, times n^2,
+    is the field n^2 (3 r r^T - E) x.
     """
 
     turns: tuple[tuple[float, Array], ...]  # what each counts, and its (3,) unit vector
@@ -42,7 +43,7 @@ class Tide(NamedTuple):
         return total
 
     def slopes(self, model: pin.Model, data: pin.Data, q: Array) -> tuple[Array, Array]:
-        """Return the slopes of `force` over the joints (nv, nv) and over turns (nv, 3)."""
+        """Return the derivatives of `force` over the joints (nv, nv) and rotations (nv, 3)."""
         by_q, by_turn = np.zeros((model.nv, model.nv)), np.zeros((model.nv, 3))
         v, still = np.zeros(model.nv), np.zeros(model.nv)
         for share, v[PIN_ANGULAR] in self.turns:

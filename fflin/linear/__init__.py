@@ -1,6 +1,6 @@
-"""A, B, C, D about a point or along a motion, and the figures that prove them.
+"""Linear models A, B, C, D about a point or along a motion, and their verification.
 
-`linearization` prepares and `state_equations` assembles; `certificate` and `check` reach the same
-matrices by other routes.
+`linearization` prepares the equations and `state_equations` assembles them; `certificate` and
+`check` compute the same matrices independently.
 Imports `base`, `robot` and `dynamics`.
 """

@@ -1,4 +1,4 @@
-"""A second route to A and B, by Pinocchio's ABA derivatives, and how far two routes differ."""
+"""Independent computation of A and B by Pinocchio's ABA derivatives, and its residuals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ROUNDING_SHARE = 1e-3
 
 
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
-    """Compute the figures that prove a continuous-time model of this robot."""
+    """Return the residuals of a continuous-time model of this robot."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     aba = Aba(state)
     A, B, _ = aba_route(state, aba, lin.q, lin.v, lin.u0, moving=lin.moving)
@@ -40,13 +40,13 @@ def certify(robot: Robot, lin: LinearModel) -> Certificate:
 
 
 def scaled_condition(M: Array) -> float:
-    """Condition number of M scaled to a unit diagonal."""
+    """Return the condition number of M scaled to a unit diagonal."""
     scale = 1.0 / np.sqrt(M.diagonal())
     return float(np.linalg.cond(scale[:, None] * M * scale))
 
 
 def inertia_residual(M: Array, inverse: Array) -> float:
-    """Largest entry of ``M M^-1 - E`` with M scaled to a unit diagonal."""
+    """Return the largest entry of ``M M^-1 - E`` with M scaled to a unit diagonal."""
     scale = np.sqrt(M.diagonal())
     residual = M @ inverse - np.eye(len(M))
     return float(np.abs(residual * scale / scale[:, None]).max())
@@ -85,7 +85,7 @@ def compare(
     steps: Array | None = None,
     rounding: float = 0.0,
 ) -> list[tuple[str, float]]:
-    """Return how far A and B are from those of another route, block by block: "A[q_b, q_m]"."""
+    """Return the errors of A and B against other matrices, by block: "A[q_b, q_m]"."""
     # Relative to the largest entry of its block, rows of accelerations being scaled by the mobility
     # sqrt((M^-1)_ii), so that a light joint does not hide a heavy one, and B by that of its input;
     # where large terms cancel in a block, to those, which a route by steps has there.
@@ -157,7 +157,7 @@ def _cancelling_terms(
 
 
 def speeds(state: StateMap, v: Array) -> tuple[Array, float, float]:
-    """Return speeds (6 + n,) without those of wheels, the largest rate, and wheels' momentum."""
+    """Return speeds (6 + n,) without wheels, the largest rate, and the wheels' momentum."""
     speed, robot = np.abs(state.velocities(v)), state.robot
     inertia = np.array([robot.wheels.get(name, 0.0) for name in robot.joint_names])
     momentum = float(inertia @ speed[6:])

@@ -1,4 +1,4 @@
-"""Whether A and B hold: against ABA derivatives and against differences of the nonlinear model."""
+"""Check of A and B against ABA derivatives and against differences of the nonlinear model."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -56,14 +56,14 @@ _LOOSEST = 1e-2
 
 @dataclass(frozen=True)
 class Check:
-    """What a check of a linear model found; prints as tables.
+    """Result of the check of a linear model; prints as tables.
 
     Attributes
     ----------
     rows : tuple of Row
-        Every figure.
+        All errors, each with its tolerance.
     title : str
-        What was checked.
+        Description of the checked model.
 
     Examples
     --------
@@ -78,17 +78,17 @@ class Check:
 
     @property
     def ok(self) -> bool:
-        """Whether every figure is within its tolerance."""
+        """Whether every error is within its tolerance."""
         return all(row.ok for row in self.rows)
 
     @property
     def max_error(self) -> float:
-        """The largest relative error."""
+        """Largest relative error."""
         return float(np.max([row.error for row in self.rows]))
 
     @property
     def failures(self) -> tuple[Row, ...]:
-        """The figures that are not within their tolerance."""
+        """Rows whose error exceeds the tolerance."""
         return tuple(row for row in self.rows if not row.ok)
 
     def __str__(self) -> str:
@@ -96,33 +96,36 @@ class Check:
 
 
 def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> Check:
-    r"""Check a linear model by routes other than the one that made it.
+    r"""Check a linear model by two independent computations.
 
-    A and B are compared, block by block, with Pinocchio's ABA derivatives mapped into the chart
-    (1e-9 relative), and with sixth-order central differences of the nonlinear model
-    :math:`\dot x = f(x, u)` in the same chart (1e-8), f itself being held against the flow
-    that it must generate. A tolerance grows with the conditioning of M, as round-off does.
+    A and B are compared block by block with
+
+    - Pinocchio's ABA derivatives, mapped into the chart (tolerance 1e-9, relative);
+    - sixth-order central differences of the nonlinear model :math:`\dot x = f(x, u)` in the same
+      chart (tolerance 1e-8). The function f itself is compared with motions that it generates.
+
+    Tolerances grow with the condition number of M, as round-off errors do.
 
     Parameters
     ----------
     robot : Robot
-        The robot that the model claims to describe.
+        Robot that the model should describe.
     lin : LinearModel
-        In continuous time; fresh, loaded from a file, or of another make.
+        Model in continuous time: just linearised, loaded from a file, or made by another tool.
     tolerance : float, optional
-        Relative, of every figure in place of its own: 1e-5, say, where a tool made A and B by
-        differences.
+        Relative tolerance that replaces the tolerance of every error, such as 1e-5 if another tool
+        computed A and B by differences.
 
     Returns
     -------
     Check
-        ``ok``, ``max_error``, ``rows``; printable.
+        Result with ``ok``, ``max_error`` and ``rows``; printable.
 
     Raises
     ------
     InputError
-        If the model is sampled or has other states and inputs than this robot's, or the tolerance
-        is not between 0 and 1.
+        If the model is sampled, its states or inputs differ from the robot's, or the tolerance is
+        not between 0 and 1.
 
     Examples
     --------
@@ -135,7 +138,9 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     if not isinstance(lin, LinearModel):
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
     if lin.dt:
-        raise InputError(f"the model is sampled at dt = {lin.dt:g} s; check the continuous one")
+        raise InputError(
+            f"the model is sampled at dt = {lin.dt:g} s; check the continuous-time model instead"
+        )
     return held_to(tolerance, _checked(Aba(StateMap(robot, frame=lin.frame)), lin))
 
 
@@ -149,7 +154,7 @@ def held_to(tolerance: float | None, found: Check) -> Check:
 
 def _checked(aba: Aba, lin: LinearModel) -> Check:
     robot, state, actuation = aba.state.robot, aba.state.about(lin.reference), aba.actuation
-    made = f"the model is one of '{lin.robot}'"
+    made = f"the model was made for '{lin.robot}'"
     states, inputs = (lin.state_names, lin.state_units), (lin.input_names, lin.input_units)
     require_same(made, robot, "state", states, (state.names, state.units))
     require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
@@ -184,7 +189,7 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     inverse = inverse_inertia(state, lin)
     if model.aba.actuation.default:
         inverse = lin.B[-len(M) :]  # all of it stands in B
-    rows.append(Row("inertia", "M M^-1 = E", inertia_residual(M, inverse), route))
+    rows.append(Row("inertia", "M M^-1 = I", inertia_residual(M, inverse), route))
     rows += [Row("inertia", name, error, 1e-12) for name, error in _positive_definite(inverse)]
     return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}")
 
@@ -245,7 +250,7 @@ def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float)
         names, units = sensing.names, sensing.units
     outputs = (lin.output_names, lin.output_units)
     require_same(
-        f"the model is one of '{lin.robot}'", state.robot, "output", outputs, (names, units)
+        f"the model was made for '{lin.robot}'", state.robot, "output", outputs, (names, units)
     )
     if state.robot.outputs == (FullState(),):
         errors = (lin.y0 - lin.x0, lin.C - np.eye(state.nx), lin.D)

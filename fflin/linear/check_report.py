@@ -1,4 +1,4 @@
-"""The figures of a check, as tables."""
+"""Report of a check, as tables."""
 
 import textwrap
 from typing import NamedTuple
@@ -7,7 +7,7 @@ from fflin.base.tables import grid, width
 
 
 class Row(NamedTuple):
-    """One figure of a check."""
+    """One error of a check, with its tolerance."""
 
     test: str
     block: str
@@ -16,22 +16,22 @@ class Row(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """Whether the error, which must be a number, is within the tolerance."""
+        """Whether the error is within the tolerance; False if the error is NaN."""
         return self.error <= self.tolerance
 
 
 def check_report(every: tuple[Row, ...], title: str) -> str:
-    """Show what a check found: a table a route, the single figures, the verdict."""
+    """Return the report of a check: a table for each computation, single errors, the verdict."""
     states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
     blocks = [row.block for row in every]
     inputs = dict.fromkeys(b[:-1].split(", ")[1] for b in blocks if b.startswith("B["))
-    parts = [f"check of {title}\na dot is an error of exactly zero"]
+    parts = [f"check of {title}\na dot means an error of exactly zero"]
     for test in ("ABA derivatives", "differences"):
         rows = {row.block: row for row in every if row.test == test}
         tolerance = next(iter(rows.values())).tolerance
         title = f"A and B against {test}: "
         if not any(row.error for row in rows.values()):
-            parts.append(f"{title}no difference in any of {len(rows)} blocks")
+            parts.append(f"{title}all {len(rows)} blocks are equal")
             continue
         body = [
             [
@@ -49,11 +49,14 @@ def check_report(every: tuple[Row, ...], title: str) -> str:
     failures = [row for row in every if not row.ok]
     if not failures:
         largest = max(row.error for row in every)
-        verdict = f"OK: {len(every)} figures hold; the largest error is {largest:.1e}"
+        verdict = f"OK: all {len(every)} errors are within tolerance; the largest is {largest:.1e}"
     else:
         names = [f"{row.block} ({row.test})" for row in failures[:6]]
         names += ["..."] * (len(failures) > 6)
-        verdict = f"FAILED: {len(failures)} of {len(every)} figures: {', '.join(names)}"
+        verdict = (
+            f"FAILED: {len(failures)} of {len(every)} errors exceed their tolerance: "
+            f"{', '.join(names)}"
+        )
     parts.append(textwrap.fill(verdict, width()))
     return "\n\n".join(parts)
 

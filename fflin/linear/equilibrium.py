@@ -1,4 +1,4 @@
-"""The inputs that hold a robot in equilibrium, and where its springs give way."""
+"""Inputs that hold a robot in equilibrium, and the deflection of its springs."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium(FrozenArrays):
-    """The inputs of least norm that hold a robot, and what they leave.
+    """Equilibrium of a robot: minimum-norm inputs, spring deflections and residual forces.
 
     Attributes
     ----------
     q : ndarray (nq,)
-        The given configuration, in which passive joints sag on their springs; takes the place of
-        q in `linearize`.
+        Equilibrium configuration: the given one, except that passive joints sag on their springs.
+        Pass it to `linearize` as q.
     u : ndarray (nu,)
-        Over the robot's inputs; takes the place of u in `linearize`.
+        Minimum-norm inputs. Pass them to `linearize` as u.
     sag : ndarray (n,)
-        How far the joints of q are from where they were given [rad | m].
+        Deflection of each joint from its given position [rad | m].
     residual : ndarray (6 + n,)
-        Generalised forces that are left, those on the base in base axes.
+        Generalised forces that the inputs do not balance; forces on the base in base axes.
     input_names, input_units : tuple of str
-        Of u.
+        Names and units of u.
     force_names, force_units : tuple of str
-        Of the residual: tau_b, F_b, and tau_m of every joint.
+        Names and units of the residual: tau_b, F_b, and tau_m of every joint.
 
     Examples
     --------
@@ -89,23 +89,23 @@ def equilibrium(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
 ) -> Equilibrium:
-    r"""Find the inputs of least norm that balance all that acts on a robot, as its springs sag.
+    r"""Compute the minimum-norm inputs that balance all forces on a robot, with spring deflections.
 
-    Springs, gravity, dampers and the forces of a steady motion: whatever `linearize` knows of. In
-    an orbit the pull of its field and the turning of its frame, in which the base rests; see
-    `relative_equilibria` for attitudes that no torque on the base need hold.
-    With f the generalised forces without u, the inputs solve
+    The forces are the same as in `linearize`: springs, gravity, dampers, and the inertial forces of
+    a steady motion. In orbit they include the gravity gradient and the inertial forces of the
+    rotating orbit frame, in which the base rests. `relative_equilibria` finds attitudes that need
+    no torque on the base. With f the generalised forces without u, the inputs solve
 
     .. math::
         \min \|u\|_2 \quad \text{subject to} \quad B(q)\,u = -f(q, v), \qquad
         u_k \ge 0 \text{ for every thruster } k.
 
-    The norm is that of the numbers in u, each in its own unit. The rows of the balance, N m and
-    N, are made comparable by the mobilities :math:`\sqrt{(M^{-1})_{ii}}`; so weighed, what is
-    left must not exceed 1e-9 of what is balanced.
+    The norm is taken of the plain numbers in u, each in its own unit. The rows of the balance, in
+    N m and N, are made comparable by the mobilities :math:`\sqrt{(M^{-1})_{ii}}`. With these
+    weights the residual must not exceed 1e-9 of the balanced forces.
 
-    Joints with a spring and no `JointTorque` sag where no input holds them: their positions are
-    solved for too, by Newton's method, :math:`M\,\partial\dot\nu/\partial q_m` its slope.
+    A joint with a spring and without a `JointTorque` sags if no input holds it. Newton's method
+    finds its position too, with the Jacobian :math:`M\,\partial\dot\nu/\partial q_m`.
 
     Parameters
     ----------
@@ -113,33 +113,37 @@ def equilibrium(
     q : array_like (nq,), optional
         Configuration in Pinocchio's order; neutral by default.
     v : array_like (nv,), optional
-        A steady motion, whose velocities in base axes do not change; at rest by default. Joints
-        may move if they are rotors, see `LinearModel.ignorable`, and under gravity the base may
-        turn about the vertical only.
+        Velocity of a steady motion, which is constant in base axes; at rest by default. Only
+        joints that are rotors may move, see `LinearModel.ignorable`. Under gravity the base may
+        rotate about the vertical only.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the inputs on the base, as in `linearize`.
     reference : pin.SE3, optional
-        Placement whose axes are the reference axes, as in `linearize`; by default the base's
-        own, so that in every frame the inputs on the base are in base axes, or in orbit its frame.
+        Placement whose axes are the reference axes, as in `linearize`. The default is the base's
+        own placement, so that the inputs on the base are in base axes in every frame; in orbit it
+        is the orbit's frame.
 
     Returns
     -------
     Equilibrium
-        ``linearize(robot, result.q, v, u=result.u)`` with the same frame and reference.
+        Use it as ``linearize(robot, result.q, v, u=result.u)`` with the same frame and reference.
 
     Raises
     ------
     EquilibriumError
-        If no inputs balance it; names the forces that are left. If springs are too weak to hold
-        what they carry, or do not settle. Or if the motion cannot be steady under any inputs.
+        If one of these holds:
+
+        - no inputs balance the forces; the message names the residual forces;
+        - springs are too weak for their load, or Newton's method does not converge;
+        - the motion cannot be steady under any inputs.
     InputError
         If a size is wrong or an entry is not a number.
     ChartError, SingularInertiaError
-        As `linearize` does.
+        As in `linearize`.
 
     Notes
     -----
-    The bounds make it a least distance problem, which non-negative least squares solve exactly
+    With the bounds this is a least-distance problem, which non-negative least squares solve exactly
     (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974, chapter 23).
 
     Examples
@@ -212,8 +216,8 @@ class _Held:
         if np.linalg.eigvals(hold / np.outer(own, own)).real.min() <= TOLERANCE:
             names = listed([robot.joint_names[i] for i in np.flatnonzero(soft[6:])])
             raise EquilibriumError(
-                f"the springs of {names} give '{robot.name}' no hold against what they carry here; "
-                "make them stiffer, or take another point"
+                f"the springs of {names} are too weak to hold '{robot.name}' at this "
+                "configuration; make them stiffer, or choose another point"
             )
         step: Array = np.zeros(len(soft))
         step[soft] = np.linalg.solve(hold, self.residual[soft])
@@ -229,19 +233,20 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
     ]
     if moving:
         raise EquilibriumError(
-            f"no input keeps '{lin.robot}' as it is while it moves: {listed(moving)}; only rotors "
-            "may, which are symmetric about their axis and have nothing fixed on them"
+            f"the motion of '{lin.robot}' is not steady under any input: joints move, "
+            f"{listed(moving)}. Only rotors may move: joints whose link is symmetric about the "
+            "axis and carries nothing. Set the other joint rates to 0"
         )
     if lin.frame in ORBITAL:
         if np.abs(drift[:6]).max() > TOLERANCE:
             raise EquilibriumError(
-                f"no input keeps '{lin.robot}' as it is while its base moves in the orbit's frame; "
-                "leave the velocity of the base out"
+                f"the motion of '{lin.robot}' is not steady under any input: its base moves in the "
+                "orbit's frame; leave out the velocity of the base"
             )
     elif "q_b.x" not in lin.ignorable and np.abs(drift[:3]).max() > TOLERANCE:
         raise EquilibriumError(
-            f"no input keeps '{lin.robot}' as it is while it turns across gravity; it may turn "
-            "about the vertical only"
+            f"the motion of '{lin.robot}' is not steady under any input: under gravity its base "
+            "may rotate about the vertical only; change its angular velocity"
         )
 
 
@@ -268,6 +273,7 @@ def _unbalanced(
         if sizes[i] > 1e-6 * sizes.max()
     ]
     return EquilibriumError(
-        f"the inputs of '{robot.name}' cannot balance what acts on it here; left are "
-        f"{listed(left)}; give it inputs that can (thrusters only push), or take another point"
+        f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
+        f"forces: {listed(left)}; add inputs that balance them (thrusters only push), or choose "
+        "another point"
     )

@@ -1,4 +1,4 @@
-"""Linear models in the coordinates of other tools, and back: (15.1) to (15.6)."""
+"""Conversion of linear models to and from the coordinates of other tools: (15.1) to (15.6)."""
 
 from __future__ import annotations
 
@@ -24,26 +24,28 @@ _ROUNDING = 1e-12  # of the largest entry, by which another route to a matrix ma
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ToolModel(Design):
-    r"""A linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
+    r"""Linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
-    x is q and v of the tool. Where its q is a manifold (mujoco, pinocchio, spart) the displacement
-    from the point, in the order of v, stands for q.
+    The state x holds q and v of the tool. If q is on a manifold (mujoco, pinocchio, spart), x holds
+    a displacement instead of q: the tangent vector from the point, in the order of v.
 
     Attributes
     ----------
     tool, robot : str
+        Names of the tool and the robot.
     A, B, C, D, f0, x0, u0, y0, dt, state_names, ..., output_units
-        As of `LinearModel`.
+        As in `LinearModel`.
     T : ndarray (nx, 12 + 2n)
-        From deviations of the state of the `LinearModel` to those of x.
+        Matrix from state deviations of the `LinearModel` to deviations of x.
     T_left : ndarray (12 + 2n, nx)
-        Its inverse; a left inverse where x has all four of a quaternion or joints that mimic.
+        Inverse of T. It is only a left inverse if x contains a whole quaternion or mimic joints.
     T_u : ndarray (nu, nu)
-        Likewise of the input: with a gain K of the `LinearModel` ``T_u K T_left`` is the tool's.
+        Matrix from input deviations of the `LinearModel` to the tool's. A gain K of the
+        `LinearModel` becomes ``T_u K T_left`` for the tool.
     q, v : ndarray
-        The point as the tool has it.
+        Configuration and velocity of the point in the tool's coordinates.
     reference : str
-        "fixed", or "moving" where x is the deviation from what moves through the point.
+        "fixed", or "moving" if x is the deviation from a reference that moves through the point.
 
     Examples
     --------
@@ -87,22 +89,23 @@ class ToolModel(Design):
 def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None) -> ToolModel:
     r"""Return a linear model in the coordinates, order and axes of another tool.
 
-    Deviations are x' = T x and u' = T_u u, and at any point, in motion too,
+    Deviations transform as x' = T x and u' = T_u u. At any point, also of a moving robot,
 
     .. math:: A' = (T A + \dot T)\,T^+ + \ldots, \qquad B' = T B\,T_u^{-1}
 
-    with what comes of inputs held in other axes and of the length of a quaternion: (15.1) to
-    (15.6) of docs/derivation.md. docs/guide/tools.md has the conventions side by side.
+    The omitted terms come from inputs in other axes and from the length of a quaternion: see (15.1)
+    to (15.6) of docs/derivation.md. docs/guide/tools.md compares the conventions of the tools.
 
     Parameters
     ----------
     robot : Robot
     lin : LinearModel
-        Of this robot, about any point. One that is sampled is sampled in the tool's coordinates.
+        Model of this robot, about any point. A sampled model gives a sampled model of the tool.
     tool : {"drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"}
+        Name of the tool, or of the attitude coordinates.
     dt : float, optional
-        Of "mujoco": its time step [s], for the pair of ``mjd_transitionFD`` with the integrator
-        Euler (of a robot with dampers: with ``eulerdamp`` disabled).
+        Only for "mujoco": its time step [s]. A and B are then the pair of ``mjd_transitionFD`` with
+        the integrator Euler (for a robot with dampers: with ``eulerdamp`` disabled).
 
     Returns
     -------
@@ -111,11 +114,12 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     Raises
     ------
     InputError
-        If the model is not of this robot or is sampled and from a file, or `dt` does not suit.
+        If the model does not fit the robot, a sampled model comes from a file, or `dt` is given
+        for another tool or out of range.
     UnknownNameError
         If there is no such tool.
     ChartError
-        If the pitch of Euler's angles is 90 deg.
+        If the pitch of the Euler angles is 90 deg.
 
     Examples
     --------
@@ -131,7 +135,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     require_fit(lin, robot, StateMap(robot, frame=lin.frame))
     sampled, whole, step = lin.dt, lin.generator, _step(tool, dt)
     if whole is None or (step and sampled):
-        raise InputError("the model is sampled; transform the continuous one that it was made of")
+        raise InputError("the model is sampled; transform its continuous-time model instead")
     lin, (kind, own, to, rates) = whole, _bridge(robot, whole, tool)
     A, B = carried(own, to, lin.A, lin.B)
     (q, v), states = kind.vectors(lin.q, lin.v), kind.states()
@@ -171,37 +175,37 @@ def from_tool(
     reference: pin.SE3 | None = None,
     moving: bool = False,
 ) -> LinearModel:
-    """Return the linear model at a point of another tool, of that tool's matrices.
+    """Return a linear model from another tool's point and matrices.
 
     Parameters
     ----------
     robot : Robot
     tool, dt
-        See `transform`; dt is the step that A and B are of.
+        See `transform`; dt is the time step for which A and B were computed.
     q, v : array_like
-        Of the tool; at rest by default. Of "spart" q is R0 column by column, r0 and qm, and v is
-        u0 and um.
+        Configuration and velocity in the tool's coordinates; v is zero by default. For "spart", q
+        is R0 column by column, r0 and qm; v is u0 and um.
     u : array_like (nu,), optional
-        Over the robot's inputs in the tool's order and axes; zero by default.
+        Inputs of the robot in the tool's order and axes; zero by default.
     A, B : array_like, optional
-        Of the tool at that point, see `ToolModel`; fflin's own by default.
+        Matrices of the tool at this point, see `ToolModel`; by default fflin computes them.
     frame, reference, moving
-        Of the model that is returned, see `linearize`.
+        Options of the returned model, see `linearize`.
 
     Returns
     -------
     LinearModel
-        Its ``q``, ``v`` and ``u0`` are the point in fflin's order; `check` and ``certificate`` tell
-        how far A and B hold.
+        Model whose ``q``, ``v`` and ``u0`` are the point in fflin's order. `check` and
+        ``certificate`` show how accurate A and B are.
 
     Raises
     ------
     InputError
-        If a size is wrong, an entry is not finite, or an attitude is none.
+        If a size is wrong, an entry is not finite, or an attitude is not a rotation.
     UnknownNameError
         If there is no such tool.
     ChartError
-        If the base is turned by 180 deg from the reference, or as `transform`.
+        If the base is rotated by 180 deg from the reference, or as in `transform`.
 
     Examples
     --------
@@ -237,10 +241,10 @@ def from_tool(
 
 
 def _bridge(robot: Robot, lin: LinearModel, tool: str) -> tuple[Any, Slopes, Slopes, Array]:
-    """Return a tool's coordinates, the slopes of a model's own and of these, and the rate of y."""
+    """Return a tool's coordinates, the derivatives of the model's and the tool's, and dy/dt."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
-        raise InputError("lin has not all states of the robot; take the whole model of it")
+        raise InputError("lin lacks some states of the robot; use the full model of the robot")
     own = ToolCoordinates(state, moving=lin.moving)
     kind = tool_coordinates(robot, tool, moving=lin.moving)
     nu, rates = state.velocities(lin.v), lin.drift
@@ -259,10 +263,12 @@ def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Arra
 
 
 def _step(tool: str, dt: Any) -> float:
-    """Return a time step, 0 where there is none."""
+    """Return the time step, 0 if none is given."""
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
-        raise InputError(f"dt is {h:g} s for {tool}, expected a step of mujoco")
+        raise InputError(
+            f"dt is {h:g} s for {tool}; expected a positive time step below 1000 s, for mujoco only"
+        )
     return h
 
 
@@ -282,5 +288,7 @@ def _change(name: str, given: Any, expected: Array) -> Array:
     """Return by how much a matrix of the caller is more than expected."""
     array = expected if given is None else as_double(name, given)
     if array.shape != expected.shape or not np.isfinite(array).all():
-        raise InputError(f"{name} has shape {array.shape}, expected finite {expected.shape}")
+        raise InputError(
+            f"{name} has shape {array.shape}, expected finite numbers of shape {expected.shape}"
+        )
     return np.asarray(array - expected)

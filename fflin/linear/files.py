@@ -1,4 +1,4 @@
-"""Linear models on disk: npz, mat, json, and csv, a table for each matrix."""
+"""Linear models on disk: npz, mat, json, and csv with a table for each matrix."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _fields(entries: Record) -> dict[str, Any]:
 def _weights(written: str) -> dict[str, Any]:
     found = json.loads(written)
     if not isinstance(found, dict) or not all(isinstance(x, dict | str) for x in found.values()):
-        raise ValueError("weights are no table")
+        raise ValueError("its weights are not a table")
     return found
 
 
@@ -178,14 +178,14 @@ def _seal(contents: dict[str, bytes]) -> str:
 
 def _from_csv(path: Path) -> tuple[Record, bool]:
     if not _csv_path(path, "info").exists() and path.exists():
-        raise ValueError("a csv model is named NAME.csv, without the matrix")
+        raise ValueError("give the name NAME.csv without the matrix, not NAME.A.csv")
     contents = {key: read_file(_csv_path(path, key), ".csv") for key in _TABLES}
     body, mark, seal = contents["info"].rpartition(f"\n{record.SEAL},".encode())
     if mark:
         contents["info"] = body + b"\n"
         if seal != f"{_seal(contents)}\n".encode():
             raise ValueError(
-                f"{record.DAMAGED}; without that line of the info table it is read as it is"
+                f"{record.DAMAGED}; to read it as it is, delete that line of the info table"
             )
     tables = {
         key: list(csv.reader(io.StringIO(content.decode(), newline="")))[1:]

@@ -1,4 +1,4 @@
-"""Whether what was made for one robot has the names and units of another."""
+"""Checks that a model or design made for one robot fits another, by names and units."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _SHOWN = 4
 
 
 def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
-    """Raise `InputError` where a model's states or inputs are not those of a robot."""
-    made, actuation = f"the model is one of '{lin.robot}'", Actuation(state)
+    """Raise `InputError` if a model's states or inputs differ from the robot's."""
+    made, actuation = f"the model was made for '{lin.robot}'", Actuation(state)
     inputs = (lin.input_names, lin.input_units)
     require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
     # A reduced model has a part of the states.
@@ -37,59 +37,62 @@ def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
 
 
 def require_sensed(lin: LinearModel, robot: Robot, state: StateMap) -> None:
-    """Raise `InputError` where a model's states, inputs or outputs are not those of a robot."""
+    """Raise `InputError` if a model's states, inputs or outputs differ from the robot's."""
     require_fit(lin, robot, state)
     own = lin.output_names, lin.output_units
-    require_same(f"the model is one of '{lin.robot}'", robot, "output", own, sensed(state))
+    require_same(f"the model was made for '{lin.robot}'", robot, "output", own, sensed(state))
 
 
 def sensed(state: StateMap) -> Signals:
-    """Return names and units of what a robot measures."""
+    """Return names and units of a robot's outputs."""
     outputs = state.robot.outputs
     found = state if outputs == (FullState(),) else Sensing(state, outputs)
     return found.names, found.units
 
 
 def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signals) -> None:
-    """Raise `InputError` that says which names and units differ from those of a robot."""
+    """Raise `InputError` that says which names and units differ from the robot's."""
     mine, others = (dict(zip(*each, strict=True)) for each in (own, there))
     lacking, beside = ([n for n in a if n not in b] for a, b in ((mine, others), (others, mine)))
     if names := lacking or beside:
         shown = ", ".join([*names[:_SHOWN], *["..."] * bool(names[_SHOWN:])])
-        with_or_without = "without" if lacking else "with"
-        said = f"{with_or_without} the {kind}{'s' * bool(names[1:])} {shown}"
+        lacks_or_adds = "lacks" if lacking else "also has"
+        said = f"{lacks_or_adds} the {kind}{'s' * bool(names[1:])} {shown}"
     elif other := [name for name in mine if mine[name] != others[name]]:
-        said = f"whose {kind} {other[0]} is in {others[other[0]]}, not {mine[other[0]]}"
+        said = f"has its {kind} {other[0]} in {others[other[0]]}, not {mine[other[0]]}"
     elif own != there:
-        said = f"whose {kind}s stand in another order"
+        said = f"has its {kind}s in another order"
     else:
         return
     raise InputError(
-        f"{made}, not of '{robot.name}' as it is given, {said}; linearise "
-        "this robot, or give it the same (Robot.replace)"
+        f"{made} and does not fit the given robot '{robot.name}', which {said}; linearise this "
+        "robot, or give it the same fields (Robot.replace)"
     )
 
 
 def require_turns(made: str, size: int, robot: Robot) -> None:
-    """Raise `InputError` where a configuration of that size is none of a robot."""
+    """Raise `InputError` if a configuration has another size than the robot's."""
     if size != robot.nq:
         raise InputError(
-            f"{made}, not of '{robot.name}' as it is given, whose configuration has {robot.nq} "
-            f"entries, not {size}: other joints are continuous; linearise this robot"
+            f"{made} and does not fit the given robot '{robot.name}', whose configuration has "
+            f"{robot.nq} entries, not {size}, because other joints are continuous; linearise this "
+            "robot"
         )
 
 
 def line_up(gain: Any, lin: LinearModel) -> Array:
-    """Return K of a gain for another model, its states and inputs matched by name.
+    """Return the K of a gain for another model, with states and inputs matched by name.
 
-    A robot, the same with what it has caught, and the same with a joint that jammed have most of
-    their states in common. What the model alone has is not fed back, nor is what the gain alone
-    has: zero columns and rows.
+    A robot before and after a capture, or before and after a joint jams, keeps most of its states.
+    States and inputs that only the model has get zero columns and rows; states and inputs that
+    only the gain has are dropped.
 
     Parameters
     ----------
     gain : Gain or GainBatch
+        Gain or gains of the first model.
     lin : LinearModel
+        Model that needs the gain.
 
     Returns
     -------
@@ -98,8 +101,8 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
     Raises
     ------
     InputError
-        If they are in different frames or of different sampling times, or if neither has all
-        states, or all inputs, of the other: then they are not of one robot.
+        If gain and model have different frames or sampling times, or if each has states, or
+        inputs, that the other lacks; they then belong to different robots.
 
     Examples
     --------
@@ -116,15 +119,19 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
     for key in ("frame", "dt"):
         own, other = getattr(gain, key, lin.dt), getattr(lin, key)
         if own != other:
-            raise InputError(f"the {key} of the gain is {own}, that of the model {other}")
+            raise InputError(
+                f"the {key} of the gain is {own}, but the {key} of the model is {other}; give "
+                f"both the same {key}"
+            )
     at = []
     for kind in ("input", "state"):
         own, other = getattr(gain, f"{kind}_names"), getattr(lin, f"{kind}_names")
         lacking, beside = ([n for n in a if n not in b] for a, b in ((own, other), (other, own)))
         if lacking and beside:
             raise InputError(
-                f"the gain of '{gain.robot}' has the {kind} {lacking[0]}, which the model of "
-                f"'{lin.robot}' has not, and not its {beside[0]}; one must have all of the other's"
+                f"the model of '{lin.robot}' lacks the {kind} {lacking[0]} of the gain of "
+                f"'{gain.robot}', and the gain lacks its {kind} {beside[0]}; one of the two must "
+                f"have all {kind}s of the other"
             )
         common = [name for name in other if name in own]
         at.append(([other.index(name) for name in common], [own.index(name) for name in common]))

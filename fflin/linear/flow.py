@@ -1,4 +1,4 @@
-"""What a robot does between the knots of a trajectory, and how far it misses the next one."""
+"""Motion between the knots of a trajectory, and its error at the next knot."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NEAR = 1e-9
 
 
 class Flow:
-    """The motion between knots, q, v, u and t of N rows; the frame of `state` is that of u."""
+    """Motion between knots, from q, v, u and t of N rows; u is in the frame of `state`."""
 
     def __init__(self, state: StateMap, t: Array, q: Array, v: Array, u: Array, held: bool) -> None:
         self._model, self._aba, self._held = state.robot.model, Aba(state), held
@@ -37,16 +37,16 @@ class Flow:
 
     @property
     def held(self) -> tuple[Held, ...]:
-        """The inputs that stand in reference axes."""
+        """Inputs in reference axes."""
         return self._aba.actuation.held
 
     @cached_property
     def residual(self) -> Array:
-        """How far each interval's end is from the next knot (N - 1,), see `missed`."""
+        """Error of each interval's end at the next knot (N - 1,), see `missed`."""
         return self.missed(range(len(self._t) - 1))
 
     def missed(self, intervals: Iterable[int]) -> Array:
-        """Return how far the ends of some intervals are from the next knots."""
+        """Return the relative errors of the ends of some intervals at the next knots."""
         # An observer who flies along with the base's median velocity takes the rates (Galilei), and
         # each rotor counts for itself: neither an orbit nor a fast wheel hides anything.
         t, u, state = self._t, self._u, self._aba.state
@@ -94,7 +94,7 @@ class Flow:
     def end(
         self, k: int, steps: int, q: Array, v: Array, over: tuple[float, float] = (0.0, 1.0)
     ) -> tuple[Array, Array]:
-        """Return q and v by steps of CF4 (11.1) over shares of an interval, all by default."""
+        """Return q and v by steps of CF4 (11.1) over a fraction of an interval, all by default."""
         start, h = self._t[k], self._t[k + 1] - self._t[k]
         method = CommutatorFree4(self._model, (over[1] - over[0]) * h / steps)
         for step in range(steps):
@@ -107,14 +107,14 @@ class Flow:
         return q, v
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
-        """Return q, v and u in base axes from a time on: cubics with the robot's own rates."""
+        """Return q, v and u (base axes) at a time, from cubics with the robot's own rates."""
         k, s = placed(self._t, t)
         powers, (turns, speeds) = np.array((1.0, s, s * s, s**3)), self.cubics
         q: Array = pin.integrate(self._model, self._q[k], powers.dot(turns[k]))
         return q, powers.dot(speeds[k]), self._in_base_axes(q, self._input(k, s))
 
     def input(self, t: float) -> Array:
-        """Return the inputs (nu,) that act from a time on, in the frame's axes."""
+        """Return the inputs (nu,) just after a time, in the frame's axes."""
         return self._input(*placed(self._t, t))
 
     def _input(self, k: int, share: float) -> Array:
@@ -130,7 +130,7 @@ class Flow:
 
     @cached_property
     def cubics(self) -> tuple[Array, Array]:
-        """Coefficients (N - 1, 4, nv) of the way in the tangent at the first knot, and of v."""
+        """Coefficients (N - 1, 4, nv) of the displacement from the first knot, and of v."""
         q, v, h = self._q, self._v, np.diff(self._t)[:, None]
         begin = np.array([self.rate(*each) for each in zip(q, v, self._u, strict=True)])
         end = begin[1:]
@@ -169,6 +169,6 @@ def placed(t: Array, time: float) -> tuple[int, float]:
 
 
 def _cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
-    """Return the coefficients (N - 1, 4, nv) of cubics over [0, 1] with these values and slopes."""
+    """Return the coefficients (N - 1, 4, nv) of cubics over [0, 1] from values and derivatives."""
     way = last - first
     return np.stack((first, rate, 3 * way - 2 * rate - end_rate, rate + end_rate - 2 * way), axis=1)

@@ -1,4 +1,4 @@
-"""Ignorable coordinates: those that nothing in a linear model of a robot depends on."""
+"""Ignorable coordinates: states on which no term of a robot's linear model depends."""
 
 import numpy as np
 

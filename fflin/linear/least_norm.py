@@ -1,4 +1,4 @@
-"""Least norms and least residuals with inputs that only push."""
+"""Minimum-norm and least-squares solutions with inputs that can only push."""
 
 from __future__ import annotations
 

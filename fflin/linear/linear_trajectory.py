@@ -1,4 +1,4 @@
-"""The time-varying linear model along a motion."""
+"""Time-varying linear model along a motion."""
 
 from __future__ import annotations
 
@@ -30,22 +30,26 @@ if TYPE_CHECKING:
 class LinearTrajectory(Trajectory):
     r"""Error dynamics along a motion, ``d(dx)/dt = A(t) dx + B(t) du``, ``dy = C dx + D du``.
 
-    The error is taken in the moving base's own axes, see `Linearizer` (``moving=True``), and du on
-    the base in base axes. With ``dt`` the left side is the error at the next knot instead. Its
-    items are the linear models at the knots.
+    The error dx is in the moving base's own axes, see `Linearizer` (``moving=True``). The part of
+    du on the base is in base axes. If ``dt`` is positive, the left side is the error at the next
+    knot instead. The items of the sequence are the linear models at the knots.
 
     Attributes
     ----------
     A : ndarray (N, nx, nx)
+        State matrices at the knots. With ``dt`` there are N - 1, each from one knot to the next.
     B : ndarray (N, nx, nu)
-        N - 1 with ``dt``: what takes a knot to the next.
+        Input matrices at the knots. With ``dt`` there are N - 1, each from one knot to the next.
     C : ndarray (N, ny, nx)
+        Output matrices at the knots.
     D : ndarray (N, ny, nu)
+        Feedthrough matrices at the knots.
     y : ndarray (N, ny)
-        Outputs on the motion.
+        Outputs along the motion.
     state_names, input_names, output_names : tuple of str
+        Names of dx, du and dy.
     dt : float
-        Time [s] that du is held; 0 for continuous time.
+        Hold time of du [s]; 0 for continuous time.
     robot, t, q, v, u, hold, frame : see `Trajectory`
 
     Examples
@@ -71,11 +75,14 @@ class LinearTrajectory(Trajectory):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.state_names != self._state.names:
-            raise InputError(f"it is no model of '{self.robot.name}' as it is given")
+            raise InputError(
+                f"the linear trajectory does not fit the given robot '{self.robot.name}': its "
+                "states differ; give the robot it was made for"
+            )
 
     @property
     def input_units(self) -> tuple[str, ...]:
-        """Of the nu inputs."""
+        """Units of the nu inputs."""
         return Actuation(self._state).units
 
     def __len__(self) -> int:
@@ -99,7 +106,7 @@ class LinearTrajectory(Trajectory):
         return Linearizer(self.robot, moving=True, engine="python")
 
     def matrices(self, t: float) -> tuple[Array, Array]:
-        """Return A (nx, nx) and B (nx, nu) at a time; between the knots those of `point`."""
+        """Return A (nx, nx) and B (nx, nu) at a time t [s], between knots evaluated at `point`."""
         t = self._within(t)
         k, share = placed(self.t, t)
         if self.dt or share in (0.0, 1.0):
@@ -109,45 +116,49 @@ class LinearTrajectory(Trajectory):
         return lin.A, lin.B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
-        """Return what arrays of the knots are at a time, linear between the knots or held."""
+        """Return values at a time of arrays given at the knots, interpolated linearly or held."""
         k, share = placed(self.t, self._within(t))
         if self.dt or not share:
             return tuple(each[k] for each in arrays)
         return tuple(each[k] + share * (each[k + 1] - each[k]) for each in arrays)
 
     def check(self) -> Check:
-        """Check every knot as `fflin.check` does: the worst of each figure."""
+        """Check every knot as `fflin.check` does, and return the worst result of each error."""
         from fflin.linear.check import check_all
 
         return check_all(self.robot, self, f"{self.robot.name}, {len(self)} knots")
 
     @in_one_thread
     def discretize(self, dt: float) -> LinearTrajectory:
-        r"""Sample it along the motion, du held from sample to sample.
+        r"""Return the sampled model along the motion, with du held constant over each sample.
 
-        The transition of :math:`\dot\Phi = F(t)\,\Phi`, F = [[A, B], [0, 0]] (10.3), by two
-        exponentials a step with F on the motion itself: of order four, exact where F does not
-        change, in steps so short that their halves agree to 1e-8.
+        The transition matrix solves :math:`\dot\Phi = F(t)\,\Phi` with F = [[A, B], [0, 0]] (10.3).
+        Each step uses two exponentials of F, evaluated on the motion itself. The method has order
+        four and is exact if F is constant. Steps are halved until the result changes by less than
+        1e-8.
 
         Parameters
         ----------
         dt : float
-            Sampling time [s], of which the duration is a multiple.
+            Sampling time [s]; the duration must be a multiple of it.
 
         Raises
         ------
         InputError
-            If dt is no such time, or it is sampled already.
+            If the duration is not a multiple of dt, or the model is already sampled.
         """
         if self.dt:
-            raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
+            raise InputError(
+                f"the model is already sampled, at dt = {self.dt:g} s; discretize the "
+                "continuous-time model"
+            )
         found = np.array([transition for _, transition in transitions(self, self.matrices, dt)])
         nx, models = len(self.state_names), along(self.resampled(dt))
         return replace(models, A=found[:, :nx, :nx], B=found[:, :nx, nx:], dt=float(dt))
 
     @classmethod
     def load(cls, path: str | Path, robot: Robot) -> LinearTrajectory:  # type: ignore[override]
-        """Read what `save` wrote of this robot; every figure is the same to the last bit."""
+        """Read a file that `save` wrote for this robot; every value is restored bit for bit."""
         return cls._read(path, robot=robot)
 
 
@@ -161,16 +172,18 @@ def linearize_trajectory(
     strict: bool = False,
     **options: Any,
 ) -> LinearTrajectory:
-    """Linearise along a motion of the robot.
+    """Linearise a robot along a motion.
 
     Parameters
     ----------
     robot : Robot
     t : Trajectory or array_like (N,)
-        The motion; or the times of its knots [s] with q, v and u as `Trajectory` takes them.
+        The motion as a `Trajectory`, or the times of its knots [s].
     q, v, u : array_like, optional
+        Configurations, velocities and inputs at the knots, as `Trajectory` takes them; only if t
+        holds times.
     strict : bool
-        Whether knots that are no motion of the robot to 1e-2 are refused.
+        Whether to refuse knots whose residual as a motion of the robot exceeds 1e-2.
     **options
         hold and frame, see `Trajectory`.
 
@@ -181,13 +194,14 @@ def linearize_trajectory(
     Raises
     ------
     InputError
-        If the arrays are no `Trajectory`, or no motion and `strict`.
+        If the arrays are not valid for `Trajectory`. With `strict`, also if the residual of the
+        motion exceeds 1e-2.
 
     Warns
     -----
     FflinWarning
-        Of knots that are no motion of the robot: where they miss it most, by how much, and what
-        the usual causes are.
+        If the knots are not a motion of the robot. The warning names the interval with the largest
+        error, the error, and usual causes.
 
     Examples
     --------
@@ -200,7 +214,10 @@ def linearize_trajectory(
     """
     if isinstance(t, Trajectory):
         if options or not q is v is u is None:
-            raise InputError("the trajectory has q, v, u, hold and frame; leave them out")
+            raise InputError(
+                "a trajectory is given, which already contains q, v, u, hold and frame; leave "
+                "these arguments out"
+            )
         motion = t if t.robot is robot else replace(t, robot=robot)
     else:
         arrays: Any = (t, q, v, u)

@@ -1,4 +1,4 @@
-"""Linear models: A, B, C and D about any point."""
+"""Linearisation: A, B, C and D about any point."""
 
 from __future__ import annotations
 
@@ -34,51 +34,57 @@ _LARGEST_COMPILED = 96
 
 
 class Linearizer:
-    r"""Linearise one robot many times; what does not change is prepared once.
+    r"""Linearisation of one robot at many points, with one preparation for all of them.
 
-    Threads may share one, taking turns; copied or pickled, it has a work space of its own.
+    Threads may share a `Linearizer`; only one computes at a time. Copies, pickled ones too, have
+    their own work space.
 
-    At rest, with N = blkdiag(E3/2, E3, En) and M the joint-space inertia in state order,
+    At rest, with N = blkdiag(E3/2, E3, En) and the joint-space inertia M in state order,
 
     .. math::
         A = \begin{bmatrix} 0 & N \\ 0 & 0 \end{bmatrix}, \qquad
         B = \begin{bmatrix} 0 \\ M^{-1} \end{bmatrix}.
 
-    Elsewhere :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
-    :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)` and carried to the chart and frame.
-    The dynamics do not depend on the base's position and linear velocity (Galilei), so they are
-    evaluated without them: a base far away costs no digits. docs/derivation.md has the equations,
-    in section 14 those of a robot in orbit, whose rates are relative to the orbit's frame.
+    At other points :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
+    :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`, then transformed to the chart and
+    the velocity frame. The dynamics do not depend on the position and linear velocity of the base
+    (Galilean invariance). They are evaluated without both, so a distant base loses no accuracy.
+    docs/derivation.md has the equations. Section 14 covers a robot in orbit, whose rates are
+    relative to the orbit's frame.
 
     Parameters
     ----------
     robot : Robot
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
-        Axes of the base's velocities and wrenches, see `StateMap`; "hybrid" by default, and of a
-        robot in orbit "lvlh", with "hill" the frames that its world may be.
+        Axes of the base velocities and wrenches, see `StateMap`. The default is "hybrid". A robot
+        in orbit needs "lvlh" (its default) or "hill".
     reference : pin.SE3, optional
-        Placement that attitude and position are relative to; by default the base's own at each
-        point, so that the model is taken about the pose where the robot stands. In orbit it is
-        the orbit's frame.
+        Placement that attitude and position are relative to. The default is the base's own
+        placement at each point, so that the model is about the robot's present pose; in orbit it
+        is the orbit's frame.
     moving : bool
-        The error dynamics about a reference that moves through the point with the robot's own
-        dynamics: the error is q_b = vec(q*^-1 q), r_b = R*^T (p - p*), the frame is "local", and
-        f0 is zero. For a trajectory, and for relative equilibria such as a steady spin.
+        Whether to return the error dynamics about a reference that moves through the point by the
+        robot's own dynamics. The error is q_b = vec(q*^-1 q), r_b = R*^T (p - p*), the frame is
+        "local", and f0 is zero. Use it for trajectories, and for relative equilibria such as a
+        steady spin.
     engine : {"python", "compiled"}, optional
-        What does points where something moves, pulls or pushes; both give the same to rounding. By
-        default it is the compiled kernel where its code is loaded already, and else from as many
-        calls on as pay for that.
+        Engine for points with velocity, springs or forces. Both engines agree to machine
+        precision. By default the compiled kernel is used if its code is already loaded, or once
+        the number of calls is large enough to pay for loading it.
 
     Raises
     ------
     InputError
-        If the frame is unknown, the reference is not a pin.SE3, or `moving` is asked for with a
-        reference or with a frame other than "local". Or the compiled engine is asked for, and
-        numba is not installed or a joint is none that it knows.
+        If one of these holds:
+
+        - the frame is unknown, or the reference is not a pin.SE3;
+        - `moving` is given with a reference, or with a frame other than "local";
+        - the compiled engine is requested, but numba is not installed, or the engine does not
+          support the robot.
     SingularInertiaError
         If M is singular at every configuration.
     ModelError
-        If Pinocchio's Data for the robot would pass 1 GiB, or its model was changed after the
+        If Pinocchio's Data for the robot would exceed 1 GiB, or its model was changed after the
         robot was made.
     UnknownNameError
         If there is no such engine.
@@ -86,8 +92,9 @@ class Linearizer:
     Attributes
     ----------
     robot : Robot
+        The robot that is linearised.
     prepared : Prepared
-        What is the same about all points.
+        Data that are the same for all points.
 
     References
     ----------
@@ -136,7 +143,7 @@ class Linearizer:
     def __call__(
         self, q: Array | None = None, v: Array | None = None, u: Array | None = None
     ) -> LinearModel:
-        """Linearise about a point; q, v, u, and what is raised, are those of `linearize`."""
+        """Linearise about a point; arguments and errors are as in `linearize`."""
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         known = v is None and u is None and self._known
@@ -228,7 +235,9 @@ class Linearizer:
         for name, array in {**made, "f0": rate}.items():
             flat = array.ravel()
             if name != "x0" and not flat.dot(flat) < LARGEST:  # nor NaN
-                raise InputError("q, v or u is so large that the model is not finite")
+                raise InputError(
+                    "the model is not finite, because q, v or u is too large; check their units"
+                )
         rate = drift(state, rate, rates.gravity) if ready.moving else rate
         return self._model(q, v, u, rate, made)
 
@@ -257,7 +266,7 @@ def linearize(
     reference: pin.SE3 | None = None,
     moving: bool = False,
 ) -> LinearModel:
-    """Linearise a robot about a point; at rest with neutral joints by default.
+    """Linearise a robot about a point, by default at rest with neutral joints.
 
     Parameters
     ----------
@@ -267,15 +276,16 @@ def linearize(
     v : array_like (nv,), optional
         Velocity in Pinocchio's order; at rest by default.
     u : array_like (nu,), optional
-        Over the robot's inputs, those on the base in the frame's axes; zero by default.
+        Inputs of the robot, zero by default. Inputs on the base are in the axes of `frame`.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
-        Axes of the base's velocities and wrenches, see `StateMap`; "hybrid" by default, of a robot
-        in orbit "lvlh".
+        Axes of the base velocities and wrenches, see `StateMap`. The default is "hybrid", for a
+        robot in orbit "lvlh".
     reference : pin.SE3, optional
-        Placement that attitude and position are relative to; the base's own by default, in orbit
-        the orbit's frame.
+        Placement that attitude and position are relative to. The default is the base's own
+        placement, in orbit the orbit's frame.
     moving : bool
-        The error dynamics about a reference that moves through the point, see `Linearizer`.
+        Whether to return the error dynamics about a reference that moves through the point, see
+        `Linearizer`.
 
     Returns
     -------
@@ -286,7 +296,7 @@ def linearize(
     InputError
         If an argument has a wrong size or value.
     ChartError
-        If the base is turned by pi from the reference.
+        If the base is rotated by pi from the reference.
     SingularInertiaError
         If a joint moves no mass.
     ModelError
@@ -294,7 +304,7 @@ def linearize(
 
     See Also
     --------
-    Linearizer : the same, prepared once for many points; the equations stand there.
+    Linearizer : prepares a robot once for many points; its documentation has the equations.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The linear model: matrices, names, units, and the figures that prove it."""
+"""Linear model: matrices, names, units, and its certificate."""
 
 from __future__ import annotations
 
@@ -28,17 +28,18 @@ _new, _set = object.__new__, object.__setattr__
 
 @dataclass(frozen=True)
 class Certificate:
-    """The figures that prove a linear model; all are relative and of the order of round-off.
+    """Certificate of a linear model: its residuals, which should be of the order of round-off.
 
     Attributes
     ----------
     condition : float
-        Condition number of M scaled to a unit diagonal; round-off times this is what to expect.
+        Condition number of M scaled to a unit diagonal. Expect residuals of this number times
+        machine precision.
     inertia_residual : float
-        Largest entry of ``M M^-1 - E``, scaled likewise.
+        Largest entry of M M^-1 minus the identity, with the same scaling.
     route_A, route_B : float
-        Largest difference to A and B built from Pinocchio's ABA derivatives, relative to the
-        block it stands in.
+        Largest difference from A and B computed by Pinocchio's ABA derivatives, relative to the
+        largest entry of the same block.
     f0 : float
         Largest entry of the state derivative at the point; 0 at a fixed point.
 
@@ -59,27 +60,33 @@ class Certificate:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearModel(FrozenArrays):
-    r"""A linear model about a point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
+    r"""Linear model about a point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The output is ``y = y0 + C (x - x0) + D (u - u0)``. For ``dt > 0`` the left side is the next
-    sample's ``x - x0`` instead and f0 what is added at each step. Arrays are read-only.
+    sample's ``x - x0`` instead, and f0 is added at each step. Arrays are read-only.
 
     Attributes
     ----------
     A : ndarray (nx, nx)
+        State matrix.
     B : ndarray (nx, nu)
+        Input matrix.
     C : ndarray (ny, nx)
+        Output matrix.
     D : ndarray (ny, nu)
+        Feedthrough matrix.
     f0 : ndarray (nx,)
-        Nonlinear right-hand side at the point; zero exactly at a fixed point.
-    x0, u0, y0 : ndarray
+        Nonlinear right-hand side at the point; exactly zero at a fixed point.
+    x0, u0, y0 : ndarray (nx,), (nu,), (ny,)
         State, input and output at the point.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
+        Names of states, inputs and outputs.
     state_units, input_units, output_units : tuple of str
+        Units of states, inputs and outputs.
     frame : str
-        "hybrid", "local" or "world": axes of velocities and wrenches; in orbit "lvlh" or "hill".
+        Axes of velocities and wrenches: "hybrid", "local" or "world"; in orbit "lvlh" or "hill".
     moving : bool
         Whether the state is the error from a reference that moves through the point.
     q : ndarray (nq,)
@@ -89,18 +96,18 @@ class LinearModel(FrozenArrays):
     robot : str
         Name of the robot.
     urdf_sha256 : str
-        Hash of the URDF as it was read; empty where there was none.
+        Hash of the URDF as it was read; empty if there is no URDF.
     locked : tuple of str
-        "joint=value" [rad|m] of the joints that are welded in it.
+        "joint=value" [rad|m] of each welded joint.
     fflin_version, pinocchio_version : str
-        What made the model.
+        Versions of the packages that made the model.
     verified : bool
-        Whether it is as it was made; False of a file that has no digest to tell damage by, and of
-        what is made of it.
+        True for a model of this session, or read from a file with a valid SHA-256 digest. False
+        for a file without a digest, and for every result made from its data.
     weights : mapping
-        What `lqr` weighs where it is given nothing, as `Robot.replace` takes it.
+        Default weights of `lqr`, as `Robot.replace` takes them.
     mean_motion : float
-        Of the orbit [rad/s] in whose frame the robot is; 0 where there is none.
+        Mean motion of the robot's orbit [rad/s]; 0 without an orbit.
 
     Examples
     --------
@@ -153,7 +160,7 @@ class LinearModel(FrozenArrays):
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:
-        """Return a model of fields; those under ``_when_asked`` are functions of q."""
+        """Return a model made from its fields; fields in ``_when_asked`` are functions of q."""
         # The generated __init__ sets two dozen frozen fields one by one, which takes as long
         # as the dynamics of a small robot.
         lin = _new(cls)
@@ -186,48 +193,48 @@ class LinearModel(FrozenArrays):
 
     @property
     def placement(self) -> Array:
-        """`reference` (7,) as its position [m] and quaternion x, y, z, w."""
+        """The `reference` as an array (7,): position [m] and quaternion x, y, z, w."""
         return self._reference
 
     @property
     def drift(self) -> Array | None:
-        """Own rate (nx,) of a moving reference, whose f0 is zero by construction; else None.
+        """State derivative (nx,) of a moving reference, for which f0 is zero; otherwise None.
 
-        That of its attitude is without turns about gravity, which change nothing.
+        Its attitude rate excludes rotation about the direction of gravity, which has no effect.
         """
         return self._drift
 
     @cached_property
     def M(self) -> Array:
-        """Joint-space inertia (6 + n, 6 + n) in state order, angular first, and frame's axes."""
+        """Joint-space inertia matrix (6 + n, 6 + n) in state order, in the axes of `frame`."""
         return self._inertia(self)
 
     @property
     def fingerprint(self) -> str:
-        """Hash of A, B and f0, which a certificate is about."""
+        """Hash of A, B and f0, the arrays that the certificate covers."""
         digest = sha256()
         for array in (self.A, self.B, self.f0):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
     def require(self, fingerprint: str) -> None:
-        """Raise `InputError` where the matrices are not those that were certified."""
+        """Raise `InputError` if the matrices differ from the certified ones."""
         if self.fingerprint != fingerprint:
             raise InputError(
-                "A, B or f0 were changed after they were certified; hold them against the robot "
-                "with fflin.check"
+                "A, B or f0 were changed after they were certified; check them with "
+                "fflin.check(robot, lin) instead"
             )
 
     def require_unchanged(self) -> None:
-        """Raise `ModelError` where the robot was changed in place after it was made."""
+        """Raise `ModelError` if the robot's model was changed after the robot was made."""
         if self._robot is not None:
             self._robot.require_unchanged()
 
     @property
     def generator(self) -> LinearModel | None:
-        """The continuous model that this is sampled from, or itself.
+        """Continuous-time model from which this model was sampled, or the model itself.
 
-        None where that is not known: of a file, or of matrices that were changed.
+        None if it is not known: the sampled model is from a file, or its matrices were changed.
         """
         if not self.dt:
             return self
@@ -236,57 +243,63 @@ class LinearModel(FrozenArrays):
 
     @cached_property
     def certificate(self) -> Certificate:
-        """The figures that prove the model, computed when first asked for."""
+        """Certificate with the residuals of the model, computed at the first access."""
         return self._certify(self)
 
     @cached_property
     def ignorable(self) -> tuple[str, ...]:
-        """The states that nothing in the model depends on, found on the robot.
+        """Names of the states on which nothing in the model depends, derived from the robot.
 
-        Where the base is, and the angles of rotors; with `moving`, without gravity, the attitude
-        too; in orbit the latter alone. A rotor is symmetric about its axis and carries nothing.
+        These are:
+
+        - the base position, except in orbit;
+        - the angles of rotors, joints whose link is symmetric about the axis and carries nothing;
+        - the base attitude, for `moving` models without gravity.
         """
         return () if self._ignorable is None else self._ignorable(self)
 
     @cached_property
     def limits(self) -> Mapping[str, float]:
-        """{name of an input or state: limit} of those that have one, found on the robot.
+        """{name of an input or state: limit}, from the URDF, the inputs and `Robot.limits`.
 
-        Of inputs the largest force or torque, of ``qdot_m`` the largest speed [rad/s | m/s], of
-        ``q_m`` the whole travel [rad | m]; of the URDF, the inputs and `Robot.limits`.
+        The limit of an input is its largest force or torque. The limit of ``qdot_m`` is the largest
+        speed [rad/s | m/s], and of ``q_m`` the whole range of travel [rad | m].
         """
         return {} if self._limits is None else self._limits()
 
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
-        """Whether the point is a fixed point or a relative equilibrium, so that A and B stay.
+        """Return whether the point is a fixed point or relative equilibrium, with constant A, B.
 
         At a relative equilibrium only ignorable coordinates move, at constant rates: a rotor
-        spins, or the base flies along. With ``moving=True`` the motion of the reference is
-        judged, not f0: its velocities in base axes must be constant, its joints stand but for
-        rotors, and under gravity it may turn about the vertical only.
+        spins, or the base moves at constant velocity. With ``moving=True`` the motion of the
+        reference is tested instead of f0:
+
+        - its velocities in base axes must be constant;
+        - no joint except rotors may move;
+        - under gravity the base may rotate about the vertical only.
 
         Parameters
         ----------
         tol : float
-            What no rate may exceed, in SI units; those of ignorable coordinates may. In orbit
-            times its mean motion, since its field is weak.
+            Largest rate of a coordinate that is not ignorable, in SI units. In orbit it is
+            multiplied by the mean motion, because the gravity gradient is weak.
         """
         rate = self.f0 if self.drift is None else self.drift
         judged = [name not in self.ignorable for name in self.state_names]
         return bool(np.abs(rate[judged]).max(initial=0.0) <= self.bound(number("tol", tol)))
 
     def bound(self, tol: float) -> float:
-        """Return what a tolerance is of rates at an equilibrium."""
+        """Return the tolerance of rates at an equilibrium, scaled by the mean motion in orbit."""
         return tol * min(1.0, self.mean_motion or 1.0)
 
     def discretize(self, dt: float) -> LinearModel:
-        r"""Sample the model with its input held constant between samples.
+        r"""Return the sampled model, with the input held constant between samples.
 
         .. math::
             A_d = e^{A h}, \quad [B_d, f_d] = \int_0^h e^{A s}\,ds\,[B, f_0]
 
-        At rest A^2 = 0, and the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B h^2/2`,
-        (2.2) of docs/derivation.md.
+        At rest A^2 = 0 and the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B h^2/2`,
+        (2.2) of docs/derivation.md. E is the identity.
 
         Parameters
         ----------
@@ -296,12 +309,12 @@ class LinearModel(FrozenArrays):
         Returns
         -------
         LinearModel
-            With ``dt`` set; its certificate is the continuous model's.
+            Sampled model with ``dt`` set and the certificate of the continuous-time model.
 
         Raises
         ------
         InputError
-            If `dt` is not positive or the model is sampled already.
+            If `dt` is not positive or the model is already sampled.
         ModelError
             If the robot's model was changed after it was made.
         """
@@ -310,10 +323,15 @@ class LinearModel(FrozenArrays):
         if dt <= 0.0:
             raise InputError(f"dt is {dt:g} s, expected a positive sampling time")
         if self.dt:
-            raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
+            raise InputError(
+                f"the model is already sampled, at dt = {self.dt:g} s; discretize the "
+                "continuous-time model"
+            )
         Ad, held = held_exponential(self.A, np.column_stack((self.B, self.f0)), dt)
         if not (np.isfinite(Ad).all() and np.isfinite(held).all()):
-            raise InputError(f"dt is {dt:g} s, over which the model grows beyond all numbers")
+            raise InputError(
+                f"dt is {dt:g} s, over which the model's response overflows; give a smaller dt"
+            )
         sampled = replace(
             self, A=Ad, B=held[:, :-1], f0=held[:, -1], dt=dt, _inertia=partial(_same_M, self)
         )
@@ -321,15 +339,17 @@ class LinearModel(FrozenArrays):
         return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
 
     def to(self, tool: str, *, dt: float | None = None) -> ToolModel:
-        """Return the model in another tool's coordinates: `transform`, of its own robot."""
+        """Return the model in another tool's coordinates, see `transform`."""
         from fflin import transform
 
         if self._robot is None:
-            raise InputError("this model's robot is not known: fflin.transform(robot, lin, tool)")
+            raise InputError(
+                "the model does not contain its robot; use fflin.transform(robot, lin, tool)"
+            )
         return transform(self._robot, self, tool, dt=dt)
 
     def to_scipy(self) -> Any:
-        """Return a `scipy.signal.StateSpace` of the deviations; names and f0 are lost."""
+        """Return a `scipy.signal.StateSpace` of the deviations, without names and f0."""
         from scipy.signal import StateSpace
 
         self.require_unchanged()
@@ -337,7 +357,7 @@ class LinearModel(FrozenArrays):
         return StateSpace(*matrices, dt=self.dt) if self.dt else StateSpace(*matrices)
 
     def to_control(self) -> Any:
-        """Return a `control.StateSpace` of the deviations, with signal names; f0 is lost.
+        """Return a `control.StateSpace` of the deviations, with signal names and without f0.
 
         Raises
         ------
@@ -351,19 +371,20 @@ class LinearModel(FrozenArrays):
         return state_space(matrices, self.dt, self.state_names, self.input_names, self.output_names)
 
     def save(self, path: str | Path) -> None:
-        """Write the model and its certificate, whole or not at all.
+        """Write the model and its certificate to a file, atomically.
 
         Parameters
         ----------
         path : str or Path
-            Ends in .npz, .mat, .json, or .csv (then one file per matrix, NAME.A.csv and so on).
+            Path that ends in .npz, .mat, .json or .csv. A .csv path gives one file for each
+            matrix, NAME.A.csv and so on.
 
         Raises
         ------
         FileError
-            If the ending is another or the file cannot be written.
+            If the path has another ending or the file cannot be written.
         InputError
-            If a figure is not finite.
+            If a value is not finite.
         """
         from fflin.base.writing import as_path
         from fflin.linear.files import record_of, write_model
@@ -372,12 +393,12 @@ class LinearModel(FrozenArrays):
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:
-        """Read a model that `save` wrote; every figure is the same to the last bit.
+        """Read a model that `save` wrote; every value is restored bit for bit.
 
         Raises
         ------
         FileError
-            If the file cannot be read, is damaged or is not such a model.
+            If the file cannot be read, is damaged or does not hold a linear model.
         """
         from fflin.base.writing import as_path
         from fflin.linear.files import given, read_model
@@ -405,6 +426,6 @@ def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
 
 
 def same_certificate(whole: LinearModel, fingerprint: str, made: LinearModel) -> Certificate:
-    """Return the certificate of what a model was made of, which that of a fingerprint has too."""
+    """Return the certificate of the source of a model, if its matrices are unchanged."""
     made.require(fingerprint)
     return whole.certificate

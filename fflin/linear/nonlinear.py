@@ -1,4 +1,4 @@
-"""The nonlinear model in the chart, its slopes by differences, and the flow that it must follow."""
+"""Nonlinear model in the chart, its derivatives by differences, and motions to compare it with."""
 
 from collections.abc import Callable
 from copy import copy
@@ -30,7 +30,7 @@ _WEIGHTS = (45.0 / 60.0, -9.0 / 60.0, 1.0 / 60.0)
 
 
 class Nonlinear:
-    """The nonlinear model in the chart, by ABA: ``xdot = f(x, u)``."""
+    """Nonlinear model ``xdot = f(x, u)`` in the chart, by ABA."""
 
     def __init__(self, state: StateMap, lin: LinearModel, aba: Aba | None = None) -> None:
         self.state = state
@@ -84,7 +84,7 @@ class Nonlinear:
 
 
 class ErrorDynamics(Nonlinear):
-    """The dynamics of the error from a reference that moves through the point; f is 0 there."""
+    """Error dynamics about a reference that moves through the point; f is 0 there."""
 
     def __init__(self, state: StateMap, lin: LinearModel, aba: Aba | None = None) -> None:
         super().__init__(state, lin, aba)
@@ -113,30 +113,34 @@ class ErrorDynamics(Nonlinear):
 
 
 def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None) -> Array:
-    """Return what the outputs of a robot measure, as y0 of a linear model is at its point.
+    """Return the outputs y of a robot in the coordinates of a linear model.
 
-    Attitudes are in the model's chart, where q0 >= 0, rotations of frames are counted from the
-    point, and continuous joints are on the turn nearest to it. So ``y - lin.y0`` is what a
-    controller of the model takes.
+    - Attitudes are in the model's chart, with q0 >= 0.
+    - Rotations of frames are relative to the point of linearisation.
+    - Angles of continuous joints are unwrapped to be nearest to that point.
+
+    The input of a controller designed for the model is therefore ``y - lin.y0``.
 
     Parameters
     ----------
     robot : Robot
-        With the states, inputs and outputs of the model; its masses may be others.
+        Robot with the states, inputs and outputs of the model; its masses may differ.
     lin : LinearModel
+        Model that defines the reference and the point.
     q, v : array_like (nq,), (nv,)
-        In Pinocchio's order; v is zero by default.
+        Configuration and velocity in Pinocchio's order; v is zero by default.
     u : array_like (nu,), optional
-        What an accelerometer feels; u0 by default.
+        Inputs, which affect only accelerometers; u0 by default.
 
     Returns
     -------
     ndarray (ny,)
+        Outputs in the order of ``lin.output_names``.
 
     Raises
     ------
     InputError
-        If a size is wrong, the model is of another robot or about a reference that moves.
+        If a size is wrong, the model does not fit the robot, or the model has a moving reference.
 
     Examples
     --------
@@ -147,7 +151,9 @@ def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None
     """
     instance("robot", robot, Robot, "a fflin.Robot")
     if instance("lin", lin, LinearModel, "a fflin.LinearModel").moving:
-        raise InputError("the model is about a moving reference, expected one that stays")
+        raise InputError(
+            "the model has a moving reference, expected a fixed one; linearise with moving=False"
+        )
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     require_sensed(lin, robot, state)
     at = robot.checked_configuration(q)
@@ -162,7 +168,7 @@ def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None
 
 
 def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, bends: Any) -> Array:
-    """Return the slopes of f, of rows, at a point by central differences of the given steps."""
+    """Return the Jacobian of f, a function of rows, by central differences of the given steps."""
     curved, straight = np.diag(steps)[bends], np.diag(steps)[~bends]
     ways = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
     first, last = np.split(f(np.concatenate((point + ways, point - ways))), 2)
@@ -190,7 +196,7 @@ def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array
 
 
 def flow_error(model: Nonlinear, lin: LinearModel) -> float:
-    """How far f is from the rate of the state along motions of the robot."""
+    """Return the relative error of f compared with the state derivative along motions."""
     model = copy(model)
     model.state = state = model.state.about(pin.SE3(lin.reference.rotation, np.zeros(3)))
     x = np.tile(lin.x0, (7, 1))

@@ -1,6 +1,6 @@
-"""C and D: the derivatives of the outputs carried into the chart, the frame and the inputs.
+"""C and D: derivatives of the outputs, transformed to the chart, the frame and the inputs.
 
-Numbers of equations are those of docs/derivation.md.
+Equation numbers refer to docs/derivation.md.
 """
 
 from __future__ import annotations

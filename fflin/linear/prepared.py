@@ -1,4 +1,4 @@
-"""What is the same about all points: prepared once, read by `Linearizer` and by sweeps."""
+"""Data that are the same for all points: prepared once, used by `Linearizer` and by sweeps."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What is the same about all points that a robot is linearised about; arrays are read-only."""
+    """Data that are the same for all points of linearisation of a robot; arrays are read-only."""
 
     robot: Robot
     map: StateMap
@@ -53,7 +53,7 @@ class Prepared:
 
     @cached_property
     def fields(self) -> dict[str, Any]:
-        """Fields of a model at rest but B and q; some take as long to make as the dynamics."""
+        """Fields of a model at rest except B and q; some take as long to make as the dynamics."""
         at_rest = partial(_state_at_rest, self.map)
         asked = {"x0": at_rest, "y0": at_rest, "_reference": partial(own_reference, self.robot)}
         other = {} if self.own_reference else {"_reference": self.reference}
@@ -69,20 +69,20 @@ class Prepared:
         return tree and PointKernel(self.map, self.actuation, tree, LARGEST, **options)
 
     def require_kernel(self) -> None:
-        """Raise `InputError` where there are no compiled equations."""
+        """Raise `InputError` if the compiled equations are not available."""
         reason = "numba is not installed (pip install 'fflin[fast]')"
         if numba_is_there():
             if self.kernel() is not None:
                 return
-            kind = "is in orbit" if self.robot.orbit else "is of another kind"
+            kind = "is in orbit" if self.robot.orbit else "has a type that it does not support"
             reason = f"{'' if self.robot.orbit else 'a joint of '}'{self.robot.name}' {kind}"
-        raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
+        raise InputError(f"engine='compiled' is not available: {reason}; leave engine out")
 
 
 def prepare(
     robot: Robot, *, frame: Frame | None, reference: pin.SE3 | None, moving: bool
 ) -> Prepared:
-    """Prepare a robot; arguments and errors are those of `Linearizer`."""
+    """Prepare a robot; arguments and errors are as in `Linearizer`."""
     moving = truth("moving", moving)
     if moving:
         refuse_orbit(robot, "models with moving=True")
@@ -92,8 +92,8 @@ def prepare(
         raise unknown_frame(frame)
     if moving and (reference is not None or frame != "local"):
         raise InputError(
-            "moving=True takes the error in the moving base's own axes: leave out the "
-            "reference, and the frame or make it 'local'"
+            "moving=True gives the error in the moving base's own axes, but a reference or a frame "
+            "other than 'local' is given; leave both out"
         )
     state = StateMap(robot, reference=reference, frame=frame)
     own = reference is None and robot.orbit is None  # in orbit it is the orbit's frame

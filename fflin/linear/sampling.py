@@ -1,4 +1,4 @@
-"""The exact solution of a linear model over a sample, its input held."""
+"""Exact solution of a linear model over a sample, with its input held constant."""
 
 import numpy as np
 

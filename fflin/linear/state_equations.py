@@ -1,6 +1,6 @@
-"""A, B and f0 of the accelerations and their slopes, at a point or at many.
+"""A, B and f0, assembled from accelerations and their derivatives at one or many points.
 
-Numbers of equations are those of docs/derivation.md.
+Equation numbers refer to docs/derivation.md.
 """
 
 from functools import partial
@@ -85,7 +85,7 @@ def assemble(
 
 
 def _over_turns(state: StateMap, actuation: Actuation, nu: Array, u: Array, rates: Rates) -> Array:
-    """Return the slopes of the rates over turns of the base, Theta (.., 6 + n, 3) of (4.4)."""
+    """Return the derivatives of the rates over base rotations, Theta (.., 6 + n, 3) of (4.4)."""
     omega_in_reference, v_in_reference = state.axes
     by_turn = np.zeros((*nu.shape, 3)) + rates.by_turn
     for columns, _ in actuation.held:

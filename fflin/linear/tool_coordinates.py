@@ -1,4 +1,4 @@
-"""How tools write a free flyer, said in a line of `TOOLS`, and the slopes of such coordinates."""
+"""Conventions of tools for a free flyer, one row of `TOOLS` each, and their derivatives."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ TOOLS = {
 
 
 class Slopes(NamedTuple):
-    """Slopes of coordinates x' and inputs u' at a point, over y (15.1) and u in base axes."""
+    """Derivatives of coordinates x' and inputs u' at a point, over y (15.1) and u in base axes."""
 
     P: Array  # of x' over y (15.2)
     rate: Array  # of P along the motion
@@ -81,8 +81,8 @@ class ToolCoordinates:
         self._wrench = wrench = acting.fixed[:6]  # of the inputs
         if wrench[LINEAR].any() and not wrench[ANGULAR].any() and self._X[LINEAR, ANGULAR].any():
             raise InputError(
-                "spart's force acts at the root link's centre of mass, and a BaseForce alone takes "
-                "no moment about the link's origin; give the robot a BaseTorque too"
+                "a force of spart acts at the root link's centre of mass, and a BaseForce alone "
+                "cannot give its moment about the link's origin; give the robot a BaseTorque too"
             )
         # Which of the robot's inputs stands where among the tool's.
         self._inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
@@ -120,7 +120,7 @@ class ToolCoordinates:
         return q, v
 
     def to_pinocchio(self, q: Any, v: Any) -> tuple[Array, Array]:
-        """Return Pinocchio's q and v of those of the tool; v None is rest."""
+        """Return Pinocchio's q and v from the tool's q and v; v None means rest."""
         robot, state, size = self.state.robot, self.state, 6 + len(self.joints)
         v = np.zeros(size) if v is None else vector("v", v, size, "the tool's: base, then joints")
         if self.convention.stored == "xyzw":
@@ -144,10 +144,12 @@ class ToolCoordinates:
             return pin.rpy.rpyToMatrix(*attitude)
         if self.convention.stored == "matrix":
             R0 = pin.SE3(attitude.reshape(3, 3).T, np.zeros(3))
-            return placement("R0, q[:9] by columns,", R0).rotation
+            return placement("R0 (q[:9] by columns)", R0).rotation
         length = float(np.linalg.norm(attitude))
         if abs(length - 1.0) > NORM_TOLERANCE:
-            raise InputError(f"the quaternion w, x, y, z has length {length:.9g}, expected 1")
+            raise InputError(
+                f"the quaternion w, x, y, z has length {length:.9g}, expected 1; normalise it"
+            )
         return turning.rotation_matrix(np.roll(attitude, -1) / length)
 
     def _attitude(self, q: Array) -> tuple[Array, Array]:
@@ -167,11 +169,11 @@ class ToolCoordinates:
         return turn
 
     def _held(self, parts: Array) -> Array:
-        """Return the slopes (6, 3) over a turn of what is held in the world, in base axes (4.4)."""
+        """Return the derivatives (6, 3) over a rotation of world-fixed vectors, base axes (4.4)."""
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
     def slopes(self, q: Array, nu: Array, u: Array, rates: Array) -> Slopes:
-        """Return the slopes at a point; nu (6 + n,), u (nu,), rates of nu (6 + n,) in base axes."""
+        """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) in base axes."""
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
         still, R_now = self._attitude(q)
         # A step along the motion; errors and tangents go along with a reference that moves.
@@ -216,7 +218,7 @@ class ToolCoordinates:
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
-    """Return those of a tool."""
+    """Return the tool's coordinates."""
     if not isinstance(tool, str) or tool not in TOOLS:
         raise unknown("tool", str(tool), TOOLS)
     if tool[:5] != "euler":
@@ -250,7 +252,10 @@ def _left(P: Array) -> Array:
 def _angles(R: Array) -> Array:
     """Return roll, pitch and yaw of R = R_z(yaw) R_y(pitch) R_x(roll), along a complex step too."""
     if np.hypot(R[0, 0].real, R[1, 0].real) < SMALLEST_Q0:
-        raise ChartError("the pitch is 90 deg, where roll and yaw of Euler's angles turn alike")
+        raise ChartError(
+            "the pitch is 90 deg, where roll and yaw cannot be distinguished; use a tool without "
+            "Euler angles, or another attitude"
+        )
     angles: Array = pin.rpy.matrixToRpy(R.real)
     if np.iscomplexobj(R):
         W = R.real.T @ R.imag
@@ -259,7 +264,7 @@ def _angles(R: Array) -> Array:
 
 
 def _of_angles(angles: Array, omega: Any = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
-    """Return G, the rates of the angles being G omega, and the slope of G omega over them."""
+    """Return G, with angle rates G omega, and the derivative of G omega over the angles."""
     (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
     G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
     _, pitch, yaw = G @ omega

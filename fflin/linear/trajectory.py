@@ -1,4 +1,4 @@
-"""A motion of a robot by knots, with inputs that are held or linear in between."""
+"""Trajectory: a motion of a robot given by knots, with held or linear inputs in between."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ _MOTION = 1e-2
 _FARTHEST_TURN = 2.5
 
 _CAUSES = (
-    "usual causes: hold, the axes (frame) of u or v, units of t or of joints, and the robot's "
-    "springs, damping and gravity"
+    "usual causes: wrong hold, wrong axes (frame) of u or v, wrong units of t or of joints, or "
+    "other springs, damping or gravity"
 )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Design):
-    """A motion of a robot by knots; the arrays are copied and read-only.
+    """Motion of a robot given by knots; the arrays are copied and read-only.
 
     Parameters
     ----------
@@ -46,25 +46,27 @@ class Trajectory(Design):
     t : array_like (N,)
         Times of the knots [s], increasing.
     q : array_like (N, nq)
-        Configurations in Pinocchio's order; each continuous joint may have one column, its angle,
-        instead of the two of (cos, sin).
+        Configurations in Pinocchio's order. A continuous joint may have one column, its angle,
+        instead of the two columns (cos, sin).
     v : array_like (N, nv)
         Velocities in Pinocchio's order.
     u : array_like (N, nu) or (N - 1, nu)
-        Over the robot's inputs; of N - 1 rows each acts over an interval.
+        Inputs at the knots; with N - 1 rows, each row acts over one interval.
     hold : {"linear", "previous"}, optional
-        Whether inputs are linear between the knots, or stay what they were at the knot before, as
-        those of a computer. Linear by default, and held where u has N - 1 rows.
+        Inputs between the knots: "linear" interpolates, "previous" holds the value of the previous
+        knot, like a digital controller. The default is "linear", or "previous" if u has N - 1
+        rows.
     frame : {"local", "hybrid", "world"}
-        Axes of the inputs on the base, in which they are held too: those of the base, or of the
-        world for the force (hybrid) or for force and torque (world).
+        Axes in which the inputs on the base are given and held. local: base axes. hybrid: force in
+        world axes, torque in base axes. world: both in world axes.
     verified : bool
-        False of a file that has no digest to tell damage by.
+        False for data from a file without a SHA-256 digest, in which damage cannot be detected.
 
     Raises
     ------
     InputError
-        If a size is wrong, the times do not increase, or a row is no configuration or velocity.
+        If a size is wrong, the times do not increase, or a row is not a valid configuration,
+        velocity or input.
 
     Examples
     --------
@@ -95,7 +97,7 @@ class Trajectory(Design):
         times = as_double("t", self.t)
         times = vector("t", times, times.size, "times of the knots")
         if len(times) < 2:
-            raise InputError("t must hold at least two times, each later than the one before")
+            raise InputError(f"t has {len(times)} times, expected at least 2, in increasing order")
         if (back := np.flatnonzero(np.diff(times) <= 0.0)).size:
             late, early = times[back[0] : back[0] + 2]
             raise InputError(
@@ -107,7 +109,7 @@ class Trajectory(Design):
         count, u = len(times), as_double("u", self.u)
         short = u.shape == (count - 1, nu) and self.hold != "linear"
         if not short and u.shape != (count, nu):
-            expected = f"({count}, {nu}), or ({count - 1}, {nu}) where each acts over an interval"
+            expected = f"({count}, {nu}), or ({count - 1}, {nu}) if each row acts over an interval"
             raise InputError(f"u has shape {u.shape}, expected {expected}")
         v = as_double("v", self.v)
         if v.shape != (count, robot.nv):
@@ -136,7 +138,7 @@ class Trajectory(Design):
         )
 
     def __str__(self) -> str:
-        """Show how good a motion of the robot it is."""
+        """Show the trajectory with its residual as a motion of the robot."""
         said = self._fault or f"residual {self.residual.max():.1e}"
         note = f"\n{folded([self._note])}" if self._note else ""
         return f"{folded(super().__str__().splitlines())}\n{folded([said])}{note}"
@@ -148,40 +150,41 @@ class Trajectory(Design):
 
     @cached_property
     def flow(self) -> Flow:
-        """The motion between the knots."""
+        """Motion between the knots."""
         return Flow(self._state, self.t, self.q, self.v, self.u, self.hold == "previous")
 
     @cached_property
     def u_base(self) -> Array:
-        """The inputs (N, nu) from the knots on, those on the base in base axes."""
+        """Inputs (N, nu) just after each knot; inputs on the base are in base axes."""
         return frozen(Actuation(self._state).rows_in_base_axes(self.q, self.u))
 
     @property
     def residual(self) -> Array:
-        """How far the knots are from a motion (N,): what the intervals around each miss.
+        """Error (N,) of the knots as a motion: the larger error of the intervals beside each knot.
 
-        An interval is integrated from its first knot under its inputs; what its end misses the
-        next knot by, as a rate, is relative to the largest rate of the motion, see `Flow`.
+        Each interval is integrated from its first knot under its inputs. Its error is the
+        difference from the next knot divided by the interval, relative to the largest rate of the
+        motion, see `Flow`.
         """
         found = self.flow.residual
         return np.maximum(np.append(found, 0.0), np.append(0.0, found))
 
     def point(self, t: float) -> tuple[Array, Array, Array]:
-        """Return q, v, and u in base axes at a time.
+        """Return q (nq,), v (nv,), and u (nu,) in base axes, at a time t [s].
 
-        Between knots q and v are cubics with the robot's own velocities and accelerations.
+        Between knots, q and v are cubics that match the robot's velocities and accelerations.
 
         Raises
         ------
         InputError
-            If the time is not within the knots.
+            If the time is before the first or after the last knot.
         """
         return self.flow.at(self._within(t))
 
     def resampled(self, dt: float) -> Trajectory:
-        """Return the same motion with knots dt [s] apart, and one at the end, see `point`.
+        """Return the same motion with knots dt [s] apart and one at the end, see `point`.
 
-        Inputs that are held stay what they were where each old knot is a new one.
+        Held inputs are unchanged if every old knot is also a new knot.
         """
         times = self.samples(dt)
         if times[-1] < self.t[-1]:
@@ -192,11 +195,11 @@ class Trajectory(Design):
         return Trajectory(self.robot, times, q, v, u, **kept)  # type: ignore[arg-type]
 
     def samples(self, dt: float) -> Array:
-        """Return the times every dt [s] that are within the knots."""
+        """Return the times every dt [s] from the first knot to the last."""
         dt, duration = number("dt", dt), float(self.t[-1] - self.t[0])
         if not dt >= 1e-7 * duration:
             raise InputError(
-                f"dt is {dt:g} s, expected a positive time of 1e-7 of the {duration:g} s or more"
+                f"dt is {dt:g} s, expected at least 1e-7 of the duration of {duration:g} s"
             )
         times: Array = self.t[0] + dt * np.arange(int(duration / dt * (1.0 + 1e-9)) + 1)
         if abs(times[-1] - self.t[-1]) <= 1e-6 * dt:
@@ -204,10 +207,10 @@ class Trajectory(Design):
         return times
 
     def require(self, *, strict: bool = False) -> None:
-        """Warn of knots that are no motion of the robot to 1e-2, or refuse them if `strict`.
+        """Warn if the residual of the motion exceeds 1e-2, or raise `InputError` if `strict`.
 
-        The message says which interval misses the motion most, by how much, and how many do. A
-        motion that overflows is refused in any case.
+        The message names the interval with the largest error, the error, and the number of
+        intervals that exceed 1e-2. A motion that overflows always raises.
         """
         fault = self._fault
         if fault and (strict or self.flow.residual.max() == np.inf):
@@ -223,27 +226,28 @@ class Trajectory(Design):
         where = f"'{self.robot.name}': from t = {self.t[k]:g} to {self.t[k + 1]:g} s"
         if missed[k] == np.inf:
             return (
-                f"t, q, v, u are no motion of {where} it overflows; expected finite rates and "
-                "times; check their units"
+                f"t, q, v, u are not a motion of {where} the integration overflows; expected "
+                "finite rates; check the units of times, velocities and inputs"
             )
         if missed[k] > _MOTION:
             return (
-                f"t, q, v, u are no motion of {where} they miss it by {missed[k]:.2g} of its "
+                f"t, q, v, u are not a motion of {where} the error is {missed[k]:.2g} of the "
                 f"largest rate, and {(missed > _MOTION).sum()} of "
-                f"{len(missed)} intervals by more than {_MOTION:g}; {_CAUSES}"
+                f"{len(missed)} intervals exceed {_MOTION:g}; {_CAUSES}"
             )
         rates = np.linalg.norm(self.v[:, 3:6], axis=1)
         turns = np.diff(self.t) * np.maximum(rates[1:], rates[:-1])
         k = int(turns.argmax())
         if turns[k] > _FARTHEST_TURN:
             return (
-                f"the base turns by {turns[k]:.2g} rad from t = {self.t[k]:g} to {self.t[k + 1]:g} "
-                f"s, more than its ends can tell; give knots at most {_FARTHEST_TURN:g} rad apart"
+                f"the base rotates by {turns[k]:.2g} rad from t = {self.t[k]:g} to "
+                f"{self.t[k + 1]:g} s, which two knots cannot represent; give knots at most "
+                f"{_FARTHEST_TURN:g} rad apart"
             )
         return ""
 
     def save(self, path: str | Path) -> None:
-        """Write it to a .npz, .mat, .json or .csv file, whole or not at all; see `load`."""
+        """Write the trajectory to a .npz, .mat, .json or .csv file, atomically; see `load`."""
         from fflin.linear.trajectory_files import write_csv
 
         target = as_path(path)
@@ -258,26 +262,34 @@ class Trajectory(Design):
     ) -> Trajectory:
         """Read a trajectory that `save`, `Motion.save` or another program wrote.
 
-        A .npz, .mat or .json file has t (N,), q and v, or the states x (N, nx) of `StateMap`, and
-        u, a row for each knot. A .csv file has named columns: t; q[0] ... and v[0] ..., or the
-        names of the states, such as q_b.x; and those of the inputs, such as tau_m.joint_1, which
-        are zero where left out. The texts `hold` and `frame` may be there too, in a .csv in every
-        row.
+        A .npz, .mat or .json file has the entries
+
+        - t (N,);
+        - q and v, or the states x (N, nx) of `StateMap`;
+        - u, with one row for each knot;
+        - optionally the texts `hold` and `frame`.
+
+        A .csv file has the named columns
+
+        - t;
+        - q[0] ... and v[0] ..., or the names of the states, such as q_b.x;
+        - the names of inputs, such as tau_m.joint_1; inputs without a column are zero;
+        - optionally `hold` and `frame`, the same in every row.
 
         Parameters
         ----------
         path : str or Path
         robot : Robot
         hold, frame : str, optional
-            What the file says by default, else what `Trajectory` takes; of x the frame says the
-            axes of the velocities too.
+            Options of `Trajectory`; by default they are taken from the file. If the file holds x,
+            `frame` also gives the axes of its velocities.
 
         Raises
         ------
         FileError
-            If the file cannot be read, is damaged, or has not these entries.
+            If the file cannot be read, is damaged, or lacks these entries.
         InputError
-            If what it has is no trajectory of this robot.
+            If its entries are not a valid trajectory of this robot.
         """
         from fflin.linear.trajectory_files import read
 
@@ -291,7 +303,10 @@ class Trajectory(Design):
     def _within(self, t: float) -> float:
         t = number("t", t)
         if not self.t[0] <= t <= self.t[-1]:
-            raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
+            raise InputError(
+                f"t is {t:g} s, expected a time of the trajectory, {self.t[0]:g} to "
+                f"{self.t[-1]:g} s"
+            )
         return t
 
     @property
@@ -306,8 +321,8 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
     if rows.shape == (count, robot.nq):
         return rows
     if rows.shape != narrow:
-        hint = ": continuous joints take two columns, (cos, sin); `Trajectory` takes angles too, "
-        hint = f"{hint}{narrow}" if len(cosines) else ""
+        hint = f", or {narrow} with one angle for each continuous joint instead of (cos, sin)"
+        hint = hint if len(cosines) else ""
         raise InputError(f"q has shape {rows.shape}, expected ({count}, {robot.nq}){hint}")
     wide = np.empty((count, robot.nq))
     wide[:, np.delete(np.arange(robot.nq), cosines + 1)] = rows
@@ -319,9 +334,14 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
 def along(motion: Any, robot: Robot | None) -> Trajectory:
     """Return a motion by knots, its inputs held or linear, whichever has the least residual."""
     if motion.phases:
-        raise InputError("a motion of several phases is of several robots; take each alone")
+        raise InputError(
+            "the motion has several phases, each with its own robot; convert each of its phases "
+            "separately"
+        )
     if robot is None:
-        raise InputError("the motion is from a file, without its robot; give the one that moves")
+        raise InputError(
+            "the motion was read from a file, which does not contain its robot; give the robot"
+        )
     entries = {name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")}
     from fflin.linear.trajectory_files import arguments
 

@@ -1,4 +1,4 @@
-"""Trajectories that other programs wrote: npz, mat and json by entries, csv by named columns."""
+"""Trajectory files, also from other programs: npz, mat and json by entries, csv by columns."""
 
 from __future__ import annotations
 
@@ -66,7 +66,9 @@ def arguments(
     states = "q" in entries and "v" in entries
     if not {"t", "u"} <= {*entries} or not (states or "x" in entries):
         found = ", ".join(sorted(entries))
-        raise FileError(f"it has the entries {found}; expected t, u, and either q and v or x")
+        raise FileError(
+            f"the file has the entries {found}; expected t, u, and either x or both q and v"
+        )
     reference = pin.XYZQUATToSE3(np.ravel(entries.get("placement", [0, 0, 0, 0, 0, 0, 1.0])))
     state = StateMap(robot, reference=reference, frame=frame)
     u = as_double("u", entries["u"])
@@ -80,7 +82,9 @@ def arguments(
         return found_as | {name: entries[name] for name in "qv"}
     x = as_double("x", entries["x"])
     if x.ndim != 2 or x.shape[1] != state.nx:
-        raise InputError(f"x has shape {x.shape}, expected (N, {state.nx}), the states")
+        raise InputError(
+            f"x has shape {x.shape}, expected (N, {state.nx}): a row of states for each knot"
+        )
     q, v = map(np.array, zip(*map(state.to_pinocchio, x), strict=True))
     return found_as | {"q": q, "v": v}
 
@@ -90,10 +94,10 @@ def _columns(path: Path) -> Record:
     lines = csv.reader(io.StringIO(read_file(path, ".csv").decode("utf-8-sig"), newline=""))
     header, *rows = [[cell.strip() for cell in line] for line in lines if any(line)]
     if len({*header}) < len(header):
-        raise ValueError("two of its columns have one name")
+        raise ValueError("two of its columns have the same name")
     for number, row in enumerate(rows, 2):
         if len(row) != len(header):
-            cells = f"row {number} has {len(row)} cells, the first {len(header)}"
+            cells = f"row {number} has {len(row)} cells, the header has {len(header)}"
             raise ValueError(f"{cells}; separate them by commas")
     return dict(zip(header, zip(*rows, strict=True), strict=True))
 

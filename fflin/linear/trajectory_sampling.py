@@ -1,4 +1,4 @@
-"""The error dynamics along a motion from sample to sample, du held in between."""
+"""Sampled error dynamics along a motion, with du held constant over each sample."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ def transitions(
     times = along.samples(dt)
     if times[-1] != along.t[-1]:
         duration = along.t[-1] - along.t[0]
-        raise InputError(f"dt is {dt:g} s, expected a part of the {duration:g} s of the trajectory")
+        raise InputError(
+            f"dt is {dt:g} s, but the duration of the trajectory, {duration:g} s, is not a "
+            "multiple of it; give a dt that divides the duration"
+        )
     nx, nu = 12 + 2 * along.robot.n, along.u.shape[1]
 
     def at(t: float) -> Array:

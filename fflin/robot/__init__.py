@@ -1,5 +1,5 @@
-"""A file or a `pinocchio.Model` becomes a `Robot`.
+"""Robots, made from a file or from a `pinocchio.Model`.
 
-What floats, what acts on it (inputs), what is watched (outputs), springs, locks, the catalogue of
+The free-flying tree of joints, its inputs and outputs, springs, locks, and the catalogue of robot
 names. Imports `base`; `robot.urdf` reads the file.
 """

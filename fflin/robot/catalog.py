@@ -1,4 +1,4 @@
-"""Where robots are found, the bundled ones or others, and their files of inputs and meshes."""
+"""Catalogue of the bundled and other robots, with their files of inputs and meshes."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -14,7 +14,7 @@ _PRUNED = {"talos_legs": ("torso_1_joint",)}
 
 
 class RobotFile(NamedTuple):
-    """Where a robot's description lies."""
+    """Location of a robot's description."""
 
     name: str  # that `load` takes
     path: Path  # of the URDF
@@ -53,7 +53,7 @@ def _example_robot_data() -> dict[str, RobotFile]:
 
 
 def list_robots() -> tuple[str, ...]:
-    """Every robot name that `load` takes: the bundled ones first, then example-robot-data's.
+    """Return all robot names that `load` accepts: first bundled, then from example-robot-data.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def list_robots() -> tuple[str, ...]:
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
     """Find a robot by a bundled name, a path from the folder or a name of example-robot-data."""
     if not isinstance(robot, str | os.PathLike):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a name or a path")
+        raise InputError(f"robot is a {type(robot).__name__}, expected a robot name or a path")
     if isinstance(robot, str) and robot in _bundled():
         return _bundled()[robot]
     path, text = Path(folder, robot), str(robot)
@@ -83,9 +83,14 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
         name = path.stem.encode(errors="backslashreplace").decode()
         return RobotFile(name, path, "file", (path.resolve().parent,))
     if isinstance(robot, Path) or path.suffix or len(Path(robot).parts) != 1:
-        raise FileError(f"no file at '{path}'; give a URDF's path or a name of `fflin robots`")
+        raise FileError(
+            f"no file at '{path}'; give the path of a URDF or a name that `fflin robots` lists"
+        )
     if text == "cassie":
-        raise UrdfError("'cassie' comes as SDF only, which Pinocchio's wheels cannot read")
+        raise UrdfError(
+            "'cassie' exists only as SDF, which the packaged Pinocchio cannot read; load another "
+            "robot, or build a pin.Model for fflin.from_model"
+        )
     if text not in _example_robot_data():
         raise unknown("robot", text, list_robots())
     return _example_robot_data()[text]
@@ -94,9 +99,9 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 def find_inputs(inputs: str | Path) -> Path:
     """Find a file of inputs by the name of the bundled one's robot, else by its path."""
     if not isinstance(inputs, str | os.PathLike) or "\0" in str(inputs):
-        raise InputError(f"{inputs!r} is not the path of a file of inputs")
+        raise InputError(f"{inputs!r} is not a path; give the path of a TOML file of inputs")
     if not str(inputs):
-        raise InputError("the name of the file of inputs is empty")
+        raise InputError("the path of the inputs is empty; give the path of a TOML file")
     bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
     path = Path(inputs)
     if str(inputs) in bundled:

@@ -22,7 +22,7 @@ _DATA_LIMIT = 2**30
 
 
 class Coordinates:
-    """What a robot's q and v are, and whether given ones are valid."""
+    """Configuration q and velocity v of a robot, and checks of given values."""
 
     model: pin.Model
     name: str
@@ -32,7 +32,7 @@ class Coordinates:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the n independent joints in state order."""
+        """Names of the n independent joints, in state order."""
         return tuple(joint.name for joint in self.joints)
 
     @property
@@ -42,33 +42,33 @@ class Coordinates:
 
     @cached_property
     def nq(self) -> int:
-        """Size of Pinocchio's configuration."""
+        """Size of Pinocchio's configuration vector q."""
         return int(self.model.nq)
 
     @cached_property
     def nv(self) -> int:
-        """Size of Pinocchio's velocity: 6 + n, and one for each mimic joint."""
+        """Size of Pinocchio's velocity vector v: 6 + n, plus one for each mimic joint."""
         return int(self.model.nv)
 
     @cached_property
     def unbounded(self) -> dict[int, str]:
-        """{index of the cosine in q: joint} of the joints that turn without end."""
+        """Continuous joints: {index of the cosine in q: joint name}."""
         joints = (*self.joints, *(follower.joint for follower in self.followers))
         return {joint.idx_q: joint.name for joint in joints if joint.unbounded}
 
     def neutral(self) -> Array:
-        """Return the neutral configuration (nq,): mimic joints where their leaders put them."""
+        """Return the neutral configuration (nq,), with mimic joints placed by their leaders."""
         q = pin.neutral(self.model)
         self.follow(q)
         return q
 
     def follow(self, q: Array) -> None:
-        """Put the mimic joints of a configuration where their leaders say."""
+        """Place the mimic joints of a configuration q (nq,) by their leaders, in place."""
         for follower in self.followers:
             follower.place(q)
 
     def checked_configuration(self, q: Array) -> Array:
-        """Return q (nq,) as a valid configuration, put right within 1e-6, or raise `InputError`."""
+        """Return a valid configuration q (nq,), corrected within 1e-6, or raise `InputError`."""
         if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
             q = vector("q", q, self.nq, _CONFIGURATION)
         entries = q.tolist()
@@ -89,21 +89,22 @@ class Coordinates:
                 if excess > NORM_TOLERANCE:
                     raise InputError(
                         f"(cos, sin) of continuous joint '{self.unbounded[index]}', "
-                        f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1"
+                        f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1; "
+                        "normalise it"
                     )
         if worst > ROUND_OFF:
             q = pin.normalize(self.model, q)
         return self._followed(q) if self.followers else q
 
     def checked_velocity(self, v: Array) -> Array:
-        """Return `v` as a valid velocity (nv,), never modified, or raise `InputError`."""
+        """Return a valid velocity v (nv,), without modification, or raise `InputError`."""
         v = vector("v", v, self.nv, "a velocity in Pinocchio's order")
         for joint, leader, multiplier, _ in self.followers:
             expected = multiplier * v[leader.idx_v]
             if abs(v[joint.idx_v] - expected) > NORM_TOLERANCE * max(1.0, abs(expected)):
                 raise InputError(
                     f"v[{joint.idx_v}] of joint '{joint.name}' is {v[joint.idx_v]:.9g}, but it "
-                    f"mimics '{leader.name}', which makes it {expected:.9g}"
+                    f"mimics '{leader.name}', which requires {expected:.9g}"
                 )
         return v
 
@@ -117,32 +118,33 @@ class Coordinates:
             if error > NORM_TOLERANCE * max(1.0, np.abs(placed[part]).max()):
                 raise InputError(
                     f"joint '{joint.name}' is at {joint.value(q):.9g}, but it mimics "
-                    f"'{leader.name}', which puts it at {joint.value(placed):.9g}; `configuration` "
-                    "places mimic joints"
+                    f"'{leader.name}', which puts it at {joint.value(placed):.9g}; "
+                    "fflin.configuration places mimic joints"
                 )
         return placed
 
     def require_unchanged(self) -> None:
-        """Raise `ModelError` where the model was changed in place after the robot was made."""
+        """Raise `ModelError` if the model was changed in place after the robot was made."""
         assert self._as_made is not None
         made = self._as_made[1]
         # Tells in a microsecond that nothing at all was changed.
         if self.model != made and (change := change_in(self.model, made)):
             raise ModelError(
                 f"the model of '{self.name}' was changed after the robot was made: {change}; make "
-                "a robot of it with fflin.from_model(model)"
+                "a new robot from it with fflin.from_model(model)"
             )
 
     def create_data(self) -> pin.Data:
-        """Make Pinocchio's work space for this robot, or raise `ModelError` beyond 1 GiB."""
+        """Return a new pin.Data for this robot, or raise `ModelError` if it exceeds 1 GiB."""
         self.require_room()
         return self.model.createData()
 
     def require_room(self) -> None:
-        """Raise `ModelError` where Pinocchio's work space would take more than 1 GiB."""
+        """Raise `ModelError` if a pin.Data of this robot would exceed 1 GiB."""
         size = _DATA_BYTES_PER_NV3 * self.nv**3
         if size > _DATA_LIMIT:
             raise ModelError(
                 f"'{self.name}' has {self.n} joints, for which Pinocchio's Data takes about "
-                f"{size / 2**30:.1f} GiB (limit 1 GiB); lock joints that do not matter"
+                f"{size / 2**30:.1f} GiB, more than the limit of 1 GiB; lock joints that do not "
+                "matter"
             )

@@ -1,4 +1,4 @@
-"""A robot file to begin with: what a URDF says of a robot, and what its names suggest."""
+"""Draft of a robot file, from the values of a URDF and from suggestive link names."""
 
 import json
 import math
@@ -33,7 +33,8 @@ def draft(robot: Robot, urdf: str) -> str:
     passive = f"\n# Joints without a motor: their effort is 0 in the URDF.\npassive = [{names}]\n"
     if len(idle) == robot.n:
         passive = (
-            f"\n# Of every joint the effort is 0, as some exporters write.\n# passive = [{names}]\n"
+            "\n# The URDF gives every joint an effort of 0, as some exporters do.\n"
+            f"# passive = [{names}]\n"
         )
         idle = []
     M = pin.crba(model, model.createData(), robot.neutral())
@@ -81,11 +82,11 @@ def _candidate(robot: Robot, index: int) -> str:
             joint.calc(data, robot.neutral())
             axis = np.asarray(data.S).reshape(6)[3:]
             size = axis @ model.inertias[frame.parentJoint].inertia @ axis
-            inertia = f"# inertia = {size:.6g}  # [kg m^2], where its joint is in lock\n"
+            inertia = f"# inertia = {size:.6g}  # [kg m^2], if its joint is locked\n"
     key = "axis" if kind == "reaction_wheel" else "direction"
     at, along = _vector(placement.translation), _vector(placement.rotation @ axis)
     position = "" if inertia or key == "axis" else "# position = [0, 0, 0]  # [m], in that frame\n"
-    said = f"# Link {_text(frame.name)} at {at}, {key} {along} in the robot's axes:"
+    said = f"# Link {_text(frame.name)} at {at} [m], {key} {along}, both in base axes:"
     return (
         f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n"
         f'# [[input]]\n# type = "{kind}"\n# name = {_text(name)}\n# frame = {_text(frame.name)}\n'

@@ -1,4 +1,4 @@
-"""What of a robot its user may set: inputs, passive joints, gravity, its start; checked once."""
+"""Fields of a robot that the user may set, checked once: inputs, passive joints, gravity, start."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -40,8 +40,8 @@ def checked_fields(
     """Return fields of `Robot.replace`, but passive and inputs; `own` are the joints but wheels."""
     if "friction" in fields:
         raise ModelError(
-            "dry friction is not differentiable at rest, so that no linear model has it; use "
-            "damping, or simulate with it"
+            "dry friction is not differentiable at rest, so a linear model cannot contain it; use "
+            "damping, or add the friction in a simulation"
         )
     check: dict[str, Callable[[Any], Any]] = {
         "outputs": _outputs,
@@ -67,14 +67,14 @@ def checked_inputs(
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise InputError(f"inputs is a {type(value).__name__}, expected a sequence of inputs")
     if not value:
-        raise InputError("inputs is empty; a model needs at least one")
+        raise InputError("inputs is empty; give at least one input")
     for item in value:
         if not isinstance(item, Input):
             known = ", ".join(kind.__name__ for kind in kinds.KINDS)
             raise InputError(f"{item!r} is not an input; expected {known}")
     value = [one for item in value for one in _spread(item, find, joints, passive)]
     if not value:
-        raise InputError("inputs are torques of joints that all are passive; name another input")
+        raise InputError("all inputs are torques of passive joints; add another input")
     # What has a name is told by that, all else by what it is but for its limits.
     named = [item for item in value if isinstance(item, kinds.WrenchInput)]
     told: list[Any] = [
@@ -84,7 +84,7 @@ def checked_inputs(
     told += [replace(item, min=None, max=None) for item in value if item not in named]
     for each in told:
         if told.count(each) > 1:
-            raise InputError(f"input {each} stands there twice")
+            raise InputError(f"input {each} is given twice; remove one")
     return tuple(value)
 
 
@@ -94,7 +94,7 @@ def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[st
         return [item]
     found = by_joint({str(item.joint): None}, joints, find)
     if item.joint in found and item.joint in passive:
-        raise InputError(f"joint '{item.joint}' is passive and has a joint torque; leave one out")
+        raise InputError(f"joint '{item.joint}' is passive but has a joint torque; remove one")
     return [replace(item, joint=name) for name in found if name not in passive]
 
 
@@ -132,7 +132,7 @@ def _outputs(value: Any) -> tuple[Output, ...]:
         raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
     for item in value:
         if not isinstance(item, Output):
-            raise InputError(f"{item!r} is not an output, as FramePose('tool') would be")
+            raise InputError(f"{item!r} is not an output; expected one such as FramePose('tool')")
     return tuple(value)
 
 
@@ -195,7 +195,7 @@ def kept_start(start: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any
 
 
 def _weights(value: Any, joints: Sequence[str], inputs: Sequence[Input]) -> dict[str, Any]:
-    """Return the weights of a robot's regulator, whose names are those of states and inputs."""
+    """Return the weights of a robot's regulator, by names of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)
     if str(weights.get("rule", RULES[0])) not in RULES:
         raise unknown("rule of weights", weights["rule"], RULES)
@@ -214,7 +214,7 @@ def _weights(value: Any, joints: Sequence[str], inputs: Sequence[Input]) -> dict
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
     for key in weights["bryson"]:
         if key in weights["q"] or key in weights["r"]:
-            raise InputError(f"'{key}' has a weight and a largest value; give either")
+            raise InputError(f"'{key}' has both a weight and a largest value; give only one")
     return {part: value for part, value in weights.items() if value}
 
 
@@ -227,7 +227,7 @@ def checked_passive(
         raise InputError(f"passive is {value!r}, expected names of joints")
     for key in keys:
         if any(each.rpartition("=")[0] == key for each in locked):
-            raise InputError(f"joint '{key}' is locked and passive; leave one out")
+            raise InputError(f"joint '{key}' is both locked and passive; remove one")
     found = by_joint(dict.fromkeys(keys), joints, find)
     return tuple(name for name in joints if name in found)
 

@@ -10,7 +10,7 @@ ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
 
 class Carried(NamedTuple):
-    """Where a frame is: the joint that carries it, and its placement on that joint."""
+    """Location of a frame: the joint that carries it, and its placement on that joint."""
 
     joint: int
     placement: pin.SE3

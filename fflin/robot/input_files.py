@@ -43,8 +43,8 @@ _EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
 def load_inputs(path: str | Path) -> tuple[Input, ...]:
     """Read the inputs of a robot from a TOML file.
 
-    The file is an array of tables ``[[input]]``; their order is that of u. Each has a ``type``
-    and the keys of that type, which are the parameters of the class:
+    The file is an array of tables ``[[input]]``, in the order of u. Each table has a ``type``
+    and the keys of this type, which are the parameters of the class:
 
     ==================  =========================================================
     ``type``            keys
@@ -52,21 +52,21 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     ``base_torque``     none: `BaseTorque`
     ``base_force``      none: `BaseForce`
     ``joint_torque``    ``joint``: `JointTorque`
-    ``thruster``        ``frame``, ``position`` [m], ``direction`` and, as
-                        wanted, ``name``, ``on_off`` (true: pulses of ``max``),
+    ``thruster``        ``frame``, ``position`` [m], ``direction``; optional:
+                        ``name``, ``on_off`` (true: pulses of ``max``),
                         ``least_impulse`` [N s]: `Thruster`
-    ``reaction_wheel``  ``axis`` and, as wanted, ``frame``, ``inertia`` [kg m^2]
-                        with ``max_speed`` [rad/s], or ``momentum`` [N m s],
-                        ``name``: `ReactionWheel`
-    all                 as wanted, ``max`` and ``min`` [N m | N]: the largest
-                        and the least value; ``min`` is -max by default, 0 of a
-                        thruster. For the base one number or three
+    ``reaction_wheel``  ``axis``; optional: ``frame``, ``name``, and either
+                        ``inertia`` [kg m^2] with ``max_speed`` [rad/s] or
+                        ``momentum`` [N m s]: `ReactionWheel`
+    every type          optional: ``max`` and ``min`` [N m | N], the largest and
+                        the least value. The default of ``min`` is -max, for a
+                        thruster 0. Base inputs take one number or three
     ==================  =========================================================
 
     Parameters
     ----------
     path : str or Path
-        Of the file, or the name of a bundled one: ``"cubesat"``, ``"servicer_7dof"``.
+        Path of the file, or the name of a bundled one: ``"cubesat"``, ``"servicer_7dof"``.
 
     Returns
     -------
@@ -75,16 +75,16 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     Raises
     ------
     FileError
-        If it is not a regular file that can be read, or too large.
+        If the path is not a regular file, or the file cannot be read or is too large.
     UnknownNameError
-        If there is no such type or key; with file and line.
+        If there is no such type or key; the message names file and line.
     InputError
-        If the file is not TOML, a key is missing, a value is wrong or an input stands there
-        twice; with file and line.
+        If the file is not TOML, a key is missing, a value is wrong or an input is given twice;
+        the message names file and line.
 
     Examples
     --------
-    A file that holds ::
+    A file with this content ::
 
         [[input]]
         type = "joint_torque"
@@ -109,13 +109,13 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
 
 
 def check_keys(document: TomlFile) -> None:
-    """Raise `UnknownNameError` where a file of inputs, or of a robot, has another key."""
+    """Raise `UnknownNameError` if a file of inputs or a robot file has an unknown key."""
     whole = "urdf" in document.record
     known, hint = (ROBOT_KEYS, "") if whole else (("input",), "; write [[input]]")
     for key in document.record:
         if key not in known:
             if not whole and key in ROBOT_KEYS:
-                missing = 'has no `urdf`; a robot file begins with it: add urdf = "my.urdf"'
+                missing = 'has no key `urdf`; a robot file needs it: add urdf = "my.urdf"'
                 raise InputError(f"{document.path}: {missing}")
             problem = unknown("key of a robot file" if whole else "table", key, known)
             raise document.unknown(f"{problem}{hint}", key)
@@ -127,7 +127,7 @@ def read_inputs(document: TomlFile) -> tuple[Input, ...]:
     if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
         raise document.error("input is not an array of tables; write [[input]]", "input")
     if not tables:
-        message = "holds no inputs; write [[input]] and below it its type"
+        message = "the file holds no inputs; write [[input]] and its type below"
         raise InputError(f"{document.path}: {message}")
     inputs: list[Input] = []
     seen: dict[Input | str | None, int] = {}
@@ -137,7 +137,7 @@ def read_inputs(document: TomlFile) -> tuple[Input, ...]:
         if what is not None and what in seen:
             shown = f"the name '{what}'" if isinstance(what, str) else what
             first = document.line("input", seen[what])
-            message = f"{shown} stands in line {first} already; take one out"
+            message = f"{shown} is already given in line {first}; remove one"
             raise _error(document, message, index, "name")
         seen[what] = index
         inputs.append(item)
@@ -152,8 +152,8 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
     kind = table.get("type")
     if kind is None:
         near = [key for key in table if key.lower() == "type"]
-        hint = f" ('{near[0]}' is not)" if near else ""
-        message = f"has no key 'type'{hint}; give one of {', '.join(_TYPES)}"
+        hint = f", but has '{near[0]}'" if near else ""
+        message = f"has no key 'type'{hint}; set it to one of {', '.join(_TYPES)}"
         raise _error(document, message, index)
     if not isinstance(kind, str) or kind not in _TYPES:
         shown = kind if isinstance(kind, str) else reprlib.repr(kind)

@@ -1,4 +1,4 @@
-"""What acts on a robot: the inputs u of the linear model, in any mix and order."""
+"""Inputs u of the linear model: forces and torques on a robot, in any mix and order."""
 
 import math
 from abc import ABC, abstractmethod
@@ -17,7 +17,7 @@ Vector3: TypeAlias = Sequence[float]
 
 @dataclass(frozen=True)
 class Input:
-    """What every kind of input says of itself."""
+    """Base class of inputs, with their limits and names."""
 
     KEY: ClassVar[str]  # its type in a TOML file
     GROUP: ClassVar[str]  # what its inputs are called together, in weights and limits
@@ -38,16 +38,21 @@ class Input:
                 self._set(name, three_numbers(what, value) if several else number(what, value))
         for least, largest in self.ranges:
             if largest <= 0.0:
-                raise InputError(f"{self.KEY} max is {largest:g}, expected more than 0, or none")
+                raise InputError(
+                    f"{self.KEY} max is {largest:g}, expected more than 0; leave it out if there "
+                    "is no limit"
+                )
             if least > largest:
-                raise InputError(f"{self.KEY} min is {least:g}, more than its max of {largest:g}")
+                raise InputError(
+                    f"{self.KEY} min is {least:g}, expected at most its max of {largest:g}"
+                )
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
-        """(least, largest) of each of its entries; infinite where there is no limit."""
+        """(least, largest) value of each entry; infinite if there is no limit."""
         largest = np.broadcast_to(math.inf if self.max is None else self.max, len(self.ENTRIES))
         usual = -largest if self.PULLS else 0.0
         least = np.broadcast_to(usual if self.min is None else self.min, len(largest))
@@ -55,38 +60,38 @@ class Input:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frames of the model that it is fixed in."""
+        """Names of the model's frames in which this input is fixed."""
         frame: str | None = getattr(self, "frame", None)
         return () if frame is None else (frame,)
 
     def names(self, count: int) -> tuple[str, ...]:
-        """Return the names of its entries in u, where it is the count-th of its kind."""
+        """Return the names of this input's entries in u; it is number `count` of its kind."""
         return tuple(f"{self.GROUP}.{entry}" for entry in self.ENTRIES)
 
 
 class WrenchInput(Input, ABC):
-    """An input that pushes or turns a link by a wrench that is constant in a frame."""
+    """Base class of inputs whose wrench on a link is constant in a frame."""
 
     frame: str | None  # of the model, on the base or on any link; None is the base's root frame
     name: str | None
 
     def names(self, count: int) -> tuple[str, ...]:
-        """Return its name in u; thruster_1, wheel_1 and so on where it has none of its own."""
+        """Return the input's name in u: the given one, or thruster_1, wheel_1, ... by default."""
         return (self.name or f"{self.KEY.rpartition('_')[2]}_{count}",)
 
     @property
     @abstractmethod
     def wrench(self) -> Array:
-        """Force [N] and torque [N m] about the frame's origin (6,) of a unit, in the frame."""
+        """Force [N] and torque [N m] (6,) of a unit input, about the frame's origin in its axes."""
 
 
 class BaseTorque(Input):
-    """Torque tau_b (3) [N m] on the base, in the axes that the velocity frame says.
+    """Torque tau_b (3,) [N m] on the base, in the axes of the chosen velocity frame.
 
     Parameters
     ----------
     max, min : float or sequence of float (3,), optional
-        Limits [N m] of each of its entries, as for every input; by keyword.
+        Limits [N m] of each entry; keyword only. Every kind of input has them.
 
     Examples
     --------
@@ -99,12 +104,12 @@ class BaseTorque(Input):
 
 
 class BaseForce(Input):
-    """Force F_b (3) [N] at the base origin, in the axes that the velocity frame says.
+    """Force F_b (3,) [N] at the base origin, in the axes of the chosen velocity frame.
 
     Parameters
     ----------
     max, min : float or sequence of float (3,), optional
-        Limits [N] of each of its entries; by keyword.
+        Limits [N] of each entry; keyword only.
 
     Examples
     --------
@@ -118,14 +123,14 @@ class BaseForce(Input):
 
 @dataclass(frozen=True)
 class JointTorque(Input):
-    """Torque [N m], or force [N], of the motor of one joint.
+    """Torque [N m] or force [N] of the motor of one joint.
 
     Parameters
     ----------
     joint : str
-        An independent joint. What mimics it is driven with it.
+        Name of an independent joint. Its mimic joints are driven with it.
     max, min : float, optional
-        Limits [N m | N] in place of the URDF's effort; by keyword.
+        Limits [N m | N], which replace the effort limit of the URDF; keyword only.
 
     Examples
     --------
@@ -138,32 +143,33 @@ class JointTorque(Input):
     joint: str
 
     def names(self, count: int) -> tuple[str, ...]:
-        """Return its name in u."""
+        """Return the input's name in u, ``tau_m.JOINT``."""
         return (f"{self.GROUP}.{self.joint}",)
 
 
 @dataclass(frozen=True)
 class Thruster(WrenchInput):
-    """Force [N] along a direction that is fixed in a frame, at a point fixed in that frame.
+    """Force [N] of a thruster, with point of action and direction fixed in a frame.
 
     Parameters
     ----------
     frame : str
         Frame of the model, on the base or on any link.
     position : sequence of float (3,)
-        Where it pushes [m], in that frame.
+        Point [m] where the force acts, in that frame.
     direction : sequence of float (3,)
-        Along which the link is pushed, in that frame; of any length but zero.
+        Direction of the force on the link, in that frame; any length except zero.
     name : str, optional
         Name of the input; thruster_1, thruster_2, ... by default.
     max, min : float, optional
-        Limits [N]; a thruster never pulls. By keyword, as what follows.
+        Limits [N], at least 0: a thruster never pulls. Keyword only, like all that follow.
     on_off : bool
-        Whether it knows `max` and nothing else: in `simulate` the command of a sample becomes a
-        pulse of `max` for its share of the sample, in whole steps; what is left over is carried
-        to the next sample, so that the impulse is right in the mean.
+        Whether the thruster can only fire with `max` or be off. `simulate` then turns the command
+        of each sample into one pulse of `max`, a whole number of steps long. The remaining
+        impulse is carried over to the next sample, so that the mean impulse is correct.
     least_impulse : float, optional
-        [N s] of a sample, below which it does not fire; that is carried over too.
+        Smallest impulse of a sample [N s]. Below it the thruster does not fire, and the impulse
+        is carried over to the next sample.
 
     Examples
     --------
@@ -184,53 +190,61 @@ class Thruster(WrenchInput):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.ranges[0][0] < 0.0:
-            raise InputError(f"thruster min is {self.min}, expected 0 or more: it never pulls")
+            raise InputError(
+                f"thruster min is {self.min}, expected 0 or more: a thruster never pulls"
+            )
         if truth("thruster on_off", self.on_off) and (self.max is None or self.min):
-            raise InputError("thruster on_off is set: it needs a max, which it pushes with, no min")
+            raise InputError(
+                "thruster on_off is set, but max is missing or min is not 0; give max, the force "
+                "of a pulse, and leave min out"
+            )
         if (impulse := self.least_impulse) is not None:
             self._set("least_impulse", _positive("thruster least_impulse", impulse, "N s"))
         self._set("position", three_numbers("thruster position", self.position))
-        self._set("direction", _unit("thruster direction", self.direction, "where it pushes"))
+        self._set(
+            "direction", _unit("thruster direction", self.direction, "the direction of its force")
+        )
 
     @property
     def wrench(self) -> Array:
-        """Force [N] and torque [N m] about the frame's origin (6,) of a unit, in the frame."""
+        """Force [N] and torque [N m] (6,) of a unit input, about the frame's origin in its axes."""
         return np.concatenate((self.direction, np.cross(self.position, self.direction)))
 
 
 @dataclass(frozen=True)
 class ReactionWheel(WrenchInput):
-    r"""Motor torque [N m] of a balanced wheel that turns about an axis fixed on a link.
+    r"""Motor torque [N m] of a balanced reaction wheel, whose axis is fixed on a link.
 
-    The torque u acts on the wheel along the axis a, and -u on the link that carries it: its power
-    is u times the speed of the wheel relative to that link. The carrier's mass and inertia in the
-    URDF count the wheel, as if it were welded.
+    The torque u acts on the wheel along the axis a, and -u on the link that carries the wheel. The
+    power is u times the speed of the wheel relative to this link. Mass and inertia of the carrier
+    in the URDF must include the wheel, as if it were welded.
 
-    With an ``inertia`` the speed of the wheel is a state: the robot has one more joint, a
-    continuous one of the wheel's name, after all joints that hang on its carrier. J a a^T goes
-    from the carrier's inertia to the wheel's; mass and transverse inertia stay where they are.
+    With an ``inertia`` J, the speed of the wheel is a state. The robot has one more joint, a
+    continuous joint with the wheel's name. In the state it follows all joints that its carrier
+    carries. J a a^T moves from the carrier's inertia to the wheel; mass and transverse inertia
+    stay with the carrier.
 
-    Without, the wheel is no joint: it turns its carrier by -u a, and where it spins, by the
-    gyroscopic torque :math:`-\omega \times h a` of its ``momentum`` h. That is the limit of a
-    small and fast wheel: h is constant, also where u is not zero, and its carrier keeps J.
+    Without ``inertia``, the wheel is not a joint. The carrier feels the torque -u a, and the
+    gyroscopic torque :math:`-\omega \times h a` of the wheel's ``momentum`` h. This is the limit
+    of a small and fast wheel: h is constant even if u is not zero, and the carrier keeps J.
 
     Parameters
     ----------
     axis : sequence of float (3,)
-        What it turns about, in that frame; of any length but zero.
+        Rotation axis, in the axes of `frame`; any length except zero.
     frame : str, optional
         Frame of the model, on the base or on any link; the base's root frame by default.
     inertia : float, optional
-        J [kg m^2] about the axis. The carrier must have that much, and more.
+        J [kg m^2] about the axis. The carrier's inertia about it must be larger.
     name : str, optional
         Name of the input, and of the joint if there is one; wheel_1, wheel_2, ... by default.
     momentum : float
-        h [N m s] along the axis, relative to the carrier; of a wheel without inertia.
+        h [N m s] along the axis, relative to the carrier; only for a wheel without inertia.
     max, min : float, optional
-        Limits [N m] of the motor's torque; by keyword, as what follows.
+        Limits [N m] of the motor's torque; keyword only, like all that follow.
     max_speed : float, optional
-        Largest speed [rad/s] relative to the carrier, either way, of a wheel with an inertia J:
-        it stores up to J max_speed [N m s].
+        Largest speed [rad/s] relative to the carrier, in both directions, of a wheel with inertia
+        J. The wheel stores at most J max_speed [N m s].
 
     Examples
     --------
@@ -251,30 +265,30 @@ class ReactionWheel(WrenchInput):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("axis", _unit("wheel axis", self.axis, "what it turns about"))
+        self._set("axis", _unit("wheel axis", self.axis, "the direction it turns about"))
         self._set("momentum", number("wheel momentum", self.momentum))
         if self.max_speed is not None:
             speed = _positive("wheel max_speed", self.max_speed, "rad/s")
             self._set("max_speed", speed)
             if self.inertia is None:
                 raise InputError(
-                    f"wheel max_speed is {speed:g} rad/s, but its speed is no state; give it an "
-                    "inertia too"
+                    f"wheel max_speed is {speed:g} rad/s, but the wheel has no inertia and so no "
+                    "speed in the state; give its inertia too"
                 )
         if self.inertia is None:
             return
-        hint = "; leave it out for a wheel of which only the momentum counts"
+        hint = "; leave it out to model the wheel by its momentum alone"
         inertia = _positive("wheel inertia", self.inertia, "kg m^2", hint)
         if self.momentum:
             raise InputError(
-                "wheel momentum is given beside an inertia, with which its speed is a state; leave "
-                "one out, and give the speed as a velocity of the point"
+                "wheel momentum is given together with an inertia, which makes its speed a state; "
+                "leave momentum out and give the speed in the velocity v of the point"
             )
         self._set("inertia", inertia)
 
     @property
     def wrench(self) -> Array:
-        """Force [N] and torque [N m] about the frame's origin (6,) of a unit, in the frame."""
+        """Force [N] and torque [N m] (6,) of a unit input, about the frame's origin in its axes."""
         return np.concatenate((np.zeros(3), -np.array(self.axis)))
 
 

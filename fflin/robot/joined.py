@@ -1,4 +1,4 @@
-"""Two robots welded into one: the second hangs on a frame of the first, its base gone."""
+"""Two robots welded into one: the base of the second is fixed to a frame of the first."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def _require_new_names(robot: Robot, prefix: str) -> None:
     taken = {*robot.model.names, *(frame.name for frame in robot.model.frames.tolist())}
     if any(name == prefix or name.startswith(f"{prefix}.") for name in taken):
         raise InputError(
-            f"'{robot.name}' has joints or frames named '{prefix}' already; give another prefix"
+            f"'{robot.name}' already has joints or frames named '{prefix}'; give another prefix"
         )
 
 
@@ -116,7 +116,7 @@ def _joined(
 def _in_order(
     model: pin.Model, joint: int, other: pin.Model, root: int = ROOT
 ) -> Iterator[tuple[pin.Model, int]]:
-    """Yield the joints depth first, those of the other after all that hang on the joint."""
+    """Yield the joints depth first; the other model's joints follow all that hang on the joint."""
     yield model, root
     for child in model.children[root]:
         yield from _in_order(model, joint, other, child)
@@ -141,7 +141,7 @@ def inertia_of(value: Any) -> pin.Inertia:
     least, size = np.linalg.eigvalsh(second)[0], np.trace(value.inertia)
     if not value.mass > 0.0 or least < -1e-9 * size:
         raise InputError(
-            f"payload of {value.mass:g} kg has the inertia of no rigid body; give it a mass above "
-            "0, and principal moments of which none is more than the sum of the others"
+            f"payload of {value.mass:g} kg has an inertia that is not physically realisable; give "
+            "a mass above 0, and principal moments none of which exceeds the sum of the other two"
         )
     return value

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 class Joint(NamedTuple):
-    """One joint of one degree of freedom."""
+    """Joint with one degree of freedom."""
 
     name: str  # in the model
     idx_q: int  # where it begins in Pinocchio's q, and in v
@@ -23,35 +23,35 @@ class Joint(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Unit of its position; its rate has this per second."""
+        """Unit of the joint's position; the unit of its rate is this per second."""
         return "m" if self.prismatic else "rad"
 
     @property
     def force_unit(self) -> str:
-        """Unit of the force or torque that moves it."""
+        """Unit of the joint's force or torque."""
         return "N" if self.prismatic else "N m"
 
     def place(self, q: Array, value: float) -> None:
-        """Write this joint's angle [rad] or length [m] into a configuration."""
+        """Write this joint's angle [rad] or length [m] into a configuration q (nq,)."""
         if self.unbounded:
             q[self.idx_q : self.idx_q + 2] = np.cos(value), np.sin(value)
         else:
             q[self.idx_q] = value
 
     def value(self, q: Array) -> float:
-        """Return this joint's angle [rad], of a continuous joint in (-pi, pi], or length [m]."""
+        """Return this joint's angle [rad] or length [m]; continuous joints are in (-pi, pi]."""
         if self.unbounded:
             return float(np.arctan2(q[self.idx_q + 1], q[self.idx_q]))
         return float(q[self.idx_q])
 
     def within(self, model: pin.Model) -> "Joint":
-        """Return the joint of this name where it begins in another model."""
+        """Return the joint of the same name with its offsets in another model."""
         joint = model.joints[model.getJointId(self.name)]
         return self._replace(idx_q=joint.idx_q, idx_v=joint.idx_v)
 
 
 class Follower(NamedTuple):
-    """A joint that mimics an independent one: value = multiplier * leader's value + offset."""
+    """Mimic joint, with value = multiplier * leader's value + offset."""
 
     joint: Joint
     leader: Joint
@@ -59,7 +59,7 @@ class Follower(NamedTuple):
     offset: float
 
     def place(self, q: Array) -> None:
-        """Put it where its leader in this configuration says."""
+        """Place the mimic joint by its leader's value in the configuration q (nq,)."""
         self.joint.place(q, self.multiplier * self.leader.value(q) + self.offset)
 
 

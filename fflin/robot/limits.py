@@ -1,4 +1,4 @@
-"""What a robot can do: limits of its inputs, and of the speeds and travels of its joints."""
+"""Limits of a robot's inputs, and of the speeds and positions of its joints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each link weighs in the words of the URDF's author, also where it is fixed to another."""
+"""Mass of each link as the URDF gives it, even if the link is fixed to another."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ROUNDING = 1e-9
 
 
 class LinkMass(NamedTuple):
-    """Mass [kg] of a link, its inertia (3, 3) [kg m^2], and in which axes, about which centre."""
+    """Mass [kg] of a link, and inertia (3, 3) [kg m^2] about the origin of `placement`."""
 
     mass: float
     inertia: Array
@@ -26,7 +26,7 @@ class LinkMass(NamedTuple):
 
     @classmethod
     def of(cls, link: Link) -> LinkMass:
-        """Take what a <link> says."""
+        """Return the mass properties of a <link>."""
         xx, xy, xz, yy, yz, zz = link.inertia
         turn = link.com.quaternion
         rotation = (

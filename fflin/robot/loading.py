@@ -1,4 +1,4 @@
-"""Making robots: from a file or from a model that was built by other means."""
+"""Robots loaded from a file, or made from a Pinocchio model that was built by other means."""
 
 import os
 import warnings
@@ -35,18 +35,19 @@ def load(
     Parameters
     ----------
     robot : str or Path
-        Bundled name, example-robot-data name, or path to a URDF or to a robot file, a TOML that
-        names a URDF and what else is known of the robot; see the guide. No mesh is loaded.
+        Name of a bundled robot or of example-robot-data, or path to a URDF or to a robot file. A
+        robot file is a TOML file that names a URDF and sets fields of the robot; see the guide.
+        No mesh is loaded.
     lock : mapping or iterable of str, optional
-        {joint: value [rad|m]} welded at that value (None: at neutral), or names; a name
-        may be a pattern, ``hinge_*``. What mimics a locked joint is welded with it.
+        Joints to weld: {joint: value [rad|m]} (None: at neutral), or their names. A name may be a
+        pattern, ``hinge_*``. The mimic joints of a locked joint are welded with it.
     package_dirs : sequence of path
-        Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
-        before those that the URDF lies in.
+        Folders to search for ``package://`` meshes when the robot is drawn; they are searched
+        before the folders that contain the URDF.
     **fields
         inputs, outputs, stiffness, damping, rest, gravity, orbit, limits, passive, weights, start:
-        see `Robot.replace`. What is given here goes before what a robot file says; of locks,
-        limits, springs and dampers name by name.
+        see `Robot.replace`. Fields given here take precedence over the robot file. Locks, limits,
+        springs and dampers are merged with it name by name.
 
     Returns
     -------
@@ -61,14 +62,14 @@ def load(
     FileError, UrdfError
         If the file cannot be read or is malformed.
     MissingPackageError
-        If it is a xacro and the package that expands it is not installed.
+        If the file is written in xacro and the package that expands it is not installed.
     ModelError
         If a joint has more than one degree of freedom.
 
     Warns
     -----
     FflinWarning
-        Of what the file holds and the model does not, and of what cannot be quite right in it.
+        About parts of the file that the model does not contain, and about likely errors in it.
 
     Examples
     --------
@@ -106,7 +107,7 @@ def load(
 
 
 def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
-    """Return a robot with fields, those of joints beside what it has of others."""
+    """Return a robot with new fields; fields of joints are merged with the robot's."""
     if not fields:
         return robot
     if robot.passive and isinstance(given := fields.get("passive"), list | tuple):
@@ -149,18 +150,18 @@ def _load(
 def from_model(
     model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: Any
 ) -> Robot:
-    """Take a Pinocchio model built by other means (MJCF, SDF, code).
+    """Make a robot from a Pinocchio model that was built by other means (MJCF, SDF, code).
 
     Parameters
     ----------
     model : pin.Model
-        Model whose one root joint is a free-flyer. It is copied; gravity of the copy is zero.
+        Model whose only root joint is a free-flyer. The model is copied; the copy has no gravity.
     name : str, optional
-        Name of the robot; the model's own by default.
+        Name of the robot; the model's name by default.
     lock : mapping or iterable of str, optional
         As in `load`.
     **fields
-        As in `load`. Of damping="urdf" the model's own ``damping`` is taken.
+        As in `load`. With damping="urdf", the ``damping`` of the model is used.
 
     Returns
     -------
@@ -169,9 +170,12 @@ def from_model(
     Raises
     ------
     ModelError
-        If the root is not one free-flyer, a joint has more than one degree of freedom, the
-        joints are not in depth-first order, in which CRBA would be silently wrong, or a
-        placement, a body or an armature is not physical.
+        If one of these holds:
+
+        - the root is not a single free-flyer;
+        - a joint has more than one degree of freedom;
+        - the joints are not in depth-first order, so that CRBA would be silently wrong;
+        - a placement, a body or an armature is not physical.
 
     Examples
     --------
@@ -183,7 +187,7 @@ def from_model(
     if not isinstance(model, pin.Model):
         raise ModelError(f"the model is a {type(model).__name__}, expected a pin.Model")
     if name is not None and not isinstance(name, str):
-        raise InputError(f"name is a {type(name).__name__}, expected a word")
+        raise InputError(f"name is a {type(name).__name__}, expected a string")
     copy = model.copy()
     copy.gravity.setZero()
     name = name or model.name or "model"

@@ -1,4 +1,4 @@
-"""Welding joints where they stand: of a model that is read, and of a robot whose joint jams."""
+"""Welding of joints at given values, in a model that is read or for a joint that jams."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
         if getattr(item, "joint", names[0]) not in gone
     ]
     if not inputs:
-        raise InputError(f"without {', '.join(values)} no input is left; a model needs one")
+        raise InputError(
+            f"without {', '.join(values)} the robot has no input; a model needs at least one"
+        )
     outputs = [
         replace(each, joints=tuple(x for x in each.joints if x not in gone))
         if isinstance(each, JointOutput) and each.joints

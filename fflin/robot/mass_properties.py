@@ -1,8 +1,9 @@
-r"""Models with other masses, whose bodies are rigid bodies.
+r"""Models with changed masses, whose bodies stay physically realisable.
 
-A body of mass m, centre of mass c and inertia I about it is a distribution of mass with the second
-moments :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. It exists if and only if its pseudo-inertia
-is positive (semi)definite, that is m and Sigma are (Wensing, Kim and Slotine, Linear matrix
+A body has mass m, centre of mass c and inertia I about c. With the identity matrix E, the second
+moments of its mass distribution are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The body is
+physically realisable if and only if its pseudo-inertia is positive (semi)definite, that is if m
+and Sigma are (Wensing, Kim and Slotine, Linear matrix
 inequalities for physically-consistent inertial parameter identification, IEEE Robotics and
 Automation Letters 3(1), 2018).
 """
@@ -46,10 +47,12 @@ def with_bodies(robot: Any, bodies: Any) -> Any:
         if name in several:
             raise InputError(
                 f"'{name}' is one of several links of the body '{body}': "
-                f"{listed(links[index])}; give that body as a whole"
+                f"{listed(links[index])}; give the properties of the whole body '{body}'"
             )
         if done.setdefault(index, value) is not value:
-            raise InputError(f"the body '{body}' is given twice, as '{name}' too; give it once")
+            raise InputError(
+                f"the body '{body}' is given twice, once under the name '{name}'; give it once"
+            )
         new.inertias[index] = _given(name, value, model.inertias[index])
     return _of_model(robot, new)
 
@@ -80,14 +83,17 @@ def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
             "about the centre of mass"
         )
     if np.abs(inertia - inertia.T).max() > _SYMMETRIC * np.abs(inertia).max():
-        raise InputError(f"inertia {of} is not symmetric")
+        raise InputError(f"inertia {of} is not symmetric; give a symmetric matrix (3, 3)")
     inertia = 0.5 * (inertia + inertia.T)
     least, middle, largest = np.linalg.eigvalsh(inertia).tolist()
     moments = f"inertia {of} has principal moments {least:.3g}, {middle:.3g}, {largest:.3g} kg m^2"
     if is_impossible(mass, (least, middle, largest)):
-        raise InputError(f"{moments}; none can be negative")
+        raise InputError(f"{moments}; expected values of 0 or more")
     if largest - middle - least > TRIANGLE_SLACK * largest:
-        raise InputError(f"{moments}; of a body none is more than the sum of the others")
+        raise InputError(
+            f"{moments}, which is not physically realisable; none may exceed the sum of the "
+            "other two"
+        )
     return pin.Inertia(mass, com, inertia)
 
 

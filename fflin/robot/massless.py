@@ -1,4 +1,4 @@
-"""What of a robot can move without moving mass at every configuration, so that M is singular."""
+"""Coordinates that move no mass at any configuration, so that M is singular."""
 
 from collections.abc import Sequence
 from weakref import WeakKeyDictionary
@@ -26,7 +26,7 @@ _INVOLVED = 0.1
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:
-    """Name what can move together without moving mass, at every configuration; nothing mostly."""
+    """Return the coordinates that can move together without moving mass; usually none."""
     # The energy vanishes only if the velocity of every mass, every turn that has inertia and every
     # rate that has an armature do: a question of geometry, decided without the masses, whose
     # rounding could hide it.
@@ -72,11 +72,11 @@ def coordinate_names(robot: Robot) -> list[str]:
 
 
 def massless_note(robot: Robot) -> str:
-    """Say what of a robot can move without moving mass, and what to do about it."""
+    """Return the message about coordinates that can move without moving mass."""
     idle = listed(idle_coordinates(robot))
     return (
         f"M of '{robot.name}' cannot be inverted at any configuration: {idle} can move without "
-        "moving mass; give the links an inertia, or lock what needs none"
+        "moving mass; give their links an inertia, or lock the joints"
     )
 
 

@@ -1,4 +1,4 @@
-"""What a Pinocchio model must hold before anything is computed, and whether it was changed."""
+"""Checks of a Pinocchio model before anything is computed, and of changes made to it later."""
 
 from collections.abc import Iterator
 
@@ -23,8 +23,8 @@ def check_root(model: pin.Model, name: str) -> None:
     fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
     if fixed:
         raise ModelError(
-            f"'{name}': joint '{fixed[0]}' hangs on the world beside the free-flyer; "
-            "everything that moves must hang on one base"
+            f"'{name}': joint '{fixed[0]}' hangs on the world, not on the free-flyer; connect "
+            "every moving link to the one base"
         )
 
 
@@ -41,7 +41,7 @@ def joint_of(model: pin.Model, index: int) -> Joint:
     if joint.nv != 1 or joint.nq not in (1, 2):
         raise ModelError(
             f"joint '{name}' is a {kind.removeprefix('JointModel')} of {joint.nv} "
-            f"degrees of freedom, expected one; lock it (lock=['{name}'])"
+            f"degrees of freedom, expected 1; lock it with lock=['{name}']"
         )
     return Joint(name, joint.idx_q, joint.idx_v, joint.nq == 2, kind.startswith("JointModelP"))
 
@@ -54,8 +54,8 @@ def check_order(model: pin.Model, name: str) -> None:
             above.pop()
         if joint and not above:
             raise ModelError(
-                f"'{name}': the joints are not in depth-first order, in which Pinocchio's CRBA is "
-                "wrong; add the joints of one branch before those of the next"
+                f"'{name}': the joints are not in depth-first order, which makes Pinocchio's CRBA "
+                "wrong; add all joints of one branch before the joints of the next"
             )
         above.append(joint)
 
@@ -82,15 +82,15 @@ def _of_joint(model: pin.Model, index: int) -> Iterator[str]:
     if not np.isfinite(placement.homogeneous).all():
         yield "has a placement that is not finite"
     if not is_rotation(placement.rotation):
-        yield "has a placement whose rotation is none: R^T R and det R must be 1"
+        yield "has a placement whose matrix R is not a rotation: R^T R must be I and det R 1"
     if not (np.isfinite(body.mass) and body.mass >= 0.0):
-        yield f"carries a mass of {body.mass:g} kg, expected one not below 0"
+        yield f"carries a mass of {body.mass:g} kg, expected 0 or more"
     if not (np.isfinite(body.lever).all() and np.isfinite(body.inertia).all()):
         yield "carries a body whose inertia or centre of mass is not finite"
     moments = np.linalg.eigvalsh(body.inertia).tolist()
     if is_impossible(body.mass, moments):
         shown = ", ".join(f"{moment:.3g}" for moment in moments)
-        yield f"carries a body of principal moments {shown} kg m^2; none can be negative"
+        yield f"carries a body of principal moments {shown} kg m^2, expected 0 or more"
     joint = model.joints[index]
     for value in model.armature[joint.idx_v : joint.idx_v + joint.nv].tolist():
         if not (np.isfinite(value) and value >= 0.0):

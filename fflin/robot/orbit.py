@@ -1,4 +1,4 @@
-"""A circular orbit, in whose rotating frame a robot flies."""
+"""Circular orbits, with the rotating frame in which a robot is described."""
 
 from __future__ import annotations
 
@@ -32,43 +32,48 @@ _FOLLOWS: Any = None  # from the others
 
 @dataclass(frozen=True)
 class CircularOrbit:
-    r"""A circular orbit about a central body.
+    r"""Circular orbit about a central body.
 
-    Its point falls freely, and a robot of this orbit is described relative to a frame that goes
-    and turns with it: ``lvlh`` (x along the orbit, y against its normal, z to the body) or
-    ``hill`` (x away from the body, y along, z normal). Pinocchio's world is that frame, and
-    velocities are relative to it. What pulls at distance x from the point is linear in x,
-    :math:`n^2 (3 r r^T - E) x` per mass, with r the unit vector away from the body: the error is
-    of the order of x over the orbit's radius.
+    The robot is described relative to a frame whose origin moves along the orbit in free fall.
+    The frame rotates with the orbit. Its axes are one of
+
+    - ``lvlh``: x along the orbit, y against the orbit normal, z towards the central body;
+    - ``hill``: x away from the central body, y along the orbit, z along the orbit normal.
+
+    Pinocchio's world is this frame, and velocities are relative to it. The gravity gradient is
+    linear in the position x relative to the origin: the force per mass is
+    :math:`n^2 (3 r r^T - E) x`, with the unit vector r away from the central body and the identity
+    E. The relative error is of the order of the distance divided by the orbit's radius.
 
     Parameters
     ----------
     altitude : float, optional
-        Above the surface [m]; `FflinWarning` where kilometres or a radius seem to be meant.
+        Height above the surface [m]. An `FflinWarning` is issued if the value looks like
+        kilometres or like a radius.
     mean_motion : float, optional
-        n [rad/s], instead of the altitude.
+        Mean motion n [rad/s], instead of the altitude.
     body : str
-        "earth", "moon", "mars", "venus", "mercury", "jupiter", "saturn"; or any name, for a body
-        whose `mu` and `body_radius` are given.
+        "earth", "moon", "mars", "venus", "mercury", "jupiter" or "saturn"; any other name needs
+        `mu` and `body_radius`.
     mu, body_radius : float, optional
-        The body's gravitational parameter [m^3/s^2] and radius [m].
+        Gravitational parameter [m^3/s^2] and radius [m] of the central body.
 
     Attributes
     ----------
     altitude, mean_motion, body, mu, body_radius
-        As above, each of them known.
+        As above; all of them have values, given or computed.
     radius : float
-        Of the orbit [m].
+        Radius of the orbit [m].
     period : float
-        2 pi / n [s].
+        Period 2 pi / n [s].
 
     Raises
     ------
     InputError
-        If not just one of altitude and mean motion is given, a value is not positive, or the orbit
-        is below the surface.
+        If both or neither of altitude and mean motion are given, a value is not positive, or the
+        orbit is below the surface.
     UnknownNameError
-        If there is no such body.
+        If the central body is unknown.
 
     Examples
     --------
@@ -92,14 +97,15 @@ class CircularOrbit:
         if not isinstance(self.body, str):
             raise InputError(f"body is {self.body!r}, expected a name such as 'earth'")
         if (self.mu is None) != (self.body_radius is None):
-            raise InputError("an orbit about another body needs both mu and body_radius; give both")
+            raise InputError("only one of mu and body_radius is given; give both or neither")
         if self.mu is None and self.body not in BODIES:
             raise unknown("central body", self.body, BODIES)
         given = [value for value in (self.altitude, self.mean_motion) if value is not None]
         if len(given) != 1:
             said = "both are" if given else "neither is"
             raise InputError(
-                f"an orbit has an altitude [m] or a mean motion [rad/s], and {said} given; give one"
+                f"an orbit needs an altitude [m] or a mean motion [rad/s], but {said} given; give "
+                "exactly one"
             )
         size = self.mu, self.body_radius
         mu, ground = (
@@ -116,16 +122,17 @@ class CircularOrbit:
         if not 0.0 < altitude < 1e15:
             raise InputError(
                 f"an altitude of {altitude:g} m over {self.body} is "
-                f"{'no orbit about it' if altitude > 0.0 else 'at or below the surface'}; expected "
-                f"more than 0 and a mean motion below {math.sqrt(mu / ground) / ground:.4g} rad/s"
+                f"{'too high for an orbit' if altitude > 0.0 else 'at or below the surface'}; give "
+                "an altitude above 0, or a mean motion below "
+                f"{math.sqrt(mu / ground) / ground:.4g} rad/s"
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
             above, said = altitude - ground, ""
             if altitude < _BARE.get(self.body, _AIR):
-                said = "altitudes are in metres, 400 km is 400e3"
+                said = "altitudes are in metres: write 400 km as 400e3"
             elif self.body == "earth" and _LOW_ORBITS[0] <= above <= _LOW_ORBITS[1]:
-                said = f"if that is the orbit's radius, its altitude is {above:.8g} m"
+                said = f"if you mean the orbit's radius, the altitude is {above:.8g} m"
             if said and self.mu is None:  # not of an asteroid, nor of an orbit that was saved
                 said = f"an altitude of {altitude:.8g} m over {self.body}: {said}"
                 warnings.warn(said, FflinWarning, stacklevel=3)
@@ -135,7 +142,7 @@ class CircularOrbit:
 
     @property
     def radius(self) -> float:
-        """Of the orbit [m]."""
+        """Radius of the orbit [m]."""
         return self.body_radius + self.altitude
 
     @property
@@ -144,12 +151,12 @@ class CircularOrbit:
         return 2.0 * math.pi / self.mean_motion
 
     def to_json(self) -> str:
-        """Return it as text."""
+        """Return the orbit as JSON text."""
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> CircularOrbit:
-        """Return the same one, to the last bit, of its text."""
+        """Return the orbit that `to_json` wrote, bit for bit."""
         parts = json.loads(text)
         n = parts.pop("mean_motion")
         orbit = cls(**parts)

@@ -1,7 +1,7 @@
-"""What is watched of a robot: the outputs y of the linear model, in any mix and order.
+"""Outputs y of the linear model: measured quantities of a robot, in any mix and order.
 
-Reference axes are those of the reference placement that the state is relative to. What a kind
-measures, and its slopes, stand in `fflin.dynamics.output_kinds`.
+Reference axes are the axes of the reference placement that the state is relative to. The module
+`fflin.dynamics.output_kinds` holds the measured value of each kind and its derivatives.
 """
 
 from dataclasses import dataclass, fields
@@ -12,7 +12,7 @@ from fflin.base.errors import InputError, unknown
 
 @dataclass(frozen=True)
 class Output:
-    """What every kind of output says of itself."""
+    """Base class of outputs, with their names and units."""
 
     # What it is called on a command line.
     WORD: ClassVar[str]
@@ -23,30 +23,30 @@ class Output:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frames of the model that it measures, or measures from."""
+        """Names of the model's frames that the output depends on."""
         return ()
 
     @property
     def signals(self) -> list[tuple[str, str]]:
-        """(name, unit) of each component, without those that are states."""
+        """(name, unit) of each component that is not a state."""
         prefix = "/".join(self.frames) + "." * bool(self.frames)
         return [(f"{prefix}{name}.{axis}", unit) for name, unit in self.VECTORS for axis in "xyz"]
 
 
 @dataclass(frozen=True)
 class FrameOutput(Output):
-    """An output of frames of the model, on the base or on any link: its fields name them."""
+    """Base class of outputs of one or two frames of the model, on the base or on any link."""
 
     frame: str
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frames of the model that it measures, or measures from."""
+        """Names of the model's frames that the output depends on."""
         return tuple(getattr(self, item.name) for item in fields(self))
 
 
 class FullState(Output):
-    """Every state, under its own name, in the order and axes of the state.
+    """Output of all states, with the names, order and axes of the state.
 
     Examples
     --------
@@ -61,7 +61,7 @@ class FullState(Output):
 
 
 class BasePose(Output):
-    """Attitude q_b (3) [1] and position r_b (3) [m] of the base, the states.
+    """Output of the base pose states: attitude q_b (3,) [1] and position r_b (3,) [m].
 
     Examples
     --------
@@ -75,7 +75,7 @@ class BasePose(Output):
 
 @dataclass(frozen=True)
 class JointOutput(Output):
-    """An output of joints: all of them where none is named."""
+    """Base class of outputs of joints, by default of all joints."""
 
     joints: tuple[str, ...] | None = None
 
@@ -83,17 +83,16 @@ class JointOutput(Output):
         # A string is a sequence of names of one letter each.
         if isinstance(self.joints, str):
             given = repr(self.joints)
-            raise InputError(f"joints is {given}, expected a tuple of names, ({given},)")
+            raise InputError(f"joints is {given}, expected a tuple of names: write ({given},)")
 
 
 class JointPositions(JointOutput):
-    """Angles [rad] or lengths [m] of joints, the states.
+    """Output of joint position states: angles [rad] or lengths [m].
 
     Parameters
     ----------
     joints : tuple of str, optional
-        Independent joints, or patterns, in the order wanted; all of them, in state order, by
-        default.
+        Independent joints, or patterns, in the wanted order; by default all, in state order.
 
     Examples
     --------
@@ -106,13 +105,12 @@ class JointPositions(JointOutput):
 
 
 class JointVelocities(JointOutput):
-    """Rates [rad/s] or [m/s] of joints, the states.
+    """Output of joint velocity states: rates [rad/s] or [m/s].
 
     Parameters
     ----------
     joints : tuple of str, optional
-        Independent joints, or patterns, in the order wanted; all of them, in state order, by
-        default.
+        Independent joints, or patterns, in the wanted order; by default all, in state order.
 
     Examples
     --------
@@ -125,15 +123,16 @@ class JointVelocities(JointOutput):
 
 
 class FramePose(FrameOutput):
-    """Pose of a frame of the model, on the base or on any link.
+    """Output of the pose of a frame, on the base or on any link.
 
-    Position (3) [m] of its origin relative to the reference, in reference axes, and rotation
-    vector (3) [rad] from its attitude R* at the point of linearisation, log(R*^T R), in the
-    frame's own axes: zero at the point.
+    - Position (3,) [m] of the frame's origin relative to the reference, in reference axes.
+    - Rotation vector (3,) [rad], log(R*^T R), from the frame's attitude R* at the point of
+      linearisation, in the frame's own axes. It is zero at that point.
 
     Parameters
     ----------
     frame : str
+        Name of the measured frame.
 
     Examples
     --------
@@ -147,14 +146,18 @@ class FramePose(FrameOutput):
 
 
 class FrameVelocity(FrameOutput):
-    """Velocity of a frame of the model, with the axes of the hybrid velocity of the base.
+    """Output of the velocity of a frame, with the axis convention of the hybrid base velocity.
 
-    Angular velocity (3) [rad/s] in the frame's own axes, and velocity (3) [m/s] of its origin,
-    in reference axes: the rates of `FramePose` at the point, whatever the frame of the state.
+    - Angular velocity (3,) [rad/s], in the frame's own axes.
+    - Velocity (3,) [m/s] of the frame's origin, in reference axes.
+
+    At the point of linearisation they are the time derivatives of `FramePose`, in every velocity
+    frame of the state.
 
     Parameters
     ----------
     frame : str
+        Name of the measured frame.
 
     Examples
     --------
@@ -169,17 +172,19 @@ class FrameVelocity(FrameOutput):
 
 @dataclass(frozen=True)
 class RelativePose(FrameOutput):
-    """Pose of a frame as seen from another, wherever the base is.
+    """Output of the pose of one frame relative to another, independent of the base pose.
 
-    Position (3) [m] of its origin from that of the other, in the other's axes, and rotation vector
-    (3) [rad] of the relative attitude from that at the point of linearisation, log(R*^T R), in
-    the frame's own axes: zero at the point.
+    - Position (3,) [m] of the origin of `frame` relative to the origin of `to`, in the axes of
+      `to`.
+    - Rotation vector (3,) [rad], log(R*^T R), from the relative attitude R* at the point of
+      linearisation, in the axes of `frame`. It is zero at that point.
 
     Parameters
     ----------
     frame : str
+        Name of the measured frame.
     to : str
-        The frame that sees it.
+        Name of the frame from which it is measured.
 
     Examples
     --------
@@ -194,7 +199,7 @@ class RelativePose(FrameOutput):
 
 
 class CenterOfMass(Output):
-    """Position (3) [m] of the centre of mass relative to the reference, in reference axes.
+    """Output of the position (3,) [m] of the centre of mass from the reference, in its axes.
 
     Examples
     --------
@@ -208,10 +213,10 @@ class CenterOfMass(Output):
 
 
 class Momentum(Output):
-    """Momentum of the whole robot, in reference axes.
+    """Output of the momentum of the whole robot, in reference axes.
 
-    Angular momentum (3) [N m s] about the centre of mass, that of every wheel included, and
-    linear momentum (3) [N s].
+    - Angular momentum (3,) [N m s] about the centre of mass, including all wheels.
+    - Linear momentum (3,) [N s].
 
     Examples
     --------
@@ -225,11 +230,12 @@ class Momentum(Output):
 
 
 class Gyroscope(FrameOutput):
-    """What a gyroscope measures: angular velocity (3) [rad/s] of a frame, in its own axes.
+    """Output of a gyroscope: angular velocity (3,) [rad/s] of a frame, in its own axes.
 
     Parameters
     ----------
     frame : str
+        Frame in which the sensor is mounted.
 
     Examples
     --------
@@ -243,14 +249,15 @@ class Gyroscope(FrameOutput):
 
 
 class Accelerometer(FrameOutput):
-    """What an accelerometer measures: specific force (3) [m/s^2], in its own axes.
+    """Output of an accelerometer: specific force (3,) [m/s^2] of a frame, in its own axes.
 
-    The acceleration of the frame's origin less gravity: zero in free fall where nothing turns
-    or pushes, and +g upwards where it stands still.
+    The specific force is the acceleration of the frame's origin minus gravity. It is zero in free
+    fall without rotation and thrust, and +g upwards at rest.
 
     Parameters
     ----------
     frame : str
+        Frame in which the sensor is mounted.
 
     Examples
     --------
@@ -282,12 +289,12 @@ def parse_output(text: str) -> tuple[Output, ...]:
         return (kind((rest,)),)
     if not issubclass(kind, FrameOutput):
         if colon:
-            raise InputError(f"output '{text}' is of the whole robot; write {word}")
+            raise InputError(f"output '{text}' names a frame, but {word} takes none; write {word}")
         return (kind(),)
     wanted = [item.name for item in fields(kind)]
     names = rest.split(":", len(wanted) - 1)
     if len(names) != len(wanted) or not all(names):
         form = ":".join((word, "NAME", *(name.upper() for name in wanted[1:])))
         missing = "no frame" if len(wanted) == 1 else "fewer than two frames"
-        raise InputError(f"output '{text}' is of {missing}; write {form}")
+        raise InputError(f"output '{text}' names {missing}; write {form}")
     return tuple(kind(*names) for kind in kinds[word])

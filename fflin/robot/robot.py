@@ -1,4 +1,4 @@
-"""The robot that every other call speaks of: a free-flyer root and n one-degree joints."""
+"""Robot: a free-flyer root joint and n joints with one degree of freedom."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fflin.robot.wheels import stored_momentum, with_inputs
 
 
 class Springs(NamedTuple):
-    """What springs and dampers do: -stiffness (q_m - rest) - damping qdot_m, each (n,)."""
+    """Springs and dampers of the force -stiffness (q_m - rest) - damping qdot_m, each (n,)."""
 
     stiffness: Array
     damping: Array
@@ -33,59 +33,60 @@ class Springs(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot(Coordinates):
-    """A robot floating free; made by `load` or `from_model`.
+    """Free-floating robot, made by `load` or `from_model`.
 
     Attributes
     ----------
     model : pin.Model
-        Free-flyer root joint, zero gravity; its mimic joints are joints like the others, and so
-        are the wheels with an inertia among the inputs. To be read: a robot whose model was
-        changed is refused, see `from_model`.
+        Pinocchio model with a free-flyer root joint and zero gravity. Mimic joints are ordinary
+        joints in it, and so are input wheels with an inertia. Do not change it: a robot whose
+        model was changed is refused. Make a new robot with `from_model` instead.
     name : str
-        Name or file stem it was loaded by.
+        Name or file stem by which the robot was loaded.
     urdf : Path or None
-        The file it was read from.
+        File from which the robot was read.
     urdf_sha256 : str
-        Hash of that file, and of the masses where they are others; empty where there is none.
+        Hash of this file, and of the masses if they were changed; empty if there is no file.
     joints : tuple of Joint
-        The n independent joints in state order, which is Pinocchio's.
+        The n independent joints in state order, which is Pinocchio's order.
     followers : tuple of Follower
         The mimic joints, each with the independent joint that it follows.
     notes : tuple of str
-        What was warned of when it was read.
+        Warnings that were issued when the robot was read.
     locked : tuple of str
-        "joint=value" [rad|m] of the joints that were welded.
+        "joint=value" [rad|m] of each welded joint.
     urdf_damping : mapping
-        {joint: viscous damping [N m s/rad | N s/m]} as its file says, what follows a joint
-        counted with it; part of the model only if `damping` is "urdf".
+        {joint: viscous damping [N m s/rad | N s/m]} from the file, including the damping of the
+        joint's mimic joints. It is part of the model only if `damping` is "urdf".
     inputs : tuple of Input
-        What acts on it; the base's torque and force and every joint's by default.
+        Inputs of the robot; by default torque and force on the base and the torque of every joint.
     outputs : tuple of Output
-        What is watched of it; the full state by default.
+        Measured outputs of the robot; by default the full state.
     stiffness, damping : mapping
         {joint: value [N m/rad | N/m], [N m s/rad | N s/m]} of springs and dampers.
     rest : mapping
-        {joint: position [rad|m]} where a spring is relaxed; 0 where not named.
+        {joint: position [rad|m]} at which a spring is relaxed; 0 for joints not named.
     gravity : tuple of float (3,)
-        Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has none.
+        Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has no gravity.
     orbit : CircularOrbit or None
-        What it circles; Pinocchio's world is then the orbit's frame, see `CircularOrbit`.
+        Orbit of the robot; Pinocchio's world is then the orbit's frame, see `CircularOrbit`.
     package_dirs : tuple of Path
-        Folders in which ``package://`` paths of meshes are looked up when it is drawn.
+        Folders that are searched for ``package://`` meshes when the robot is drawn.
     passive : tuple of str
         Joints without a motor.
     weights : mapping
-        What `lqr` weighs by default, where it is not the rule's: see `replace`.
+        Default weights of `lqr` that replace the rule's: see `replace`.
     start : mapping
-        Where `simulate` and `visualize` begin by default: see `replace`.
+        Default initial state of `simulate` and `visualize`: see `replace`.
     limits : mapping
-        {name of an input or state: (least, largest)} in place of what the URDF and the inputs say.
+        {name of an input or state: (least, largest)}, which replaces the limits of the URDF and
+        of the inputs.
     links : mapping
-        {link: LinkMass} of those that weigh something, as the URDF has them.
+        {link: LinkMass} of all links with mass, as the URDF gives them.
     file_joints : tuple of str
-        All joints, fixed ones too, as its file has them.
+        All joints of the file, including fixed joints.
     attached : tuple of (str, Robot)
-        What it has grasped, each with the prefix of its names.
+        Grasped robots, each with the prefix of its names.
 
     Examples
     --------
@@ -139,35 +140,35 @@ class Robot(Coordinates):
         Parameters
         ----------
         inputs : sequence of Input
-            What acts on it, in the order of u. Wheels with an inertia among them become joints
-            of the robot; those that it had before and that are not among them go. The joint of
-            a `JointTorque` may be a pattern, ``*``, for all that it fits and that have a motor.
+            Inputs of the robot, in the order of u. Wheels with an inertia become joints of the
+            robot; previous wheels that are not among the new inputs are removed. The joint of a
+            `JointTorque` may be a pattern, ``*``, for all matching joints that have a motor.
         outputs : sequence of Output
-            What is watched of it, in the order of y.
+            Measured outputs of the robot, in the order of y.
         stiffness : mapping or float
-            {joint: K [N m/rad | N/m]}, or one for all joints but wheels. A name may be a
-            pattern, ``hinge_*``, here and below.
+            {joint: K [N m/rad | N/m]}, or one value for all joints except wheels. A name may be
+            a pattern, ``hinge_*``, here and below.
         damping : mapping, float or "urdf"
-            {joint: D [N m s/rad | N s/m]}, one for all joints but wheels, or what the URDF
-            says.
+            {joint: D [N m s/rad | N s/m]}, one value for all joints except wheels, or "urdf" for
+            the damping of the URDF.
         rest : mapping
-            {joint: position [rad|m]} where its spring is relaxed.
+            {joint: position [rad|m]} at which its spring is relaxed.
         gravity : sequence of float (3,)
             Uniform acceleration [m/s^2] in Pinocchio's world axes.
         orbit : CircularOrbit, float, mapping or None
-            What it circles, or the altitude over the earth [m], or {parameter: value} of one.
+            Orbit of the robot, an altitude over the earth [m], or {parameter: value} of an orbit.
         passive : sequence of str
-            Joints without a motor: their torques leave the inputs.
+            Joints without a motor; their torques are removed from the inputs.
         weights : mapping
-            What `lqr` weighs where it is given nothing: ``rule`` ("urdf", "identity"), ``q``,
-            ``r``, ``bryson``: {state, input, group or pattern: weight or largest value}.
+            Default weights of `lqr`: ``rule`` ("urdf" or "identity"), and ``q``, ``r``,
+            ``bryson``, each {state, input, group or pattern: weight or largest value}.
         start : mapping
-            Where `simulate` begins where it is not told: ``joints`` {joint: position [rad|m]},
-            ``rpy`` (3,) [deg] about fixed axes, ``position`` (3,) [m] of the base, ``velocity``
+            Default initial state of `simulate`: ``joints`` {joint: position [rad|m]}, ``rpy``
+            (3,) [deg] about fixed axes, ``position`` (3,) [m] of the base, ``velocity``
             {joint or state: rate}, as `fflin.velocity` takes it.
         limits : mapping
             {name, group or pattern of inputs or states: largest magnitude, or (least, largest)},
-            in place of what the URDF and the inputs say of them.
+            which replaces the limits of the URDF and of the inputs.
 
         Returns
         -------
@@ -176,13 +177,17 @@ class Robot(Coordinates):
         Raises
         ------
         InputError
-            If a value is negative or not a number, a field is not one of these, or a wheel has
-            more inertia than what carries it, or there are both gravity and an orbit.
+            If one of these holds:
+
+            - a value is negative or not a number;
+            - a wheel has more inertia than its carrier;
+            - both gravity and an orbit are given.
         UnknownNameError
-            If there is no such joint, no such frame for an input or output, or nothing to limit.
+            If there is no such field, no such joint, no such frame of an input or output, or no
+            such name to limit.
         ModelError
-            If dry friction is asked for, which is not differentiable at rest, or the robot's
-            model was changed after it was made.
+            If dry friction is given, which is not differentiable at rest, or if the robot's model
+            was changed after the robot was made.
         """
         self.require_unchanged()
         robot = self
@@ -195,35 +200,39 @@ class Robot(Coordinates):
         robot = replace(robot, **checked_fields(fields, *known))
         if robot.orbit and any(robot.gravity):
             raise InputError(
-                f"'{self.name}' has uniform gravity and an orbit, which has the field of its own "
-                "body; leave one out"
+                f"'{self.name}' has both uniform gravity and an orbit, which includes the gravity "
+                "of its central body; leave one out"
             )
         for name in robot.used_frames:
             find_frame(robot.model, name)
         return robot
 
     def with_mass_properties(self, bodies: Mapping[str, Any]) -> Robot:
-        """Return the same robot with other masses.
+        """Return the same robot with other masses, centres of mass or inertias.
 
         Parameters
         ----------
         bodies : mapping
             {body: {"mass": m [kg], "com": (3,) [m], "inertia": (3, 3) [kg m^2] about the centre of
-            mass} or pin.Inertia}, in the axes of the body's joint. A body is named by its joint,
-            ``base``, a pattern, or its link where no other is fixed to that: links that are fixed
-            to each other are one body, given as a whole and with its wheels. What is left out
-            stays; a mass without an inertia scales that with it, as another density does.
+            mass} or pin.Inertia}, in the axes of the body's joint.
+
+            A body is named by its joint, by ``base``, by a pattern, or by its link if no other
+            link is fixed to it. Links that are fixed to each other are one body, which is given
+            as a whole and includes its wheels.
+
+            Properties that are left out stay. A mass given without an inertia scales the inertia
+            in proportion, like a change of density.
 
         Returns
         -------
         Robot
-            With the pictures, names and inputs of this one, and another ``urdf_sha256``.
+            A robot with the same meshes, names and inputs, and another ``urdf_sha256``.
 
         Raises
         ------
         InputError
-            If a mass is not positive, an inertia is that of no rigid body, or less than that of
-            the wheels in it.
+            If a mass is not positive, or an inertia is not physically realisable or less than
+            the inertia of the wheels in the body.
         UnknownNameError
             If there is no such body or property.
         """
@@ -234,24 +243,27 @@ class Robot(Coordinates):
     def perturbed(
         self, *, mass: float = 0.1, com: float = 0.1, inertia: float = 0.1, seed: int = 0
     ) -> Robot:
-        """Return the same robot with masses drawn at random, each body still a rigid body.
+        """Return the same robot with random, physically realisable mass properties.
 
-        With d uniform in [-1, 1], anew for each body and axis, a mass is multiplied by
-        1 + mass d, the second moments per mass along the axes of the body's frame by
-        1 + inertia d, and the centre of mass is shifted along each axis by com d times the root
-        mean square distance of the mass from it along that axis.
+        A number d is drawn uniformly from [-1, 1], independently for each body and axis:
+
+        - The mass is multiplied by 1 + `mass` d.
+        - The second moments per mass along the axes of the body's frame are multiplied by
+          1 + `inertia` d.
+        - The centre of mass is shifted along each axis by `com` d times the root mean square
+          distance of the mass from the centre along that axis.
 
         Parameters
         ----------
         mass, com, inertia : float
             Relative spreads, from 0 to less than 1.
         seed : int
-            The same seed gives the same robot.
+            Seed of the random numbers; the same seed gives the same robot.
 
         Returns
         -------
         Robot
-            As of `with_mass_properties`.
+            As from `with_mass_properties`.
         """
         from fflin.robot.mass_properties import perturbed
 
@@ -259,19 +271,19 @@ class Robot(Coordinates):
 
     @property
     def used_frames(self) -> tuple[str, ...]:
-        """The frames of the model that inputs and outputs are fixed in."""
+        """Names of the model's frames that inputs and outputs use."""
         of_inputs = [name for item in self.inputs for name in item.frames]
         return (*of_inputs, *(name for item in self.outputs for name in item.frames))
 
     @cached_property
     def wheels(self) -> dict[str, float]:
-        """{name: inertia [kg m^2]} of the wheels among its joints."""
+        """{name: inertia [kg m^2]} of the wheels among the joints."""
         wheels = named_wheels(self.inputs)
         return {name: wheel.inertia for name, wheel in wheels if wheel.inertia}
 
     @cached_property
     def stored_momentum(self) -> tuple[tuple[int, Array], ...]:
-        """Of wheels without inertia: (Pinocchio joint, momentum (3,) [N m s] in its axes)."""
+        """Wheels without inertia: (Pinocchio joint, momentum (3,) [N m s] in its axes)."""
         return stored_momentum(self.model, self.inputs)
 
     @cached_property
@@ -282,19 +294,21 @@ class Robot(Coordinates):
 
     @property
     def mass(self) -> float:
-        """Total mass in kg."""
+        """Total mass [kg]."""
         return float(sum(inertia.mass for inertia in self.model.inertias.tolist()[ROOT:]))
 
     def __repr__(self) -> str:
         return f"Robot('{self.name}', n={self.n}, mass={self.mass:.6g} kg)"
 
     def joint(self, name: str) -> Joint:
-        """Return the independent joint of that name.
+        """Return the independent joint with the given name.
 
         Raises
         ------
         UnknownNameError
-            If there is none; the message has the near names, or the leader of a mimic joint.
+            If there is no such joint; the message suggests similar names.
+        InputError
+            If the joint is a mimic joint, a wheel without inertia or a locked joint.
         """
         for joint in self.joints:
             if joint.name == name:
@@ -302,12 +316,13 @@ class Robot(Coordinates):
         for follower in self.followers:
             if follower.joint.name == name:
                 raise InputError(
-                    f"joint '{name}' mimics '{follower.leader.name}'; place that one instead"
+                    f"joint '{name}' mimics '{follower.leader.name}'; give "
+                    f"'{follower.leader.name}' instead"
                 )
         if name in (wheel for wheel, _ in named_wheels(self.inputs)):
             raise InputError(
-                f"wheel '{name}' has no inertia, so that it is no joint and has no speed; give it "
-                "one, or its momentum"
+                f"wheel '{name}' has no inertia, so it is not a joint and has no speed; give the "
+                "wheel an inertia, or its momentum"
             )
         if any(locked.rpartition("=")[0] == name for locked in self.locked):
             raise InputError(f"joint '{name}' is locked; lock it at another value instead")
@@ -324,5 +339,5 @@ class Robot(Coordinates):
         joints = checked_passive(passive, bare.joint, bare.joint_names, self.locked)
         inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
         if not inputs:
-            raise InputError("passive leaves no input; a model needs at least one")
+            raise InputError("passive removes all inputs; a model needs at least one")
         return replace(self, passive=joints, inputs=inputs)

@@ -1,4 +1,4 @@
-"""Robots from TOML files: a URDF with what acts on it, is watched of it and is known of it."""
+"""Robot files: TOML files that name a URDF and give its inputs, outputs and other fields."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _WORDS = (["damping"], ["weights", "rule"], ["orbit", "body"])
 
 
 class RobotToml:
-    """What a robot's TOML file says, checked as far as it can be without the robot."""
+    """Content of a robot's TOML file, checked as far as possible without the robot."""
 
     def __init__(self, path: Path, name: str) -> None:
         self._document = document = TomlFile(path)
         check_keys(document)
         if "urdf" not in document.record:
             raise InputError(
-                f'{path}: holds inputs alone; add urdf = "my.urdf" above them, or give it to a '
-                "robot, with --inputs or fflin.load_inputs"
+                f'{path}: the file holds inputs only; add urdf = "my.urdf" above them, or pass the '
+                "file to a robot with --inputs or fflin.load_inputs"
             )
         given = {key: self._checked(key) for key in document.record if key != "input"}
         self._written = given | {"inputs": document.record.get("input")}
@@ -90,7 +90,7 @@ class RobotToml:
         for name in names if isinstance(names, list | dict) else ():
             if name in self.lock:
                 line = self._document.line("lock")
-                raise InputError(f"joint '{name}' is locked in line {line}; leave one out")
+                raise InputError(f"joint '{name}' is also locked in line {line}; remove one")
 
     def _checked(self, key: str) -> Any:
         """Return the value of a key, in which names stand for names and numbers for numbers."""

@@ -1,4 +1,4 @@
-"""What a robot is, in words and tables."""
+"""Summary of a robot in text and tables."""
 
 import math
 import textwrap
@@ -9,7 +9,7 @@ from fflin.base.tables import counted, folded, grid, width
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.robot import ROOT, Robot
 
-_LIMITS = "limits in rad, N m and rad/s; of a prismatic joint in m, N and m/s"
+_LIMITS = "limits in rad, N m and rad/s; for prismatic joints in m, N and m/s"
 _START = {"rpy": "[deg]", "position": "[m]", "joints": "[rad | m]", "velocity": "[rad/s | m/s]"}
 
 

@@ -87,7 +87,8 @@ def _with_wheels(model: pin.Model, wheels: Sequence[tuple[str, ReactionWheel]]) 
     for name, wheel in wheels:
         if model.existJointName(name) or model.existFrame(name):
             raise InputError(
-                f"wheel '{name}' has the name of a joint or frame of the robot; give it another"
+                f"wheel '{name}' has the name of a joint or frame of the robot; give it another "
+                "name"
             )
         joint, axis = carrier(model, wheel)
         mounted = _Mounted(name, axis, float(wheel.inertia or 0.0))
@@ -105,9 +106,10 @@ def _without(body: pin.Inertia, wheel: _Mounted, of: str) -> pin.Inertia:
     if is_impossible(body.mass, moments):
         about = float(axis @ body.inertia @ axis)
         raise InputError(
-            f"wheel '{name}' of {inertia:g} kg m^2 takes more than its carrier has: {of} has "
-            f"{about:.3g} kg m^2 about its axis, and {moments[0]:.3g} would be left; the URDF's "
-            "inertia counts the wheels: correct that, or the wheel's"
+            f"wheel '{name}' of {inertia:g} kg m^2 has more inertia than its carrier: {of} has "
+            f"{about:.3g} kg m^2 about its axis, which leaves a principal moment of "
+            f"{moments[0]:.3g}; the inertia in the URDF must include the wheels: correct the URDF "
+            "or the wheel"
         )
     return pin.Inertia(body.mass, body.lever, rest)
 

@@ -291,6 +291,6 @@ def test_the_room_of_a_sweep_is_its_own_from_the_start(tmp_path):
 
 
 def test_a_reason_is_never_empty():
-    assert reason(EOFError()) == "it ends too early"
+    assert reason(EOFError()) == "the file ends too early"
     assert reason(NotImplementedError()) == "NotImplementedError"
     assert reason(KeyError("q")) == "it has no entry 'q'"

@@ -258,7 +258,7 @@ def test_at_a_steady_end_wheels_spin_on():
 
 
 @pytest.mark.exhaustive
-@pytest.mark.filterwarnings("ignore:t, q, v, u are no motion")
+@pytest.mark.filterwarnings("ignore:t, q, v, u are not a motion")
 def test_a_steady_end_leaves_out_what_inputs_cannot_hold(tumbling):
     robot, traj = tumbling
     robot = robot.replace(inputs=robot.inputs[2:])

@@ -348,7 +348,7 @@ def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
     refused(r"w, x, y, z has length 1.1, expected 1", back, robot, "drake", q)
     q = lin.to("spart").q.copy()
     q[0] = -1.0
-    refused(r"the rotation of R0, q\[:9\] by columns, is not one", back, robot, "spart", q)
+    refused(r"the matrix R of R0 \(q\[:9\] by columns\) is not a rotation", back, robot, "spart", q)
     up = fflin.configuration(
         robot, {}, pin.SE3(pin.rpy.rpyToMatrix(0.3, np.pi / 2, 0.0), np.zeros(3))
     )
@@ -359,13 +359,13 @@ def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
     refused(r"dt is 0.1 s for drake", to, robot, lin, "drake", dt=0.1)
     refused(r"dt is -1 s for mujoco", to, robot, lin, "mujoco", dt=-1.0)
     refused(r"sampled", to, robot, lin.discretize(0.1), "mujoco", dt=0.1)
-    refused(r"not of 'cubesat'", to, fflin.load("cubesat"), lin, "drake")
+    refused(r"does not fit the given robot 'cubesat'", to, fflin.load("cubesat"), lin, "drake")
     arm = robot.replace(inputs=[fflin.JointTorque("*")])
     reduced = fflin.momentum_reduction(fflin.linearize(arm))
-    refused(r"lin has not all states", to, arm, reduced, "drake")
+    refused(r"lin lacks some states", to, arm, reduced, "drake")
     servicer = fflin.load("servicer_7dof").replace(inputs=[fflin.BaseForce()])
     if np.abs(Formulas(servicer, "spart", servicer.neutral()).centre.translation).max():
-        refused(r"a BaseForce alone takes no moment", fflin.linearize(servicer).to, "spart")
+        refused(r"a BaseForce alone cannot give its moment", fflin.linearize(servicer).to, "spart")
     assert rng and free_body((1.0, 2.0, 3.0)).n == 0
 
 
@@ -393,4 +393,4 @@ def test_an_orbit_has_angles_and_no_other_tool():
     n = len(m.A) // 2
     assert relative(m.A[:n], np.eye(n, 2 * n, n)) < 1e-13  # coordinates and their rates
     for tool in ("drake", "mujoco", "pinocchio", "spart"):
-        refused(r"is in orbit; take robot.replace", lin.to, tool)
+        refused(r"is in orbit; use robot.replace", lin.to, tool)

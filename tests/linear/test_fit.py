@@ -94,7 +94,7 @@ def test_what_cannot_be_lined_up_is_one_line(pair):
     other = fflin.linearize(fflin.load("panda"))
     mixed = fflin.linearize(fflin.jam(pair[1], "joint_2").robot)
     for call, said in [
-        (lambda: fflin.line_up(gain, other), "has not"),
+        (lambda: fflin.line_up(gain, other), "lacks the"),
         (lambda: fflin.line_up(gain, mixed), "other"),
         (lambda: fflin.line_up(fflin.lqr(held), fflin.linearize(pair[1], frame="local")), "frame"),
         (lambda: fflin.line_up(gain, held.discretize(0.1)), "0.0"),

@@ -77,7 +77,7 @@ def test_what_is_no_motion_is_told_with_the_time_and_refused_where_asked():
     t, q, v, u = motion(robot, knots=17)
     jump = q.copy()
     jump[8:, 0] += 0.1
-    said = r"no motion of 'ets_vii': from t = 0\.175 to 0\.2 s they miss it by \d"
+    said = r"not a motion of 'ets_vii': from t = 0\.175 to 0\.2 s the error is \d"
     with pytest.raises(fflin.InputError, match=said):
         fflin.linearize_trajectory(robot, t, jump, v, u, strict=True)
     with pytest.warns(fflin.FflinWarning, match=said):

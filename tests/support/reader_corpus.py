@@ -519,13 +519,11 @@ refuse("mimic of nothing", three("<mimic/>"), ":6:", "'joint'", "'j1'")
 refuse("mimic of an unknown joint", three('<mimic joint="j9"/>'), ":6:", "'j1'", "'j9'")
 refuse("mimic of Drake", three("", '<drake:mimic joint="j1"/>'), ":7:", "'j2'", "<mimic>")
 refuse("mimic of itself", three('<mimic joint="j1"/>'), ":6:", "itself", "'j1'")
-refuse(
-    "mimics of each other", three('<mimic joint="j2"/>', '<mimic joint="j1"/>'), "circle", "'j2'"
-)
+refuse("mimics of each other", three('<mimic joint="j2"/>', '<mimic joint="j1"/>'), "loop", "'j2'")
 refuse(
     "mimics in a circle of three",
     three(*(f'<mimic joint="j{k}"/>' for k in (2, 3, 1))),
-    "circle",
+    "loop",
     "'j3'",
 )
 refuse("two mimics in one joint", three('<mimic joint="j2"/><mimic joint="j3"/>'), "second <mimic>")

@@ -1,4 +1,4 @@
-"""Joints of a URDF: what they connect, how they move, and which follow others."""
+"""Joints of a URDF: the links that they connect, their type, and their mimic joints."""
 
 import math
 import re
@@ -66,16 +66,16 @@ def read_joint(element: Element) -> JointElement:
     if kind not in FREEDOM:
         advice = "use three revolute joints" if kind == "spherical" else "correct it"
         raise element.error(
-            f"{of} is of the unknown type {quoted(kind)}; known: {', '.join(FREEDOM)}; {advice}"
+            f"{of} has the unknown type {quoted(kind)}; known: {', '.join(FREEDOM)}; {advice}"
         )
     known = ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
     refuse_near_miss(element, of, known)
     for child in element.children:
         prefix, _, local = child.tag.rpartition(":")
         if prefix and local == "mimic":
-            raise child.error(f"<{child.tag}> in {of} is not read; write it as <mimic>")
+            raise child.error(f"<{child.tag}> in {of} is not known to URDF; write it as <mimic>")
         if prefix and local == "rotor_inertia":
-            child.note(f"<{child.tag}> of {of} is not in the model")
+            child.note(f"<{child.tag}> of {of} is ignored: the model has no rotor inertia")
     ends = {end: element.require(end, of) for end in ("parent", "child")}
     for found in ends.values():
         found.allow_only("link", of=of)
@@ -105,7 +105,7 @@ def _axis(element: Element, of: str, kind: str) -> tuple[float, ...]:
             )
     if kind == "planar" and (axis[0] or axis[1] or axis[2] < 0.0):
         raise element.error(
-            f"{of} is planar about an axis other than z; turn its <origin> so that "
+            f"{of} is planar with a normal other than z; rotate its <origin> so that "
             '<axis xyz="0 0 1"/> is the normal of the plane'
         )
     return axis
@@ -119,7 +119,10 @@ def _limits(element: Element, of: str, kind: str) -> dict[str, float] | None:
     limits = {name: _limit(found, name, of) for name in names if name in found.attributes}
     lower, upper = limits.get("lower", 0.0), limits.get("upper", 0.0)
     if lower > upper:
-        found.note(f"lower of {of} is {lower:g}, more than upper, {upper:g}; taken as no limits")
+        found.note(
+            f"lower limit {lower:g} of {of} exceeds its upper limit {upper:g}; the model has no "
+            "position limits for it"
+        )
         limits |= {"lower": -UNLIMITED, "upper": UNLIMITED}
     return limits
 
@@ -132,8 +135,10 @@ def _limit(found: Element, name: str, of: str) -> float:
     least = -math.inf if name in ("lower", "upper") else 0.0
     # Written so that NaN, of what is no number, fails too.
     if not value >= least or value == -math.copysign(math.inf, none):
-        expected = "a number" if least else "one that is not negative"
-        found.note(f"{name} of {of} is {quoted(text)}, expected {expected}; taken as no limit")
+        expected = "a number" if least else "a number of 0 or more"
+        found.note(
+            f"limit {name} of {of} is {quoted(text)}, expected {expected}; the limit is ignored"
+        )
         return none
     return none if math.isinf(value) else value
 
@@ -152,7 +157,7 @@ def _resistance(found: Element, name: str, of: str) -> float:
         return 0.0
     value = bounded_number(found, name, of, 0.0)
     if value < 0.0:
-        raise found.error(f"{name} of {of} is {value:g}; it cannot be negative")
+        raise found.error(f"{name} of {of} is {value:g}, expected 0 or more; correct it")
     return value
 
 
@@ -180,10 +185,10 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
             if leader in chain:
                 loop = [*chain[chain.index(leader) :], leader]
                 raise joints[follower].element.error(
-                    f"the mimic joints {enumerated(loop)} follow each other in a circle; one of "
-                    "them must be free"
+                    f"the mimic joints {enumerated(loop)} form a loop; remove the <mimic> of one "
+                    "of them"
                     if len(loop) > 2
-                    else f"joint {quoted(name)} mimics itself; name the joint that it follows"
+                    else f"joint {quoted(name)} mimics itself; name another joint in its <mimic>"
                 )
             chain.append(leader)
         for follower in reversed(chain[:-1]):
@@ -212,8 +217,8 @@ def counted_leaders(joints: dict[str, JointElement], mimics: dict[str, Mimic]) -
 def _check_mimic(joint: JointElement, mimic: Mimic, joints: dict[str, JointElement]) -> None:
     if joint.freedom != 1:
         raise joint.element.error(
-            f"joint {quoted(joint.name)} is {joint.type} and has a <mimic>; only a joint of one "
-            "degree of freedom can follow another"
+            f"joint {quoted(joint.name)} is {joint.type} and has a <mimic>; only a joint with one "
+            "degree of freedom can mimic another"
         )
     if mimic.leader not in joints:
         error = unknown("joint", mimic.leader[:60], [name[:60] for name in joints])
@@ -224,5 +229,5 @@ def _check_mimic(joint: JointElement, mimic: Mimic, joints: dict[str, JointEleme
     if leader.freedom != 1:
         raise joint.element.error(
             f"joint {quoted(joint.name)} mimics {quoted(leader.name)}, which is {leader.type}; "
-            "a leader has one degree of freedom"
+            "name a joint with one degree of freedom"
         )

@@ -1,4 +1,4 @@
-"""Links of a URDF: where they are, what they weigh, and what is odd about that."""
+"""Links of a URDF: their placements, masses and inertias, and likely errors in them."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -61,7 +61,7 @@ def read_link(element: Element) -> Link:
     of = f"link {quoted(name)}"
     refuse_near_miss(element, of, ("inertial",))
     for misplaced in element.find_all("mass"):
-        raise misplaced.error(f"<mass> stands directly in {of}; put it into an <inertial>")
+        raise misplaced.error(f"<mass> is directly in {of}; put it into an <inertial>")
     inertial = element.find("inertial", of)
     if inertial is None:
         return Link(name, element)
@@ -70,7 +70,7 @@ def read_link(element: Element) -> Link:
     mass_element.allow_only("value", of=of)
     mass = bounded(mass_element, "mass", of, mass_element.number("value", f"<mass> of {of}"))
     if mass < 0.0:
-        raise mass_element.error(f"mass of {of} is {mass:g} kg; it cannot be negative")
+        raise mass_element.error(f"mass of {of} is {mass:g} kg, expected 0 or more; correct it")
     inertia = inertial.require("inertia", f"<inertial> of {of}")
     inertia.allow_only(*INERTIA, of=of)
     moments = tuple(bounded_number(inertia, entry, of) for entry in INERTIA)
@@ -112,7 +112,9 @@ def bounded_number(element: Element, name: str, of: str, default: float | None =
 def bounded(element: Element, what: str, of: str, value: float) -> float:
     """Return a number that is not absurdly large."""
     if abs(value) > _ABSURD:
-        raise element.error(f"{what} of {of} is {value:g}, beyond anything physical; correct it")
+        raise element.error(
+            f"{what} of {of} is {value:g}, expected a magnitude of at most {_ABSURD:g}; correct it"
+        )
     return value
 
 
@@ -157,18 +159,18 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
             if abs(least) > _LOST_IN_BODY * of_body:
                 raise link.element.error(
                     f"the inertia of link {quoted(link.name)} has principal moments {least:.3g}, "
-                    f"{middle:.3g}, {largest:.3g} kg m^2; none can be negative: correct ixx ... izz"
+                    f"{middle:.3g}, {largest:.3g} kg m^2, expected 0 or more; correct ixx ... izz"
                 )
             negligible.append(link.name)
         elif largest - middle - least > TRIANGLE_SLACK * abs(largest):
             unequal.append(link.name)
         if link.mass == 0.0 and any(link.inertia):
             weightless.append(link.name)
-    lost = f"the inertia of {named('link', negligible)} has a negative principal moment, of no "
+    lost = f"the inertia of {named('link', negligible)} has a negative principal moment, "
     notes = (
-        (negligible, f"{lost}account beside the links it is fixed to"),
+        (negligible, f"{lost}negligible compared with the links it is fixed to"),
         # One principal moment is more than the sum of the others.
-        (unequal, f"inertia of no rigid body: {enumerated(unequal)}"),
-        (weightless, f"an inertia and no mass: {named('link', weightless)}"),
+        (unequal, f"unphysical inertia: {enumerated(unequal)}"),
+        (weightless, f"inertia without mass: {named('link', weightless)}"),
     )
     return [f"{origin}: {text}" for names, text in notes if names]

@@ -1,4 +1,4 @@
-"""From a URDF file to a Pinocchio model with a free-flyer root."""
+"""Reader of URDF files, which builds a Pinocchio model with a free-flyer root joint."""
 
 import hashlib
 import threading
@@ -30,7 +30,7 @@ _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
 
 
 class Advice(NamedTuple):
-    """A warning that falls away where a field of the robot names all of the joints."""
+    """Warning that is dropped if a field of the robot names all of the joints."""
 
     field: str
     joints: tuple[str, ...]
@@ -38,7 +38,7 @@ class Advice(NamedTuple):
 
 
 class Description(NamedTuple):
-    """A robot as its file describes it."""
+    """Robot as its file describes it."""
 
     model: pin.Model  # free-flyer root joint, zero gravity; mimic joints move freely in it
     sha256: str  # of the file as it was read, without files that a xacro includes
@@ -68,7 +68,10 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
         expanded, notes = expand(path, document, first)
         root = parse(expanded, f"{path} as expanded by xacro")
         if left := first_xacro(root):
-            raise left.error(f"xacro is left in <{left.tag}>; is a macro missing?")
+            raise left.error(
+                f"<{left.tag}> still holds xacro after the expansion; define or include the "
+                "missing macro"
+            )
     urdf = read_description(root, prune)
     mimics = resolve_mimics(urdf.joints)
     model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
@@ -109,8 +112,8 @@ def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> p
     nv = 6 + sum(joint.freedom for joint in urdf.joints.values())
     if nv > _LARGEST_NV:
         raise root.error(
-            f"the joints have {nv - 6} degrees of freedom; at most {_LARGEST_NV - 6} fit into "
-            "1 GiB of Pinocchio's Data; make joints fixed that do not matter"
+            f"the joints have {nv - 6} degrees of freedom, expected at most {_LARGEST_NV - 6}, "
+            "which take 1 GiB in Pinocchio's Data; make fixed the joints that do not matter"
         )
     root_joint = "root_joint"
     while root_joint in urdf.joints or root_joint in urdf.links:
@@ -123,11 +126,14 @@ def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> p
         )
     except (ValueError, RuntimeError) as error:
         raise UrdfError(
-            f"{path}: Pinocchio cannot build it: {' '.join(str(error).split())[:300]}"
+            f"{path}: Pinocchio cannot build the model: {' '.join(str(error).split())[:300]}"
         ) from None
     moving = {joint.name for joint in urdf.joints.values() if joint.freedom}
     if set(model.names) != {"universe", root_joint, *moving} or model.nv != nv:
-        raise UrdfError(f"{path}: Pinocchio built other joints than the file describes")
+        raise UrdfError(
+            f"{path}: the joints that Pinocchio built differ from the joints in the file; rename "
+            "joints with unusual names"
+        )
     model.gravity.setZero()
     # The name of a file need not be text.
     model.name = urdf.name or path.stem.encode(errors="backslashreplace").decode()

@@ -1,4 +1,4 @@
-"""From the elements of a URDF to a checked description: links and joints that form one tree."""
+"""Checks that the links and joints of a URDF form one tree."""
 
 from collections.abc import Callable, Collection, Iterable
 from graphlib import CycleError, TopologicalSorter
@@ -19,7 +19,7 @@ Part = TypeVar("Part", Link, JointElement)
 
 
 class Urdf(NamedTuple):
-    """What a URDF describes, checked: the joints connect the links into one tree."""
+    """Checked content of a URDF: the joints connect the links into one tree."""
 
     name: str  # empty where the file gives none
     links: dict[str, Link]  # by name, in the order of the file
@@ -32,7 +32,10 @@ def read_description(root: Element, prune: Collection[str] = ()) -> Urdf:
     _check_root(root)
     links = _by_name(read_link, root.find_all("link"))
     if len(links) > _LINK_LIMIT:
-        raise root.error(f"<robot> has {len(links)} links; at most {_LINK_LIMIT} are read")
+        raise root.error(
+            f"<robot> has {len(links)} links, expected at most {_LINK_LIMIT}; merge links that "
+            "are fixed to each other"
+        )
     if not links:
         raise root.error("<robot> has no <link>; add one")
     joints = _by_name(read_joint, root.find_all("joint"))
@@ -57,7 +60,7 @@ def _check_root(root: Element) -> None:
     for child in root.children:
         if child.tag == "robot":
             raise child.error(
-                "a <robot> inside <robot>; keep one <robot> with all links and joints"
+                "there is a <robot> inside <robot>; keep one <robot> with all links and joints"
             )
         direct = child.tag in parts
         for inner in child.children if direct else child.iterate():
@@ -77,7 +80,7 @@ def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[s
         earlier = parts.setdefault(part.name, part)
         if earlier is not part:
             raise element.error(
-                f"a second {element.tag} named {quoted(part.name)}, after that of line "
+                f"this is the second {element.tag} named {quoted(part.name)}, the first is in line "
                 f"{earlier.element.line}; rename one of them"
             )
     return parts
@@ -102,15 +105,15 @@ def _check_tree(
             other = above[joint.child]
             raise joint.element.error(
                 f"link {quoted(joint.child)} is the child of {of} and of joint "
-                f"{quoted(other.name)} of line {other.element.line}; a link has one parent, and "
-                "closed loops cannot be described"
+                f"{quoted(other.name)} in line {other.element.line}; a link can have only one "
+                "parent, so remove one joint: URDF has no closed loops"
             )
         above[joint.child] = joint
 
     roots = [name for name in links if name not in above]
     if len(roots) > 1:
         raise links[roots[1]].element.error(
-            f"the links fall into {len(roots)} parts, with roots {enumerated(roots)}; connect "
+            f"the links form {len(roots)} separate trees, with roots {enumerated(roots)}; connect "
             "them by joints"
         )
     depths = dict.fromkeys(roots, 1)
@@ -123,14 +126,14 @@ def _check_tree(
     except CycleError as error:
         loop = [above[name] for name in error.args[1][:0:-1]]
         raise loop[0].element.error(
-            f"{named('joint', [joint.name for joint in loop])} form a closed loop that hangs on "
-            "nothing; correct a parent or child in it"
+            f"{named('joint', [joint.name for joint in loop])} form a closed loop without a root; "
+            "correct a parent or child in it"
         ) from None
     deepest = max(depths, key=depths.__getitem__)
     if depths[deepest] > _DEPTH_LIMIT:
         raise root.error(
-            f"link {quoted(deepest)} stands {depths[deepest]} links deep; at most {_DEPTH_LIMIT} "
-            "are read; join links that are fixed to each other"
+            f"link {quoted(deepest)} is {depths[deepest]} links deep in the tree, expected at most "
+            f"{_DEPTH_LIMIT}; merge links that are fixed to each other"
         )
     return depths
 
@@ -144,8 +147,8 @@ def _drop_world(links: dict[str, Link], joints: dict[str, JointElement]) -> None
         return
     first = hanging[0]
     first.element.note(
-        f"joint {quoted(first.name)} is floating and link {quoted(root.name)} has no mass; both "
-        f"are left out, for the base, link {quoted(first.child)}, floats free by itself"
+        f"floating joint {quoted(first.name)} and its massless link {quoted(root.name)} are left "
+        f"out: the base, link {quoted(first.child)}, is free-floating without them"
     )
     del links[root.name], joints[first.name]
 

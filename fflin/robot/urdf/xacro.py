@@ -1,4 +1,4 @@
-"""Xacro: told from plain URDF, and expanded by the optional package xacrodoc."""
+"""Xacro documents: distinguished from plain URDF, and expanded by the optional package xacrodoc."""
 
 import sys
 from itertools import chain
@@ -40,9 +40,10 @@ def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, l
     use = f", first used by <{first.tag}> in line {first.line}" if first else ""
     if not (find_spec("xacro") and find_spec("xacrodoc")):
         raise MissingPackageError(
-            f"{path}: is written in xacro{use}; pip install 'fflin[xacro]' to have it expanded"
+            f"{path}: the file is written in xacro{use}, which needs another package; install it "
+            "with: pip install 'fflin[xacro]'"
         )
-    failed = f"{path}: cannot be expanded by xacro{use}"
+    failed = f"{path}: xacro cannot expand the file{use}"
     child = [sys.executable, "-I", "-X", "utf8", "-W", "ignore", _CHILD]
     try:
         done = subprocess.run(
@@ -54,12 +55,12 @@ def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, l
         )
     except subprocess.TimeoutExpired:
         raise UrdfError(
-            f"{failed}: it takes more than {LIMIT:g} s; is there a macro or an expression "
-            "without end?"
+            f"{failed}: the expansion takes more than {LIMIT:g} s; look for a macro or an "
+            "expression that never ends"
         ) from None
     said = done.stderr.decode(errors="replace").splitlines()
     if done.returncode:
-        why = " ".join(said[-1:]) or f"its process ended with {done.returncode}"
+        why = " ".join(said[-1:]) or f"its process ended with exit code {done.returncode}"
         raise UrdfError(f"{failed}: {why[:300]}")
     files, _, urdf = done.stdout.partition(b"\n")
     remember(*json.loads(files))

@@ -1,4 +1,4 @@
-"""From bytes to a small tree of XML elements, each with the line it stands on."""
+"""Parser that turns bytes into a small tree of XML elements, each with its line number."""
 
 from __future__ import annotations
 
@@ -58,11 +58,12 @@ class Element:
         return [child for child in self.children if child.tag == tag]
 
     def find(self, tag: str, of: str) -> Element | None:
-        """Return the one child of that tag, None if there is none; `of` names this element."""
+        """Return the only child with a tag, or None; `of` names this element in errors."""
         found = self.find_all(tag)
         if len(found) > 1:
             raise found[1].error(
-                f"a second <{tag}> in {of}, after that of line {found[0].line}; keep one of them"
+                f"this is the second <{tag}> in {of}, the first is in line {found[0].line}; keep "
+                "one of them"
             )
         return found[0] if found else None
 
@@ -88,9 +89,11 @@ class Element:
             if nearest(name.lower(), names, _NEAR):
                 raise self.error(
                     f"<{self.tag}> of {of} has an unknown attribute {quoted(name)}; known: "
-                    f"{', '.join(names)}; correct it or take it out"
+                    f"{', '.join(names)}; correct it or remove it"
                 )
-            self.note(f"the attribute {quoted(name)} of <{self.tag}> is not in the model")
+            self.note(
+                f"attribute {quoted(name)} of <{self.tag}> is ignored: it is not part of URDF"
+            )
 
     def text(self, name: str, of: str) -> str:
         """Return an attribute that must be there and hold something."""
@@ -118,8 +121,8 @@ class Element:
             )
         if len(entries) != size:
             raise self.error(
-                f"{name} of {of} has {len(entries)} entries, {quoted(text)}; expected {size}, "
-                "separated by spaces"
+                f"{name} of {of} is {quoted(text)}, which has {len(entries)} entries; expected "
+                f"{size} numbers separated by spaces"
             )
         return tuple(self._decimal(entry, f"{name} of {of}") for entry in entries)
 
@@ -167,7 +170,7 @@ def told(root: Element) -> list[str]:
 def parse(document: bytes, origin: str) -> Element:
     """Return the root of a document in the encoding that it declares, without entities."""
     if not document.strip():
-        raise UrdfError(f"{origin}: is empty; expected a URDF with a <robot>")
+        raise UrdfError(f"{origin}: the file is empty; expected a URDF with a <robot>")
     builder = _Builder(origin)
     try:
         builder.parse(document)
@@ -185,12 +188,12 @@ def parse(document: bytes, origin: str) -> Element:
 def _explain(error: expat.ExpatError) -> str:
     what = expat.errors.messages[error.code]
     advice = {
-        "junk after document element": "something follows the end of the root element; a URDF "
-        "holds one <robot> and nothing after it",
+        "junk after document element": "text follows the end of the root element; remove "
+        "everything after </robot>",
         "unknown encoding": "its declared encoding is unknown; save it as UTF-8",
     }
     return advice.get(
-        what, f"not well-formed XML: {what} at column {error.offset + 1}; mend it there"
+        what, f"not well-formed XML: {what} at column {error.offset + 1}; correct it there"
     )
 
 
@@ -215,15 +218,15 @@ class _Builder:
             if begin - parser.CurrentByteIndex > _TAG_LIMIT:
                 raise UrdfError(
                     f"{self.root.origin}:{parser.CurrentLineNumber}: a tag or comment is longer "
-                    f"than {_TAG_LIMIT} bytes; mend it"
+                    f"than {_TAG_LIMIT} bytes; shorten it"
                 )
         parser.Parse(b"", True)
         # Where declarations are not read, expat drops entities that it does not know from
         # attributes in silence. Without its zeros, UTF-16 is ASCII where it matters.
         if self._unread and _ENTITY.search(document.replace(b"\0", b"")):
             raise UrdfError(
-                f"{self.root.origin}: uses an entity that it does not declare itself; write what "
-                "it stands for in its place"
+                f"{self.root.origin}: the file uses an entity that it does not declare; replace "
+                "the entity by its text"
             )
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
@@ -233,11 +236,11 @@ class _Builder:
         self._count += 1
         if self._count > _ELEMENT_LIMIT:
             raise element.error(
-                f"more than {_ELEMENT_LIMIT} elements, which no robot description needs"
+                f"the file has more than {_ELEMENT_LIMIT} elements; reduce it to the robot"
             )
         if len(self._open) > _DEPTH_LIMIT:
             raise element.error(
-                f"elements are nested more than {_DEPTH_LIMIT} deep; is an end tag missing?"
+                f"elements are nested more than {_DEPTH_LIMIT} deep; check for a missing end tag"
             )
         self._open[-1].children.append(element)
         self._open.append(element)
@@ -249,5 +252,5 @@ class _Builder:
     def _refuse_entities(self, *_: object) -> None:
         raise UrdfError(
             f"{self.root.origin}:{self.parser.CurrentLineNumber}: entities (<!ENTITY>) are not "
-            "read; take the declaration out and write what each stands for"
+            "supported; remove the declaration and replace each entity by its text"
         )
