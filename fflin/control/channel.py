@@ -1,4 +1,4 @@
-"""How a command reaches the robot: held between samples, late, and within limits."""
+"""Channel from command to actuator: sample and hold, delay and limits."""
 
 import math
 from collections import deque
@@ -40,13 +40,13 @@ class Law:
         names = self._names
         if u.shape != self._shape:
             raise InputError(
-                f"policy(t, q, v) gave shape {u.shape} at t = {t:g} s, expected {self._shape}: "
-                f"a value for each of {', '.join(names[:8])}" + (", ..." if names[8:] else "")
+                f"policy(t, q, v) returned shape {u.shape} at t = {t:g} s, expected {self._shape}: "
+                f"one value for each of {', '.join(names[:8])}" + (", ..." if names[8:] else "")
             )
         wrong = np.flatnonzero(~np.isfinite(np.clip(u, *self._limits)))
         if len(wrong) and float(v.dot(v)) < self._slow:
             raise InputError(
-                f"policy(t, q, v) gave {u[wrong[0]]} for {names[wrong[0]]} at t = {t:g} s, "
+                f"policy(t, q, v) returned {u[wrong[0]]} for {names[wrong[0]]} at t = {t:g} s, "
                 "expected finite numbers"
             )
         return u
