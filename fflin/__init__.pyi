@@ -1,4 +1,4 @@
-"""What type checkers see of fflin, and what `fflin/__init__.py` makes at run time: its names."""
+"""Public names of fflin: type checkers read them here, `fflin/__init__.py` at run time."""
 
 __version__: str
 

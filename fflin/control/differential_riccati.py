@@ -1,4 +1,4 @@
-"""The differential Riccati equation backwards in time, by maps that keep P positive."""
+"""Differential Riccati equation, solved backwards in time with P positive semidefinite."""
 
 from __future__ import annotations
 
@@ -148,7 +148,9 @@ def bounded_by(remedy: str) -> Iterator[None]:
         with np.errstate(over="ignore", invalid="ignore"):
             yield
     except np.linalg.LinAlgError:
-        raise InputError(f"P changes too fast; give {remedy}") from None
+        raise InputError(
+            f"P of the Riccati equation changes too fast to be integrated; give {remedy}"
+        ) from None
 
 
 class Passed:

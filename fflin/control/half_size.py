@@ -1,4 +1,4 @@
-"""Modes, Lyapunov equations by them, and the optimal loop of half the usual eigenproblem."""
+"""Modal Lyapunov solver, and optimal loops from an eigenproblem of half the usual size."""
 
 from __future__ import annotations
 

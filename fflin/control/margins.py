@@ -29,9 +29,9 @@ class Margins(NamedTuple):
         Phase lag or lead of each input [deg].
     """
 
-    disk: float  # the symmetric disk margin, 2 at most; 0 where the loop is at the limit
-    gain: tuple[float, float]  # factors between which the gain of each input may lie
-    phase: float  # lag or lead of each input [deg]
+    disk: float
+    gain: tuple[float, float]
+    phase: float
 
 
 def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:

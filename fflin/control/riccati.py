@@ -1,4 +1,4 @@
-"""Algebraic Riccati equations: a solution with its residual, from half the size where possible."""
+"""Algebraic Riccati equations: a solution with its residual, at half the size if possible."""
 
 import math
 import warnings

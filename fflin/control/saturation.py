@@ -1,4 +1,4 @@
-"""What acts of a command: within limits, up to the largest speed of a wheel, in pulses."""
+"""Actuator saturation: input limits, wheel speed limits and thruster pulses."""
 
 import math
 import warnings
@@ -60,13 +60,14 @@ class Pulses:
         for (_, name, item), most in zip(thrusters, self.most.tolist(), strict=True):
             if not sample:
                 raise InputError(
-                    f"thruster '{name}' fires from sample to sample (on_off, least_impulse); give "
-                    "the time between samples, or a policy on a sampled model"
+                    f"thruster '{name}' is pulsed (on_off, least_impulse), which needs a sampling "
+                    "time; give `sample`, or a policy on a sampled model"
                 )
             if (item.least_impulse or 0.0) > most * self.time:
                 raise InputError(
                     f"thruster '{name}' has a least impulse of {item.least_impulse:g} N s, but "
-                    f"gives {most * self.time:.3g} N s in a sample; take longer samples"
+                    f"can give only {most * self.time:.3g} N s within a sample; give a longer "
+                    "sampling time"
                 )
 
     def begin(self, step: int, u: Array) -> None:
@@ -94,7 +95,7 @@ class Pulses:
 
 
 class Saturation(NamedTuple):
-    """What acts of a command of the inputs of a robot."""
+    """Limits, wheels and pulses that act on the commands of a robot's inputs."""
 
     low: Array  # (nu,)
     high: Array
@@ -148,10 +149,10 @@ def warn_beyond(
         share = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
     worst = share.argmax(axis=0)
     beyond = [
-        f"{name} is asked for {asked[row, k]:.3g} {unit}, limit {bounds[row, k]:g}"
+        f"{name} requires {asked[row, k]:.3g} {unit}, its limit is {bounds[row, k]:g}"
         for k, (name, unit, row) in enumerate(zip(names, units, worst, strict=True))
         if share[row, k] > 1.0 + 1e-6
     ]
     if beyond:
-        said = f"the limits do not hold '{robot}' {where}: {listed(beyond)}"
+        said = f"the input limits are too small for '{robot}' {where}: {listed(beyond)}"
         warnings.warn(said, FflinWarning, stacklevel=3)
