@@ -1,7 +1,8 @@
-"""Upper bounds of the structured singular value of parameters that are real and repeated.
+"""Upper bounds of the structured singular value for real repeated parameters.
 
-Of real ones it jumps with the frequency, where a pole crosses the axis, and values at a grid's own
-frequencies say nothing of those between. So each interval has one scaling for all of it.
+For real parameters it is discontinuous in the frequency, if a pole crosses the axis. Values on a
+grid of frequencies then say nothing about the frequencies between. So one scaling is used for each
+whole interval.
 """
 
 from __future__ import annotations
