@@ -1,4 +1,4 @@
-"""Chunks of rows on the workers of an executor, of which some may die."""
+"""Distribution of chunks to the workers of an executor, with retries if a worker dies."""
 
 from __future__ import annotations
 

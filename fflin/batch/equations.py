@@ -1,4 +1,4 @@
-"""Linear models about many points at once, by the compiled kernel."""
+"""Linear models about many points by the compiled kernel."""
 
 from __future__ import annotations
 

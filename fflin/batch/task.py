@@ -1,4 +1,4 @@
-"""What a sweep is asked to do: its points, and what of the result is the same at all of them."""
+"""Task of a sweep: its points, and the part of the result that is the same at all points."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _OF_THE_ROBOT = (
 
 
 class SweepTask:
-    """A sweep's points, and what of its result is the same at all of them."""
+    """Points of a sweep, and the part of its result that is the same at all points."""
 
     def __init__(self, job: ChunkJob, configurations: Configurations, v: Any, u: Any) -> None:
         self.job, self.robot = job, job.linearizer.robot

@@ -32,7 +32,7 @@ class Gridded(Protocol):
     lin: LinearModel
 
     def table(self) -> tuple[dict[str, Array], Array]:
-        """Return the joints of the grid and their values, and the gains (N, nu, nx) in order."""
+        """Return the grid axes {joint: values} and the gains (N, nu, nx) in grid order."""
         ...
 
 
