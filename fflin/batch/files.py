@@ -33,7 +33,7 @@ _CHUNK_BYTES = 2**22
 
 
 def check_format(path: Path) -> None:
-    """Raise where the ending says no known format, or h5py is needed and not installed."""
+    """Raise if the file's ending is not a known format, or h5py is needed and not installed."""
     check_ending(path, FORMATS)
     if path.suffix == ".h5":
         hdf5()
@@ -108,7 +108,7 @@ def _chunk_seals(varying: Mapping[str, Array], count: int, chunk: int) -> NDArra
 def whole_seal(
     texts: Mapping[str, str], chunk: int, seals: Any, constants: Mapping[str, Array]
 ) -> NDArray[np.uint8]:
-    """Return the SHA-256 (32,) of all of a file, its rows by those of their chunks."""
+    """Return the SHA-256 (32,) of a file's content, with the checksums of its chunks of rows."""
     whole = content_digest({**texts, "chunk": chunk, CHUNK_SEALS: seals, **constants})
     return np.frombuffer(bytes.fromhex(whole), np.uint8)
 

@@ -118,7 +118,7 @@ def checked_inputs(names: tuple[str, ...], u: Any, count: int) -> Array:
 
 
 def _not_finite(rows: Array) -> list[int]:
-    """Return the rows with an entry that is not finite; a finite sum tells that there is none."""
+    """Return the rows with an entry that is not finite; a finite sum excludes any."""
     with np.errstate(all="ignore"):
         if np.isfinite(rows.sum()):
             return []

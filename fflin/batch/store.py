@@ -212,7 +212,7 @@ def part_of(path: Path) -> Path:
 
 
 def check_room(count: int, size: int, path: Path | None, what: str = "points") -> None:
-    """Raise where so many points, of so many bytes, fit neither file nor memory."""
+    """Raise if `count` points of `size` bytes in total do not fit into the file or memory."""
     said = f"{count:,} {what} need {readable(size)}"
     if path is None:
         if size > (memory := _memory()):

@@ -21,15 +21,15 @@ _PATIENCE = 5.0
 
 
 class WorkerDied(BrokenExecutor):
-    """The process that did a task is gone; the others are not."""
+    """Error of a task whose worker process died; other workers continue."""
 
 
 class NoWorkers(BrokenExecutor):
-    """No process can be started."""
+    """Error if no worker process can be started."""
 
 
 class OwnWorkers(Executor):
-    """Processes of our own; one that dies is replaced and harms no task but its own."""
+    """Executor of worker processes; if one dies, only its task fails and it is replaced."""
 
     def __init__(self, count: int) -> None:
         cores = available_cores()

@@ -57,7 +57,7 @@ class Weights(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """How fast a loop comes back that no limit slows, from which share of the displacements."""
+    """Bandwidth of a loop without active limits, and the fraction of the displacements."""
 
     bandwidth: float = BANDWIDTH  # [rad/s]
     share: float = 1.0
@@ -299,10 +299,10 @@ class _Trial(NamedTuple):
 def _slowed(
     lin: LinearModel, costs: _Costs, size: Array, driven: Array, limit: _Limit
 ) -> tuple[_Limit, str]:
-    """Slow a loop with springs or gravity until it keeps within the limits; say what it achieves.
+    """Slow a loop with springs or gravity until it respects the limits; report what it achieves.
 
-    What is displaced by `size` (m,) asks for efforts at first, what inputs drive by `driven` on its
-    way back too: a joint without a motor is where its spring or gravity leaves it.
+    Displacements `size` (m,) require efforts at the start, and displacements `driven` also on the
+    way back. The latter omit joints without a motor, which springs or gravity move.
     """
     trials = list[_Trial]()
     for _ in range(_TRIALS):
@@ -342,7 +342,7 @@ def _on_the_way(lin: LinearModel, solution: Solution, size: Array) -> Array:
 
 
 def _achieved(lin: LinearModel, solution: Solution, bandwidth: float) -> str:
-    """Say how fast a loop decays, and which of its modes are slower than at rest."""
+    """Return a report of a loop's bandwidth and decay, and of modes slower than at rest."""
     m, (poles, modes) = len(lin.M), np.linalg.eig(lin.A - lin.B @ solution.K)
     rates = rates_of(poles, lin.dt)
     decay, fast = -rates.real, np.abs(rates)

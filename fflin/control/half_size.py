@@ -11,7 +11,7 @@ from fflin.base.validation import Array
 
 
 class ModalMatrix:
-    """The modes V (n, n) of a real matrix F, those of complex pairs side by side."""
+    """Modes V (n, n) of a real matrix F, with complex pairs side by side."""
 
     def __init__(self, V: Any, poles: Any, discrete: bool) -> None:
         self.V, self.inverse, self.values = V, np.linalg.inv(V), poles

@@ -25,7 +25,7 @@ _OPEN, _SOFT, _PASSES, _MOST = 1e30, 8, 2, 10_000
 
 
 class Stage(NamedTuple):
-    """A sample, e' = A e + B d with d = u - u*, and limits on E e' + D d, first those of inputs."""
+    """Stage e' = A e + B d with d = u - u*, and limits on E e' + D d, input limits first."""
 
     A: Array  # (nx, nx)
     B: Array  # (nx, nu)

@@ -59,7 +59,7 @@ class Sample(NamedTuple):
 
 
 class Compensation:
-    """What a law does from sample to sample or, where dt is 0, stage to stage, from z = 0 on."""
+    """Control law with a state z, advanced from sample to sample, or per stage if dt is 0."""
 
     def __init__(self, size: int, at: Callable[[float], Sample], dt: float = 1.0) -> None:
         self.at, self.dt = at, dt
@@ -90,7 +90,7 @@ class Compensation:
 
 
 class Loop(Compensation):
-    """The policy of a law on what the robot measures, relative to where it is to be."""
+    """Policy of a control law on the robot's outputs, relative to its reference."""
 
     def __init__(
         self, state: StateMap, dt: float, noise: Any, size: int, at: Any, there: Any

@@ -296,7 +296,7 @@ def _sought(
 
 
 class _Search(NamedTuple):
-    """What stays the same while a plan is sought."""
+    """Constant data of a search for a plan."""
 
     shooting: Shooting
     limits: Array  # least and largest inputs (2, nu)
@@ -307,7 +307,7 @@ class _Search(NamedTuple):
     def step(
         self, q: Array, v: Array, u: Array, missed: Array, near: Array, effort: Array
     ) -> StageSolution | None:
-        """Return the best step of all knots and inputs; None where there is none."""
+        """Return the best step of all knots and inputs; None if no step is found."""
         space, nx = self.room(q, v), self.shooting.state.nx
         if not max(_excess(space).max(), np.abs(missed).max()) < np.inf:
             return None
@@ -343,12 +343,12 @@ class _Search(NamedTuple):
         return u
 
     def acting(self, u: Array) -> Array:
-        """Return inputs of which the last, where they are held, is that of the last interval."""
+        """Return the inputs; if held, the last row repeats the input of the last interval."""
         return np.vstack((u[:-1], u[-2])) if self.shooting.held else u
 
 
 def _shares(shooting: Shooting, R: Array, u: Array) -> Array:
-    """Return what the squares of inputs (N + 1, nu) cost, so that those of the guess cost one."""
+    """Return the cost of squared inputs (N + 1, nu), scaled so that the guess costs 1."""
     cost = np.tile(R, (len(u), 1))
     # Of the knots in an integral: by the trapezoidal rule, or as long as each input is held.
     if not shooting.held:
@@ -368,7 +368,7 @@ def _room(shooting: Shooting, end: Point, bounds: Array, asked: Array, q: Array,
 
 
 def _limited(state: StateMap, q: Array, v: Array) -> Array:
-    """Return what limits are of (N, nx): places and rates of joints, zero for the base."""
+    """Return the limited values (N, nx): positions and rates of joints, zero for the base."""
     n, values = state.robot.n, np.zeros((len(q), state.nx))
     values[:, 6 : 6 + n] = state.joint_positions(q)
     values[:, state.nx - n :] = state.velocities(v)[:, 6:]

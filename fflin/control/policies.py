@@ -224,7 +224,7 @@ def axes_of(policy: Any) -> tuple[Frame | None, pin.SE3 | None]:
 
 
 def bound(policy: Any, robot: Robot) -> Policy:
-    """Return a policy for a robot, or raise `InputError` where it is none."""
+    """Return a policy for a robot, or raise `InputError` if the object is not a policy."""
     result = policy.bind(robot) if hasattr(policy, "bind") else policy
     if not callable(result):
         raise InputError(

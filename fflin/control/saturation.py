@@ -30,7 +30,7 @@ class Wheels(NamedTuple):
     speeds: Callable[..., Array]  # (k,) [rad/s], of whatever the law is given
 
     def cut(self, u: Array, *point: object) -> Array:
-        """Return u (nu,) without what would take a wheel beyond its speed within a step."""
+        """Return u (nu,) with torques cut that would exceed a wheel's speed limit in a step."""
         room = np.clip(self.stiffness * (self.limits - self.speeds(*point)), *self.torques)
         # It cuts, and drives nothing of itself.
         given = np.clip(u[self.at], np.minimum(room[0], 0.0), np.maximum(room[1], 0.0))
@@ -41,7 +41,7 @@ class Wheels(NamedTuple):
 
 
 class Pulses:
-    """What thrusters (place, name, thruster) that fire in pulses make of each sample's command."""
+    """Pulses of thrusters (index, name, thruster) that realise the command of each sample."""
 
     # What is asked for and not fired, for whole steps or the least impulse, is carried to the next.
     # `high` (nu,) is what they give; where it is infinite, one that is on-off gives its own `max`.
@@ -86,7 +86,7 @@ class Pulses:
         self._acting[self.places] = 0.0
 
     def at(self, step: int) -> Array:
-        """Return what acts (nu,) in a step; the same array while nothing changes."""
+        """Return the applied inputs (nu,) in a step; the same array while nothing changes."""
         firing = step < self._end
         if (firing != self._firing).any():
             self._firing, self._acting = firing, self._acting.copy()
@@ -106,7 +106,7 @@ class Saturation(NamedTuple):
 def saturation(
     robot: Robot, limits: Mapping[str, Range], q: Array, dt: float, sample: int
 ) -> Saturation:
-    """Return what acts of a command at q, in steps of dt [s], `sample` steps to a sample or 0."""
+    """Return the saturation of commands at q, in steps of dt [s], `sample` steps a sample or 0."""
     inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
     names = list(inputs)
     low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in names]).T

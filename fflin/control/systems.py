@@ -132,7 +132,7 @@ def fitted(system: System, lin: LinearModel) -> System:
 
 
 def _places(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -> list[int]:
-    """Return which signals of a model those of a controller are."""
+    """Return the indices of a controller's signals among the signals of a model."""
     named = not all(map(_NUMBERED.fullmatch, names))
     if size != len(names if named else known):
         raise InputError(

@@ -150,7 +150,7 @@ class TrajectoryFeedback:
         InputError
             If the attitude is given twice, or ``|q_b|`` is not less than 1.
         UnknownNameError
-            If there is no such state.
+            If a state does not exist.
         """
         robot, (q, v, _) = self.trajectory.robot, self.reference(0.0)
         # A chart about where it begins, which may be turned by any angle itself.
@@ -222,7 +222,7 @@ def followed(policy: Any, robot: Robot, held: float = 0.0) -> Any:
 
 
 def reference_of(policy: Any) -> Reference | None:
-    """Return what a policy follows, where it follows a motion."""
+    """Return the reference of a policy that follows a motion, else None."""
     found = getattr(decider(policy), "reference", None)
     return found if callable(found) else None
 

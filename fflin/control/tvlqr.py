@@ -139,7 +139,7 @@ def tvlqr(
 
 
 def asks_steady(Qf: Any) -> bool:
-    """Whether Qf is "steady", or raise `InputError` where it is another word."""
+    """Return whether Qf is "steady"; raise `InputError` if it is another string."""
     if isinstance(Qf, str) and Qf != "steady":
         raise InputError(f"Qf is {Qf!r}, expected 'steady' or a weight")
     return isinstance(Qf, str)
@@ -159,7 +159,7 @@ def held_stages(
 
 
 def require_continuous(traj: LinearTrajectory) -> None:
-    """Raise `InputError` where something is no LinearTrajectory in continuous time."""
+    """Raise `InputError` if traj is not a LinearTrajectory in continuous time."""
     if not isinstance(traj, LinearTrajectory):
         raise InputError(
             f"traj is a {type(traj).__name__}, expected a LinearTrajectory; "

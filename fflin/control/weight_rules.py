@@ -29,7 +29,7 @@ _APART = 1e4
 
 
 class _Given(NamedTuple):
-    """A weight that is given, and whether as a largest value."""
+    """Given weight, and whether it was given as a largest value."""
 
     value: float
     largest: bool
@@ -83,9 +83,10 @@ def rule_weights(
 def _of_regulated(
     lin: LinearModel, pace: Pace, wheel_speeds: bool | None
 ) -> tuple[Array, Array, str, Array]:
-    """Return Q (nx, nx), R and the rule of what is regulated of a model that may have wheels.
+    """Return Q (nx, nx), R, the rule and costs, for a model that may have wheels.
 
-    Last is what the largest of each state and input (nx + nu,) costs, 0 where the rule has none.
+    The costs (nx + nu,) are those of the largest value of each state and input, 0 if the rule has
+    none.
     """
     part = regulated_part(lin, wheel_speeds)
     if part is lin:
@@ -146,8 +147,8 @@ def _reweighed(
 ) -> tuple[Array, Array]:
     """Return Q and R, scaled to the largest values that are given, with what is given in them.
 
-    A common factor of Q and R changes no gain. That of the rule takes what it lets the largest of
-    the named states and inputs cost to 1, as Bryson's rule does.
+    A common factor of Q and R does not change the gain. The rule's weights are scaled so that the
+    largest values of the named states and inputs cost 1, as in Bryson's rule.
     """
     costs = [terms[index] for index, each in given.items() if each.largest and terms[index]]
     scale = math.exp(-np.log(costs).mean()) if costs else 1.0

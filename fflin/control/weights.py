@@ -91,7 +91,7 @@ def is_input(kind: str, key: str, lin: Any) -> bool:
 
 
 def inverse_square(what: str, size: float) -> float:
-    """Return 1/size^2, or raise `InputError` where that is no positive number."""
+    """Return 1/size^2, or raise `InputError` if it is not a positive finite number."""
     if size <= 0.0:
         raise InputError(f"{what} is {size:g}, expected a positive number")
     if not 1e-150 <= size <= 1e150:
@@ -134,7 +134,7 @@ def columns(what: str, value: ArrayLike, rows: int) -> Array:
 def require_semidefinite(
     what: str, matrix: Array, names: Sequence[str], definite: bool = False
 ) -> None:
-    """Raise `InputError` with the lowest eigenvalue where a symmetric matrix is not so."""
+    """Raise `InputError` with the lowest eigenvalue if a matrix is not positive semidefinite."""
     values, directions = np.linalg.eigh(matrix)
     if definite or values[0] < -_ROUNDING * np.abs(matrix).max(initial=0.0):
         where = names[int(np.abs(directions[:, 0]).argmax())]
@@ -268,6 +268,6 @@ def _diagonal(
 def _negative(what: str, value: float, where: str, definite: bool) -> InputError:
     kind = "definite" if definite else "semidefinite"
     return InputError(
-        f"{what} is not positive {kind}: it has the eigenvalue {value:.6g}, with an eigenvector "
+        f"{what} is not positive {kind}: it has the eigenvalue {value:.6g} with an eigenvector "
         f"mainly along {where}; increase the weight there"
     )

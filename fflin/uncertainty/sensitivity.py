@@ -276,7 +276,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     ----------
     lin : LinearModel
         Result of `linearize` in this session, about any point and in any frame. If `discretize`
-        sampled it, the derivatives are those of the sampled A, B and f0.
+        sampled it, the sampled A, B and f0 are differentiated.
 
     Returns
     -------

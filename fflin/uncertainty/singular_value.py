@@ -56,7 +56,7 @@ def largest_bound(
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
     def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
-        """Return the bound of an interval and what gives it, and that of its middle alone."""
+        """Return the bound of an interval with its scaling, and the bound of its middle alone."""
         Z = response(np.linspace(a, b, _HELD))
         middle = Z[_HELD // 2]
         found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]
@@ -85,7 +85,7 @@ def largest_bound(
 
 
 def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
-    """Return scalings that are good for Z, with those of AB13MD where blocks are told."""
+    """Return scalings that are good for Z, with the scaling of AB13MD if blocks are given."""
     none: Array = np.zeros(len(Z))
     found: list[Scaling] = [(perron(Z)[:, 0], none)]
     if len(Z) == 1 and len(blocks) and Z[0, 0].imag:

@@ -29,7 +29,7 @@ Figure: TypeAlias = Callable[[Array], Array]  # how bad loops are, of rows of de
 
 
 class Figures(NamedTuple):
-    """How bad loops are: by a few frequencies, by all, and which are worse than a bound."""
+    """Criterion of a loop: by a few frequencies, by all, and loops worse than a bound."""
 
     quick: Figure
     exact: Figure
