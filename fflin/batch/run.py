@@ -72,7 +72,7 @@ def run_chunks(
         if progress:
             progress(count, store.count)
     if notes:
-        more = f" (and {len(notes) - 1} more chunks)" if len(notes) > 1 else ""
+        more = f" (and {len(notes) - 1} more such warnings)" if len(notes) > 1 else ""
         warnings.warn(notes[0] + more, FflinWarning, stacklevel=3)
     return sorted(failed)
 

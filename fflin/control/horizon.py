@@ -146,9 +146,9 @@ class Receding:
         """Notes on the run: plans, exceeded limits and failures of the solver."""
         said = f"{self.solves} plans of {self.of.samples} samples of {self.of.dt:g} s"
         if self.softened:
-            said += f"; {self.softened} plans exceed a soft limit, at most {self._said}"
+            said += f"; {self.softened} plans exceed a soft limit (worst: {self._said})"
         if self.passed:
-            said += f"; the robot exceeds one at {self.passed} samples, at most {self._met}"
+            said += f"; the robot exceeds one at {self.passed} samples (worst: {self._met})"
         if self.unfinished:
             said += f"; {self.unfinished} plans not found: regulator used, cut at the limits"
         return (said,) if self.solves else ()

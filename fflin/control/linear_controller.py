@@ -206,8 +206,8 @@ class LinearController:
         lin = instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
         if lin.moving or number("sign", self.sign) not in (1.0, -1.0):
             raise InputError(
-                "the model is about a moving reference or sign is not 1 or -1, expected a model "
-                "about a fixed point, and sign=1 or sign=-1"
+                f"sign is {self.sign!r} and lin.moving is {lin.moving}, expected sign 1 or -1 and "
+                "a model about a fixed point, with moving False"
             )
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")

@@ -63,7 +63,8 @@ class OutputFeedback(LinearController):
     ) -> None:
         if not isinstance(lin, LinearModel) or not isinstance(compensator, Compensator):
             raise InputError(
-                "OutputFeedback takes a LinearModel and a Compensator, as fflin.lqg returns it"
+                f"OutputFeedback got a {type(lin).__name__} and a {type(compensator).__name__}, "
+                "expected a LinearModel and a Compensator, as fflin.lqg returns it"
             )
         if not lin.dt or lin.moving:
             raise InputError(
@@ -144,7 +145,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         super().bind(robot)  # refuses another robot
         origin, home = self.trajectory.robot, StateMap(robot, frame="local")
         own = sensed(StateMap(origin, frame="local"))
-        made = f"the trajectory is one of '{origin.name}'"
+        made = f"the trajectory is a motion of '{origin.name}'"
         require_same(made, robot, "output", own, sensed(home))
 
         def there(t: float) -> tuple[Measuring, Array]:

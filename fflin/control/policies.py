@@ -165,7 +165,7 @@ class Allocation:
                 f"the design's joints differ from the joints of '{robot.name}'; give the same "
                 "robot, with other inputs, as the design"
             )
-        require_turns(f"the design is '{self.design.name}'", self.design.nq, robot)
+        require_turns(f"the design is a variant of '{self.design.name}'", self.design.nq, robot)
         frame, reference = axes_of(self)
         asked, given = (
             StateMap(each, reference=reference, frame=frame) for each in (self.design, robot)

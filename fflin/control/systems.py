@@ -84,8 +84,8 @@ def _checked(
     for key, each, shape in zip("ABCD", (A, B, C, D), shapes, strict=True):
         if each.shape != shape or not np.isfinite(each).all():
             raise InputError(
-                f"{key} of the controller has shape {each.shape}, expected {shape}, finite, for "
-                f"{nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
+                f"{key} of the controller has shape {each.shape}, expected {shape} with finite "
+                f"entries, for {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
             )
     if dt is not None:
         # True is of a system that is sampled nobody knows how, -1 MATLAB's word for it.

@@ -71,7 +71,8 @@ class TrajectoryFeedback:
             isinstance(self.trajectory, Trajectory) and isinstance(self.schedule, GainSchedule)
         ):
             raise InputError(
-                "TrajectoryFeedback takes a LinearTrajectory and a GainSchedule, as "
+                f"TrajectoryFeedback got a {type(self.trajectory).__name__} and a "
+                f"{type(self.schedule).__name__}, expected a Trajectory and a GainSchedule, as "
                 "fflin.linearize_trajectory and fflin.tvlqr return them"
             )
 
@@ -196,7 +197,7 @@ class TrajectoryFeedback:
         """
         origin = self.trajectory.robot
         state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
-        made = f"the trajectory is one of '{origin.name}'"
+        made = f"the trajectory is a motion of '{origin.name}'"
         for kind, pair in (("input", map(Actuation, (own, state))), ("state", (own, state))):
             require_same(made, robot, kind, *((each.names, each.units) for each in pair))
         require_turns(made, origin.nq, robot)

@@ -215,7 +215,9 @@ def _steady(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Array:
     try:
         return kalman(lin, W, V).P
     except (DetectabilityError, InputError) as error:
-        raise type(error)(f"at the start: {error}; give P0") from None
+        raise type(error)(
+            f"no steady filter exists at the start of the trajectory: {error}; give P0"
+        ) from None
 
 
 def _sampled(

@@ -178,7 +178,9 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
         return resting_end(traj, end)
     except EquilibriumError as error:
         where, given = ("end", "Q, R and Qf") if end else ("start", "P0")
-        raise EquilibriumError(f"at the {where}: {error}; give {given}") from None
+        raise EquilibriumError(
+            f"no inputs hold the robot at the {where} of the trajectory: {error}; give {given}"
+        ) from None
 
 
 def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
