@@ -157,7 +157,7 @@ class Dispatch:
 
     def _given_up(self, error: BaseException) -> Iterator[Done]:
         """Yield the chunks that an executor took with it when it died."""
-        reason = f"the executor died: {type(error).__name__}: {error}".rstrip(": ")
+        reason = f"the executor failed: {type(error).__name__}: {error}".rstrip(": ")
         if isinstance(error, NoWorkers):
             reason = str(error)
         running, self._running = self._running, {}

@@ -55,12 +55,12 @@ def lqr(
     solver sees it. `acceleration_lqr` avoids this loss.
 
     Without weights, the regulator respects the limits of the URDF, (10.7) of docs/derivation.md.
-    Its slowest motion has a bandwidth of 0.2 rad/s. The bandwidth is reduced if the robot would
-    exceed its effort or speed limits when it returns from these displacements: 30 deg of the base
-    and 0.3 rad of each joint. Each input then has a phase margin of 60 deg and tolerates any gain
-    factor above one half. With springs or gravity, each mode that the inputs reach decays as fast
-    as without them (10.8). ``gain.weights`` states the bandwidth, decay rate and damping of the
-    loop, and names slower modes.
+    Its slowest motion has a bandwidth of 0.2 rad/s. The bandwidth is lower if the robot would
+    otherwise exceed an effort or speed limit. The limits are checked for a return from 30 deg of
+    the base and 0.3 rad of each joint. Each input then has a phase margin of 60 deg and tolerates
+    any gain factor above one half. With springs or gravity, each mode that the inputs reach decays
+    as fast as without them (10.8). ``gain.weights`` states the bandwidth, decay rate and damping
+    of the loop, and names slower modes.
 
     For a model with reaction wheels, only the controllable part is regulated, (9.4) of
     docs/derivation.md; ``gain.regulated`` lists its states. Weights have no effect on the others:

@@ -72,8 +72,8 @@ class TrajectoryFeedback:
         ):
             raise InputError(
                 f"TrajectoryFeedback got a {type(self.trajectory).__name__} and a "
-                f"{type(self.schedule).__name__}, expected a Trajectory and a GainSchedule, as "
-                "fflin.linearize_trajectory and fflin.tvlqr return them"
+                f"{type(self.schedule).__name__}, expected a LinearTrajectory and a GainSchedule, "
+                "as fflin.linearize_trajectory and fflin.tvlqr return them"
             )
 
     @property

@@ -46,9 +46,9 @@ def tvlqr(
 
     .. math:: e(T)^T Q_f\,e(T) + \int_t^T e^T Q\,e + \delta u^T R\,\delta u\;d\tau.
 
-    The differential Riccati equation :math:`-\dot P = A^T P + P A - P B R^{-1} B^T P + Q`,
-    :math:`P(T) = Q_f`, is solved backwards from knot to knot by maps of the form
-    :math:`P_0 = W + T^T P_1 (E + G P_1)^{-1} T`, with E the identity and W and G positive
+    The differential Riccati equation is :math:`-\dot P = A^T P + P A - P B R^{-1} B^T P + Q`, with
+    :math:`P(T) = Q_f`. It is solved backwards from knot to knot by maps
+    :math:`P_0 = W + T^T P_1 (E + G P_1)^{-1} T`. Here E is the identity, and W and G are positive
     semidefinite. Each map is computed from a short matrix exponential by doubling, so P stays
     positive semidefinite over any horizon. The method is of fourth order along a changing
     trajectory and exact along a constant one. Knots are added until halving and interpolation

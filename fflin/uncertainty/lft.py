@@ -1,7 +1,7 @@
 r"""Linear-fractional models: A and B as exact functions of uncertain parameters.
 
 :math:`\dot x = A x + B_1 w + B_2 u,\; z = C_1 x + D_{11} w + D_{12} u,\; w = \Delta z` with
-:math:`\Delta = \mathrm{diag}(\delta_k I_{r_k})`, each :math:`\delta_k` between -1 and 1.
+:math:`\Delta = \mathrm{diag}(\delta_k E_{r_k})`, each :math:`\delta_k` between -1 and 1.
 """
 
 from __future__ import annotations
@@ -120,7 +120,8 @@ class LFT(Design):
         Returns
         -------
         A, B, C, D : ndarray
-            :math:`A + B_1 \Delta (I - D_{11} \Delta)^{-1} C_1` and so on, for each row.
+            :math:`A + B_1 \Delta (E - D_{11} \Delta)^{-1} C_1` and so on, for each row, with E the
+            identity.
 
         Raises
         ------
