@@ -61,9 +61,9 @@ def sweep(
 
     With numba installed (``pip install 'fflin[fast]'``), a compiled kernel processes eight points
     at a time, on all threads. At rest M depends on the joints only, and
-    :math:`B = [0;\, M^{-1}]`; operating points in motion are supported too. Without numba, or if
-    the robot has other outputs than its state, a `Linearizer` processes the points one by one,
-    which can be distributed to processes.
+    :math:`B = [0;\, M^{-1}]`. The kernel also supports operating points in motion. Without numba,
+    or if the robot has other outputs than its state, a `Linearizer` processes the points one by
+    one. These points can be distributed over worker processes.
 
     Parameters
     ----------
@@ -85,8 +85,8 @@ def sweep(
     threads : int, optional
         Threads of the kernel in this process; by default all available cores.
     chunk : int, optional
-        Number of points in a chunk. By default a chunk's result has about 4 MB. A resumed sweep
-        uses the chunk size of its unfinished file.
+        Number of points in a chunk. By default the result of a chunk takes about 4 MB. A resumed
+        sweep uses the chunk size of its unfinished file.
     progress : callable, optional
         Function ``progress(done, total)``, called after every chunk with numbers of points.
     out : str or Path, optional

@@ -370,7 +370,7 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: flo
         sizes = " or ".join(f"{d:.2g} {unit}" for unit, d in joints.items())
         from_where.append(f"{sizes} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size, the URDF has no limits"
-    slow = f", set by {limit.what}" if limit.what else ""
+    slow = f"; bandwidth set by {limit.what}" if limit.what else ""
     if beyond := [name for name, room in _efforts(lin).items() if room <= 0.0]:
         slow += f"; at or beyond the URDF limit at the point itself: {listed(beyond)}"
     pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"

@@ -87,7 +87,8 @@ class GainSchedule(Schedule):
         Weights of the continuous cost.
     residual : float
         Largest residual of the differential Riccati equation midway between the knots, relative
-        to the sum of the norms of its terms. For a sampled schedule, of the difference equation.
+        to the sum of the norms of its terms. For a sampled schedule, the residual of the
+        difference equation.
     state_names, input_names : tuple of str
     robot : str
     dt : float

@@ -82,12 +82,13 @@ def lqr(
         Cross weight. Q - N R^-1 N' must be positive semidefinite.
     weights : {"urdf", "identity"}, optional
         Rule for the weights, instead of Q and R: "urdf" is the rule above (default), "identity"
-        is 1 on every state and input. For a sampled model, the rule gives the continuous cost
-        under the hold.
+        is 1 on every state and input. For a sampled model, the rule applies to the continuous
+        cost, which is then sampled under zero-order hold.
     wheel_speeds : bool, optional
-        Whether to regulate the wheel speeds to their values at the point. By default, if inputs
-        other than the wheels can do it. True: also if only wheels turning against each other can
-        do it. False: never. The default weights return them at a tenth of the bandwidth.
+        Whether to regulate the wheel speeds to their values at the point. By default they are
+        regulated if inputs other than the wheels can do it. With True, also if only wheels turning
+        against each other can do it. With False, never. The default weights return them at a tenth
+        of the bandwidth.
 
     Returns
     -------

@@ -68,7 +68,7 @@ def mpc(
     Parameters
     ----------
     lin : LinearModel or LinearTrajectory
-        Continuous model or trajectory, or a model that `discretize` made of a continuous one.
+        Continuous model or trajectory, or a sampled model that `discretize` returned.
     Q, R : see `lqr`, optional
         Weights of the integral. By default the weights of `lqr` or `tvlqr`, by the rule `weights`.
     horizon : int

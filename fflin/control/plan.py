@@ -66,12 +66,12 @@ def plan(
     R: Weight | None = None,
     free: Sequence[str] = (),
 ) -> Trajectory:
-    r"""Plan a low-effort trajectory to a goal within limits, such as a slew or a detumbling.
+    r"""Plan a low-effort trajectory to a goal within limits, such as a slew or detumbling.
 
     The plan minimises :math:`\int u^T R\,u\;dt`. Inputs, joints and wheels stay within their
     limits. The method is multiple shooting: the start of each interval is a variable. Sequential
-    quadratic programming searches a local minimum in at most 50 iterations. The quadratic programs
-    are built from the linear models along the motion and solved by PIQP
+    quadratic programming searches for a local minimum in at most 50 iterations. The quadratic
+    programs are built from the linear models along the motion and solved by PIQP
     (``pip install 'fflin[mpc]'``).
 
     The attitude may turn by any angle. It makes whole turns if the angular rates at both ends

@@ -74,7 +74,8 @@ class Sensitivity:
 
     Other parameters are ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
     ``THRUSTER.direction.x`` (its part that rotates the unit vector) and ``WHEEL.inertia``. The
-    inertia of a wheel is part of its carrier's inertia, which therefore changes oppositely.
+    inertia of a carrier includes its wheels. A larger wheel inertia therefore reduces the inertia
+    of the rest of the carrier.
 
     Attributes
     ----------

@@ -205,8 +205,8 @@ class Uncertain:
         q : array_like (nq,), optional
             Configuration, as in `lft`.
         samples : int
-            Number of random draws, tried after the corners of the set. From each loop that is
-            worse than the worst before it, a local search continues.
+            Number of random draws, tried after the corners of the set. A local search starts from
+            each loop that is worse than all loops before it.
         seed : int
             The same seed gives the same draws.
 

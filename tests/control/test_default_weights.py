@@ -141,7 +141,7 @@ def test_efforts_hold_for_every_displacement_and_one_limit_binds(loops, name):
     weak = fflin.from_model(model)
     lin = fflin.linearize(weak)
     gain = fflin.lqr(lin)
-    assert re.search(r" rad/s, set by the effort of \w+$", gain.weights)
+    assert re.search(r" rad/s; bandwidth set by the effort of \w+$", gain.weights)
     m = len(lin.M)
     sizes = np.array(
         [
