@@ -233,7 +233,7 @@ def _unregulated(gain: Gain) -> str:
     left = [name for name in gain.state_names if gain.regulated and name not in gain.regulated]
     base = [name for name in left if name.startswith(("r_b.", "v_b."))]
     shown = "r_b, v_b" if len(base) == 6 else ", ".join(base)
-    parts = [f"{shown} (no input pushes it)"] if base else []
+    parts = [f"{shown} (no input pushes the base)"] if base else []
     if any(name.startswith("q_m.") for name in left):
         parts.append("wheel angles (ignorable)")
     if speeds := [name for name in left if name.startswith("qdot_m.")]:

@@ -56,11 +56,11 @@ def lqr(
 
     Without weights, the regulator respects the limits of the URDF, (10.7) of docs/derivation.md.
     Its slowest motion has a bandwidth of 0.2 rad/s. The bandwidth is lower if the robot would
-    otherwise exceed an effort or speed limit. The limits are checked for a return from 30 deg of
-    the base and 0.3 rad of each joint. Each input then has a phase margin of 60 deg and tolerates
-    any gain factor above one half. With springs or gravity, each mode that the inputs reach decays
-    as fast as without them (10.8). ``gain.weights`` states the bandwidth, decay rate and damping
-    of the loop, and names slower modes.
+    otherwise exceed an effort or speed limit. The limits are checked for a return from a
+    displacement of 30 deg of the base and 0.3 rad of each joint. Each input then has a phase
+    margin of 60 deg and tolerates any gain factor above one half. With springs or gravity, each
+    mode that the inputs reach decays as fast as without them (10.8). ``gain.weights`` states the
+    bandwidth, decay rate and damping of the loop, and names slower modes.
 
     For a model with reaction wheels, only the controllable part is regulated, (9.4) of
     docs/derivation.md; ``gain.regulated`` lists its states. Weights have no effect on the others:

@@ -37,8 +37,8 @@ class TrajectoryFeedback:
 
     The error is defined as in `linearize_trajectory`. Torques and forces on the base are in base
     axes, and t is the time since the first knot. After the end, the target is the last
-    configuration at rest. The command is then the holding input there plus the feedback of the
-    regulator with the same weights.
+    configuration at rest. The command is then the sum of the inputs that hold the robot there and
+    the feedback of the regulator with the same weights.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class TrajectoryFeedback:
         Result of `tvlqr`.
     held : bool
         Whether commands are held between samples; for a sampled schedule they always are. If
-        held, the command at the end of the trajectory is already the holding input.
+        so, the command at the last knot already contains the inputs that hold the robot there.
 
     Examples
     --------
