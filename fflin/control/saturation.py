@@ -60,8 +60,8 @@ class Pulses:
         for (_, name, item), most in zip(thrusters, self.most.tolist(), strict=True):
             if not sample:
                 raise InputError(
-                    f"thruster '{name}' is pulsed (on_off, least_impulse), which needs a sampling "
-                    "time; give `sample`, or a policy on a sampled model"
+                    f"thruster '{name}' is pulsed (on_off, least_impulse), which needs sampled "
+                    "commands; give the time between samples, or a policy on a sampled model"
                 )
             if (item.least_impulse or 0.0) > most * self.time:
                 raise InputError(
