@@ -40,13 +40,13 @@ def acceleration_lqr(
 
     Let the accelerations :math:`a = L u` be the inputs, where L is the lower block of B. A model
     at rest then has one double integrator per coordinate, :math:`\ddot q_i = s_i a_i`, with
-    s = 1/2 for attitude and s = 1 otherwise. Diagonal weights decouple the coordinates. In
-    continuous time, (10.2) of docs/derivation.md,
+    s = 1/2 for attitude and s = 1 otherwise. Diagonal weights decouple the coordinates. By (10.2)
+    of docs/derivation.md, the regulator in continuous time is
 
     .. math:: k_p = \sqrt{q_p/r_a},\quad k_d = \sqrt{q_v/r_a + 2 s k_p},\quad
               u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
 
-    and the poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. Under an exact
+    and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. Under an exact
     zero-order hold the coordinates remain decoupled, and each has a closed form too. The speed of
     a reaction wheel whose angle is not regulated is a single integrator with k_p = 0. The weight
     on u is :math:`L^T R_a L`. The gain is computed without this product, so an ill-conditioned

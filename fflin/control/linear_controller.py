@@ -180,9 +180,11 @@ class LinearController:
     Raises
     ------
     InputError
-        If a size, name or sampling time does not fit the model, an entry is not finite, or a
-        transfer function is improper. Also if D acts on an output with direct feedthrough from
-        the inputs, which would be an algebraic loop.
+        If one of these holds:
+
+        - a size, name or sampling time does not fit the model;
+        - an entry is not finite, or a transfer function is improper;
+        - D acts on an output with direct feedthrough from the inputs (algebraic loop).
     FileError
         If the file cannot be read or lacks the matrices named above.
 

@@ -86,9 +86,9 @@ def lqr(
         cost, which is then sampled under zero-order hold.
     wheel_speeds : bool, optional
         Whether to regulate the wheel speeds to their values at the point. By default they are
-        regulated if inputs other than the wheels can do it. With True, also if only wheels turning
-        against each other can do it. With False, never. The default weights return them at a tenth
-        of the bandwidth.
+        regulated if inputs other than the wheels can do it. With True they are also regulated if
+        only wheels turning against each other can do it. With False they are never regulated. The
+        default weights return wheel speeds at a tenth of the bandwidth.
 
     Returns
     -------

@@ -59,8 +59,8 @@ def mpc(
     - Input limits are hard: inputs never exceed them.
     - Limits of states and outputs are soft and hold at the samples, as the linear model predicts.
       If the program is infeasible, they are exceeded slightly; the motion's `notes` report it.
-    - If the solver finds no plan, the regulator's command is applied, cut at the input limits. A
-      warning reports it.
+    - If the solver finds no plan, the regulator's command is applied, cut at the input limits,
+      and a warning is issued.
 
     DAQP solves the quadratic program (docs/guide/mpc.md; ``pip install 'fflin[mpc]'``). It starts
     from the limits that were active at the previous sample.

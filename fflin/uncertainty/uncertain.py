@@ -89,9 +89,9 @@ class Uncertain:
         Raises
         ------
         InputError
-            If the point is not a fixed point for all parameters, because of gravity, an orbit,
-            stored momentum or a deflected spring. Also if an output depends on accelerations or
-            masses.
+            If an output depends on accelerations or masses, or the point is not a fixed point for
+            all parameters. The latter happens with gravity, an orbit, stored momentum or a
+            deflected spring.
         """
         robot = self.robot
         lin = linearize(robot, q)
