@@ -1,4 +1,4 @@
-"""Public names of fflin, for type checkers and for `fflin/__init__.py` at run time."""
+"""Public names of fflin: type checkers read them here, `fflin/__init__.py` at run time."""
 
 __version__: str
 

@@ -1,8 +1,9 @@
-"""Many points at once: points, workers, files, gains between points.
+"""Sweeps: linear models and gains about many points, on threads or worker processes.
 
-`run` takes any rows through any job: chunk by chunk, on threads or by `dispatch` on workers, into a
-`store` that goes on after a crash. A sweep is such a run: of `configurations` (and what is the same
-about them, a `task`) through the job of `chunks`; a `linear_batch` is read from the store.
+`run` processes rows by a job, chunk by chunk, on threads or through `dispatch` on workers. Results
+go into a `store`, from which a run resumes after a crash. In a sweep the rows are `configurations`,
+a `task` holds the data common to all of them, and the job is in `chunks`. The result is a
+`linear_batch`.
 
 Imports `base`, `robot`, `dynamics`, `kernel`, `linear` and `control`.
 """

@@ -1,4 +1,4 @@
-"""What a file has of a `LinearBatch` beside its rows, and what its models ask the robot for."""
+"""Header of a `LinearBatch` file, and the data that its models compute from the robot."""
 
 from __future__ import annotations
 
@@ -64,7 +64,10 @@ def read_batch(path: Path, robot: Robot | None, *, verify: bool) -> dict[str, An
     made_of = fields["urdf_sha256"], fields["locked"], tuple(joints)
     given_one = robot.urdf_sha256, robot.locked, robot.joint_names
     if (*given_one, mean_motion(robot)) != (*made_of, n):
-        raise InputError(f"'{robot.name}' is not the robot that the batch is of")
+        raise InputError(
+            f"robot '{robot.name}' differs from the robot '{fields['robot']}' of the batch in its "
+            "URDF, joints or orbit; give the robot that the batch was made of"
+        )
     from fflin.linear.prepared import prepare
 
     prepared = prepare(robot, frame=fields["frame"], reference=None, moving=fields["moving"])
@@ -78,8 +81,8 @@ def asked_of(common: Mapping[str, Any]) -> dict[str, Any]:
 
 def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:
     raise InputError(
-        f"the {what} needs the robot: load the batch with LinearBatch.load(path, robot) where "
-        f"robot is '{name}' as it was"
+        f"the {what} is not in the file and needs the robot; load the batch with "
+        f"LinearBatch.load(path, robot), with the unchanged robot '{name}'"
     )
 
 

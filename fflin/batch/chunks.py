@@ -1,4 +1,4 @@
-"""The part of a sweep that a worker does: the models about the points of one chunk."""
+"""Job of a sweep's workers: linear models about the points of one chunk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many configurations: given, on a grid, or random; made as they are needed."""
+"""Sets of configurations: given, on a grid, or random, generated on demand."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ _TURN = (-math.pi, math.pi)
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """All combinations of joint values, the last joint's varying fastest; see `grid`.
+    """Grid of configurations: all combinations of joint values; see `grid`.
+
+    The values of the last joint vary fastest.
 
     Attributes
     ----------
@@ -37,7 +39,7 @@ class Grid:
     axes : mapping
         {joint: values (k,) [rad|m]}.
     start : ndarray (nq,)
-        What the base and the other joints are at.
+        Configuration of the base and of the joints that are not on the grid.
 
     Examples
     --------
@@ -70,16 +72,17 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class RandomConfigurations:
-    """Joint values drawn evenly from ranges; see `random_configurations`.
+    """Random configurations, uniform in ranges of the joints; see `random_configurations`.
 
     Attributes
     ----------
     robot : Robot
     count, seed : int
+        Number of configurations, and seed of the draws.
     ranges : mapping
         {joint: (low, high) [rad|m]}.
     start : ndarray (nq,)
-        What the base is at.
+        Configuration that fixes the base.
 
     Examples
     --------
@@ -136,27 +139,26 @@ def grid(
     joints: Mapping[str, float] | None = None,
     base: pin.SE3 | None = None,
 ) -> Grid:
-    """Lay a grid over joint values.
+    """Return a grid of configurations over joint values, for `sweep`.
 
     Parameters
     ----------
     robot : Robot
     axes : mapping
-        {joint: increasing values (k,) [rad|m]}, the last varying fastest.
+        {joint: increasing values (k,) [rad|m]}. The last joint varies fastest.
     joints, base : optional
-        Of the other joints and the base, as `configuration` takes them.
+        Values of the other joints and pose of the base, as in `configuration`.
 
     Returns
     -------
     Grid
-        For `sweep`.
 
     Raises
     ------
     UnknownNameError
-        If there is no such joint.
+        If a joint does not exist.
     InputError
-        If there is no axis, or its values are none, not finite or do not increase.
+        If no axis is given, or the values of an axis are empty, not finite or not increasing.
 
     Examples
     --------
@@ -172,17 +174,22 @@ def grid(
     for name, values in axes.items():
         robot.joint(name)
         if joints and name in joints:
-            raise InputError(f"joint '{name}' is on the grid and in joints; give either")
+            raise InputError(
+                f"joint '{name}' is on the grid and in joints=; give it in only one of the two"
+            )
         axis = as_double(f"grid of joint '{name}'", values)
         if axis.ndim != 1 or not axis.size:
             raise InputError(f"grid of joint '{name}' has shape {axis.shape}, expected (k,), k > 0")
         if not np.isfinite(axis).all() or (np.diff(axis) <= 0.0).any():
-            raise InputError(f"grid of joint '{name}' must be finite numbers that increase")
+            raise InputError(
+                f"grid of joint '{name}' has values that are not finite or do not increase, "
+                "expected increasing finite numbers"
+            )
         axis.setflags(write=False)
         checked[name] = axis
     count = math.prod(map(len, checked.values()))
     if count > sys.maxsize:
-        raise InputError(f"{count:,} points are too many; choose fewer")
+        raise InputError(f"the grid has {count:,} points, too many to index; give fewer values")
     start.setflags(write=False)
     return Grid(robot, checked, start)
 
@@ -195,33 +202,32 @@ def random_configurations(
     ranges: Mapping[str, tuple[float, float]] | None = None,
     base: pin.SE3 | None = None,
 ) -> RandomConfigurations:
-    """Draw configurations evenly from the joints' limits.
+    """Return random configurations, uniform within the joint limits, for `sweep`.
 
     Parameters
     ----------
     robot : Robot
     count : int
-        How many.
+        Number of configurations.
     seed : int
         The same seed gives the same configurations.
     ranges : mapping, optional
-        {joint or pattern: (low, high) [rad|m]} in place of its limits. What turns without limits
-        is drawn from one turn.
+        {joint or pattern: (low, high) [rad|m]} instead of the joint limits. Revolute joints
+        without limits are drawn from one full turn.
     base : pin.SE3, optional
-        Placement of the base; the identity by default.
+        Pose of the base; the identity by default.
 
     Returns
     -------
     RandomConfigurations
-        For `sweep`.
 
     Raises
     ------
     UnknownNameError
-        If there is no such joint.
+        If a joint does not exist.
     InputError
-        If the count or seed is no whole number, a range is empty, or a joint that slides has no
-        limits and no range.
+        If the count or seed is not a whole number, a range is empty, or a prismatic joint has
+        neither limits nor a range.
 
     Examples
     --------
@@ -252,7 +258,8 @@ def as_configurations(robot: Robot, q: Any) -> Configurations:
     # The same robot with other inputs or outputs will do.
     if q.robot.joints != robot.joints:
         raise InputError(
-            f"q is of '{q.robot.name}', whose joints are others than those of '{robot.name}'"
+            f"q was made for '{q.robot.name}', whose joints differ from the joints of "
+            f"'{robot.name}'; make q for the robot that is swept"
         )
     return replace(q, robot=robot)
 
@@ -275,9 +282,9 @@ def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:
             raise InputError(f"{what} is {given!r}, expected (low, high)") from None
         low, high = number(what, low), number("its end", high)
         if not low <= high:
-            raise InputError(f"{what} is {low:g} to {high:g}, expected low to high")
+            raise InputError(f"{what} is {low:g} to {high:g}, expected low <= high")
         if math.isinf(high - low):
-            raise InputError(f"{what} is {low:g} to {high:g}, wider than all numbers; narrow it")
+            raise InputError(f"{what} is {low:g} to {high:g}, its width overflows; narrow it")
         return low, high
     if joint.unbounded:
         return _TURN
@@ -287,7 +294,9 @@ def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:
         low, high = max(low, 2 * _TURN[0]), min(high, 2 * _TURN[1])
         return (low, high) if low <= high and high - low < 4 * math.pi else _TURN
     if not (low <= high and abs(low) < 1e6 and abs(high) < 1e6):
-        raise InputError(f"joint '{joint.name}' slides without limits; give it a range")
+        raise InputError(
+            f"prismatic joint '{joint.name}' has no limits to draw from; give its range in ranges="
+        )
     return low, high
 
 

@@ -1,4 +1,4 @@
-"""Chunks of rows on the workers of an executor, of which some may die."""
+"""Distribution of chunks to the workers of an executor, with retries if a worker dies."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class ChunkResult(NamedTuple):
 
 
 class Job(Protocol):
-    """What is done to rows; it is pickled, and sent to every worker once."""
+    """Computation on rows; it is pickled, and sent to every worker once."""
 
     @property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
@@ -62,7 +62,7 @@ class Job(Protocol):
 
 
 class Done(NamedTuple):
-    """A chunk that came to an end: its result, or why there is none."""
+    """Finished chunk: its result, or the reason of its failure."""
 
     span: Span
     result: ChunkResult | None
@@ -70,7 +70,7 @@ class Done(NamedTuple):
 
 
 class Dispatch:
-    """The chunks that wait and those that run, how often each was begun, and the workers."""
+    """Waiting and running chunks, the number of attempts for each, and the workers."""
 
     def __init__(self, job: Job, rows: Rows, spans: list[Span], workers: Executor) -> None:
         content = pickle.dumps(job)
@@ -157,7 +157,7 @@ class Dispatch:
 
     def _given_up(self, error: BaseException) -> Iterator[Done]:
         """Yield the chunks that an executor took with it when it died."""
-        reason = f"the executor died: {type(error).__name__}: {error}".rstrip(": ")
+        reason = f"the executor failed: {type(error).__name__}: {error}".rstrip(": ")
         if isinstance(error, NoWorkers):
             reason = str(error)
         running, self._running = self._running, {}
@@ -197,7 +197,7 @@ def work(parcel: Parcel, rows: Any, start: int) -> ChunkResult | None:
 
 
 def _count(executor: Executor) -> int:
-    """How many workers an executor has, as far as it tells."""
+    """Return the number of workers of an executor, or a default if it is not known."""
     for name in ("_max_workers", "num_workers"):
         count = getattr(executor, name, None)
         if isinstance(count, int) and count > 0:

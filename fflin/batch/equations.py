@@ -1,4 +1,4 @@
-"""Linear models about many points at once, by the compiled kernel."""
+"""Linear models about many points by the compiled kernel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fflin.kernel.points import PointKernel
 from fflin.kernel.tree import LANES, Tree, batch_tree
 from fflin.linear.prepared import LARGEST, Prepared
 
-# Up to this angle the kernel's sines and cosines are exact to rounding [rad].
+# Up to this angle the kernel's sines and cosines are exact to machine precision [rad].
 _FARTHEST = 1e6
 
 RowNumbers: TypeAlias = NDArray[np.integer[Any]]
@@ -26,7 +26,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 
 class BatchEquations:
-    """What differs from point to point of a robot's linear models, about many points."""
+    """Equations of a robot's linear models about many points, for the arrays that vary."""
 
     def __init__(self, prepared: Prepared, tree: Tree, kernel: PointKernel | None) -> None:
         self._prepared, self._tree, self._kernel = prepared, tree, kernel
@@ -34,7 +34,7 @@ class BatchEquations:
         self._least_coupling = 0.999 * (6 + prepared.robot.n)
 
     def write(self, points: Points, out: Mapping[str, Array]) -> RowNumbers:
-        """Write what differs from point to point, and return the rows that are left."""
+        """Write the arrays that vary between points, and return the rows not computed."""
         count = len(points.q)
         if count < LANES:
             more = {key: np.empty((LANES, *array.shape[1:])) for key, array in out.items()}

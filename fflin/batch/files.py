@@ -1,7 +1,8 @@
-"""Arrays of many rows on disk: npz, and HDF5 whose arrays are read as they are used.
+"""Files with arrays of many rows: npz, and HDF5 whose arrays are read on demand.
 
-An HDF5 file has a dataset for each array, ``chunk_sha256`` of the rows of so many points as its
-attribute ``chunk`` says, and ``sha256`` of all else and of those.
+An HDF5 file has a dataset for each array and two datasets of checksums. ``chunk_sha256`` has the
+checksum of each chunk of rows, whose size is the attribute ``chunk``. ``sha256`` is the checksum of
+those and of all other content.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _CHUNK_BYTES = 2**22
 
 
 def check_format(path: Path) -> None:
-    """Raise where the ending says no known format, or h5py is needed and not installed."""
+    """Raise if the file's ending is not a known format, or h5py is needed and not installed."""
     check_ending(path, FORMATS)
     if path.suffix == ".h5":
         hdf5()
@@ -107,7 +108,7 @@ def _chunk_seals(varying: Mapping[str, Array], count: int, chunk: int) -> NDArra
 def whole_seal(
     texts: Mapping[str, str], chunk: int, seals: Any, constants: Mapping[str, Array]
 ) -> NDArray[np.uint8]:
-    """Return the SHA-256 (32,) of all of a file, its rows by those of their chunks."""
+    """Return the SHA-256 (32,) of a file's content, with the checksums of its chunks of rows."""
     whole = content_digest({**texts, "chunk": chunk, CHUNK_SEALS: seals, **constants})
     return np.frombuffer(bytes.fromhex(whole), np.uint8)
 
@@ -119,7 +120,7 @@ def read_rows(
     with path.open("rb") as file:
         zipped = file.read(2) == b"PK"
     if not zipped and path.suffix == ".npz":
-        raise ValueError("it is no zip archive")
+        raise ValueError("it is not a zip archive")
     arrays, texts, verified = (_from_npz if zipped else _from_hdf5)(path, verify)
     return arrays, json.loads(texts["constant"]), texts, verified
 

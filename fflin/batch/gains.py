@@ -1,4 +1,4 @@
-"""Linear quadratic regulators about many points at once, and the gains between them."""
+"""Linear quadratic regulators about many points, and gain scheduling between them."""
 
 from __future__ import annotations
 
@@ -35,17 +35,18 @@ _SOUND = 1e-11
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GainBatch(Design):
-    """State feedbacks ``u = u0 - K (x - x0)`` about N points, as `lqr_batch` makes them.
+    """State-feedback gains ``u = u0 - K (x - x0)`` about N points, made by `lqr_batch`.
 
     Attributes
     ----------
     K : ndarray (N, nu, nx)
+        Gains.
     residual : ndarray (N,)
-        Of each Riccati equation, see `Gain`.
+        Residual of each Riccati equation, see `Gain`.
     margin : ndarray (N,)
-        Slowest decay [1/s] of each closed loop.
+        Slowest decay rate [1/s] of each closed loop.
     joint_positions : ndarray (N, n)
-        The points [rad|m].
+        Joint positions of the points [rad|m].
     joint_names, state_names, input_names : tuple of str
     frame, robot : str
 
@@ -82,20 +83,24 @@ class GainBatch(Design):
 
     @property
     def grid(self) -> dict[str, Array]:
-        """The joints that differ between the points and their values.
+        """Axes of the grid: {joint: values [rad|m]}, for the joints that vary.
 
         Raises
         ------
         InputError
-            If the points are not on a grid, or none of them differ.
+            If the points are not on a grid, or are all the same.
         """
         return dict(self._axes)
 
     def gain(self, joints: Array) -> Array:
         """Return K (nu, nx) at joint positions (n,) by linear interpolation.
 
-        Beyond the grid it is that at its edge. Errors are those of `grid`; the positions must be n
-        finite numbers.
+        Outside the grid, the gain at its edge is returned.
+
+        Raises
+        ------
+        InputError
+            If the positions are not n finite numbers; otherwise as for `grid`.
         """
         return self._between(vector("joints", joints, len(self.joint_names), "the joint positions"))
 
@@ -115,11 +120,13 @@ class GainBatch(Design):
             if np.ptp(column) > 0.0
         }
         if not axes:
-            raise InputError("all points of the batch are the same; lay a grid with fflin.grid")
+            raise InputError(
+                "all points of the batch are the same, expected a grid; make one with fflin.grid"
+            )
         if np.prod([len(values) for values in axes.values()]) != len(self):
             raise InputError(
-                f"the {len(self)} points are not on a grid over {', '.join(axes)}; gains are "
-                "interpolated on a grid that fflin.grid lays"
+                f"the {len(self)} points are not on a grid over {', '.join(axes)}, which "
+                "interpolation needs; make the points with fflin.grid"
             )
         return axes
 
@@ -134,7 +141,10 @@ class GainBatch(Design):
         shape = tuple(len(values) for values in self._axes.values())
         order = np.ravel_multi_index(at, shape)
         if len(np.unique(order)) != len(self):
-            raise InputError(f"the points are not on a grid over {', '.join(self._axes)}")
+            raise InputError(
+                f"the points are not on a grid over {', '.join(self._axes)}, which interpolation "
+                "needs; make the points with fflin.grid"
+            )
         K = np.empty_like(self.K)
         K[order] = self.K
         return RegularGridInterpolator(
@@ -145,18 +155,21 @@ class GainBatch(Design):
 def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     r"""Return the linear quadratic regulator about every point of a batch.
 
-    At rest and fully actuated the gains are computed many at a time: with
-    :math:`L R^{-1} L^T = L_s L_s^T`, L the lower half of B, and the weight Q in the coordinates
-    :math:`(p, \dot p)` in which the weight on :math:`\ddot p` is the identity, the closed loop's
-    poles and motions are those of an eigenproblem of half the Hamiltonian's size (see `lqr`), and
-    :math:`K = -u\,x^{-1}` of these motions. Each is refined by Newton's method and put back into
-    its Riccati equation. Any other model, and what falls short, is left to `lqr`.
+    For fully actuated models at rest, many gains are computed together:
+
+    1. With L the lower half of B, factorise :math:`L R^{-1} L^T = L_s L_s^T`. This defines
+       coordinates :math:`(p, \dot p)` in which the weight on :math:`\ddot p` is the identity.
+    2. Solve an eigenproblem of half the Hamiltonian's size (see `lqr`) for the poles and modes of
+       the closed loop. Inputs u and states x of the modes give :math:`K = -u\,x^{-1}`.
+    3. Refine each solution by Newton's method, and compute the residual of its Riccati equation.
+
+    `lqr` computes the gains of other models, and those whose residual is too large.
 
     Parameters
     ----------
     batch : LinearBatch
     Q, R : array_like, float or mapping
-        The same for all points; as `lqr` takes them.
+        Weights as in `lqr`, the same for all points.
 
     Returns
     -------
@@ -165,9 +178,9 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     Raises
     ------
     InputError
-        If a weight is of a wrong size or sign.
+        If a weight has a wrong size or sign.
     EquilibriumError, StabilizabilityError
-        If there is no regulator about a point; it is named.
+        If no regulator exists about a point; the message names the point.
 
     Examples
     --------
@@ -177,9 +190,11 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     (3, 9, 18)
     """
     if not isinstance(batch, LinearBatch):
-        raise InputError(f"batch is a {type(batch).__name__}, expected a LinearBatch of sweep")
+        raise InputError(
+            f"batch is a {type(batch).__name__}, expected a LinearBatch; fflin.sweep returns one"
+        )
     if not len(batch):
-        raise InputError("the batch has no points")
+        raise InputError("the batch has no points; give at least one")
     batch[0].require_unchanged()
     Q = weight("Q", Q, batch.state_names)
     R = weight("R", R, input_keys(batch), definite=True)
@@ -218,20 +233,20 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
 
 @dataclass(frozen=True, eq=False)
 class ScheduledFeedback:
-    """The feedback ``u = u0 - K(q_m) (x - x0)`` toward a target, its gain from a grid.
+    """Gain-scheduled feedback ``u = u0 - K(q_m) (x - x0)``, interpolated over a grid.
 
     Parameters
     ----------
     lin : LinearModel
-        About the target.
+        Model about the target.
     gains : GainBatch
-        On a grid of the same robot; or of it free where it has caught something since, or the
-        other way: `line_up` matches states and inputs.
+        Gains on a grid of the same robot. The robot may also have captured or released an object
+        since: `line_up` then matches states and inputs.
 
     Raises
     ------
     InputError
-        If they cannot be lined up, or the gains are not on a grid.
+        If states and inputs cannot be matched, or the gains are not on a grid.
 
     Examples
     --------
@@ -264,12 +279,12 @@ class ScheduledFeedback:
         _ = lined.grid
 
     def table(self) -> tuple[dict[str, Array], Array]:
-        """Return the joints of the grid and their values, and the gains (N, nu, nx) in order."""
+        """Return the grid axes {joint: values} and the gains (N, nu, nx) in grid order."""
         by = self.gains
         return by.grid, by._interpolator.values.reshape(by.K.shape)
 
     def bind(self, robot: Robot) -> Any:
-        """Return policy(t, q, v) -> u for a robot; errors are those of `StateFeedback.bind`."""
+        """Return policy(t, q, v) -> u for a robot; see `StateFeedback.bind` for errors."""
         lin, gains = self.lin, self.gains
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         require_fit(lin, robot, state)

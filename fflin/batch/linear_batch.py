@@ -1,4 +1,4 @@
-"""Linear models of one robot about many points, what they share held once."""
+"""Batch of linear models of one robot about many points."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ _SAME = 1e-9
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearBatch(FrozenArrays):
-    r"""Linear models about N points, ``dx/dt = f0 + A (x - x0) + B (u - u0)``; made by `sweep`.
+    r"""Batch of linear models ``dx/dt = f0 + A (x - x0) + B (u - u0)``, made by `sweep`.
 
-    ``batch[i]`` is the `LinearModel` about point i, ``batch[2:9]`` or ``batch[mask]`` a batch.
-    Every array has N rows; one that is the same about all points, such as A at rest, is held once
-    (its stride over the points is zero). The upper half of B is zero and is not held. Arrays are
-    read-only; those of a batch that stands in an HDF5 file are read as they are used.
+    ``batch[i]`` is the `LinearModel` about point i. ``batch[2:9]`` and ``batch[mask]`` are smaller
+    batches. Every array has N rows. An array that is the same at all points, such as A at rest, is
+    stored once (its stride over the points is zero). The upper half of B is zero and is not
+    stored. Arrays are read-only. If the batch is in an HDF5 file, they are read on demand.
 
     Attributes
     ----------
     A : ndarray (N, nx, nx)
     B_lower : ndarray (N, 6 + n, nu)
-        The velocity rows of B, at rest with the default inputs the inverse inertia.
+        Velocity rows of B. At rest, with the default inputs, they are the inverse inertia.
     C : ndarray (N, ny, nx)
     D : ndarray (N, ny, nu)
     f0 : ndarray (N, nx)
@@ -59,12 +59,14 @@ class LinearBatch(FrozenArrays):
     robot : str
         Name of the robot.
     urdf_sha256, fflin_version, pinocchio_version : str
+        SHA-256 of the URDF, and the versions that made the batch.
     locked : tuple of str
+        Names of the locked joints.
     columns : tuple of (int, int)
-        Where each joint stands in q: (index, -1), or those of its (cos, sin).
+        Indices of each joint in q: (index, -1), or the indices of its (cos, sin).
     verified : bool
-        Whether it is as it was made; False of a file that has no digest to tell damage by, or
-        that was not held against it.
+        Whether the data is known to be unchanged. False for a file without a checksum, or if the
+        checksum was not verified.
 
     Examples
     --------
@@ -134,13 +136,16 @@ class LinearBatch(FrozenArrays):
     def __getitem__(self, index: Any) -> LinearModel | LinearBatch:
         if isinstance(index, int | np.integer):
             if not -len(self) <= index < len(self):
-                raise IndexError(f"point {index} of a batch of {len(self)}")
+                raise IndexError(f"index is {index}, but the batch has {len(self)} points")
             return self._model(int(index) % len(self))
         if not isinstance(index, slice):
             refuse_masked("index", index)
             index = np.asarray(index)
             if index.dtype.kind not in "iub" or index.ndim != 1:
-                raise InputError("a batch is indexed by a number, a slice, numbers or a mask")
+                raise InputError(
+                    f"index has type {index.dtype} and shape {index.shape}, expected an integer, "
+                    "a slice, a list of integers or a mask"
+                )
         count = len(np.empty(len(self), dtype=bool)[index])
         rows: dict[str, Any] = {
             key: np.broadcast_to(value[0], (count, *value.shape[1:]))
@@ -155,7 +160,7 @@ class LinearBatch(FrozenArrays):
 
     @property
     def B(self) -> Array:
-        """All of B (N, nx, nu), its upper half zero; made anew at each call."""
+        """Input matrices B (N, nx, nu), with zero upper halves; computed at each access."""
         count, nv, nu = self.B_lower.shape
         B = np.zeros((count, 2 * nv, nu))
         B[:, nv:] = self.B_lower
@@ -163,7 +168,7 @@ class LinearBatch(FrozenArrays):
 
     @property
     def x0(self) -> Array:
-        """States at the points (N, nx); at rest made anew at each call."""
+        """States at the points (N, nx); at rest, computed at each access."""
         return self._states_at_rest(self.q) if self._x0 is None else self._x0
 
     @property
@@ -180,18 +185,20 @@ class LinearBatch(FrozenArrays):
 
     @property
     def joint_positions(self) -> Array:
-        """Angles, in (-pi, pi] of continuous joints, and lengths (N, n) of the joints."""
+        """Joint positions (N, n) [rad|m]; angles of continuous joints are in (-pi, pi]."""
         return positions(self.q, self.columns)
 
     def nearest(self, joints: Mapping[str, float]) -> LinearModel:
-        """Return the model whose joints are nearest to the values [rad|m], the others left out.
+        """Return the model nearest to the given joint values [rad|m].
+
+        Joints that are not named are ignored.
 
         Raises
         ------
         UnknownNameError
-            If there is no such joint.
+            If a joint does not exist.
         InputError
-            If a value is not a finite number, or none is given.
+            If a value is not a finite number, or no value is given.
         """
         distance = np.zeros(len(self))
         for index, value in self._named(joints).items():
@@ -200,14 +207,14 @@ class LinearBatch(FrozenArrays):
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
-        """Return the models whose joints are at a value [rad|m], or in a range (low, high).
+        """Return the models whose joints have a value [rad|m] or lie in a range (low, high).
 
         Raises
         ------
         UnknownNameError
-            If there is no such joint.
+            If a joint does not exist.
         InputError
-            If a value is neither, or no model is there.
+            If a value is neither a number nor a range, or no point of the batch matches.
         """
         mask = np.ones(len(self), dtype=bool)
         for index, value in self._named(joints).items():
@@ -221,21 +228,23 @@ class LinearBatch(FrozenArrays):
             else:
                 mask &= away(self.q, self.columns[index], number(what, value)) <= _SAME
         if not mask.any():
-            raise InputError(f"no point of the batch has {dict(joints)}; `nearest` finds the next")
+            raise InputError(
+                f"no point of the batch has {dict(joints)}; use `nearest` to find the nearest point"
+            )
         return self[mask]
 
     def save(self, path: str | Path) -> None:
-        """Write the batch, whole or not at all.
+        """Write the batch to a file, atomically.
 
         Parameters
         ----------
         path : str or Path
-            Ends in .npz, or .h5 (HDF5, which need not fit in memory to be read).
+            File ending in .npz or .h5. An HDF5 file can be read later without fitting in memory.
 
         Raises
         ------
         FileError
-            If the ending is another or the file cannot be written.
+            If the file has another ending or cannot be written.
         MissingPackageError
             If h5py is needed and not installed.
         """
@@ -246,23 +255,24 @@ class LinearBatch(FrozenArrays):
 
     @staticmethod
     def load(path: str | Path, robot: Robot | None = None, *, verify: bool = True) -> LinearBatch:
-        """Read a batch that `save` or `sweep` wrote; every figure is the same to the last bit.
+        """Read a batch that `save` or `sweep` wrote; all numbers are restored bit for bit.
 
         Parameters
         ----------
         path : str or Path
         robot : Robot, optional
-            Whose it is, which the inertia M and the certificate of its models need.
+            The robot of the batch. It is needed for the inertia M and the certificate of the
+            models.
         verify : bool
-            Whether the rows are held against their SHA-256, for which all of them are read. If
-            not, a file of HDF5 is there at once, and the batch is not `verified`.
+            Whether to verify the SHA-256 checksums, which reads all rows. If False, an HDF5 file
+            opens at once, and the batch is not `verified`.
 
         Raises
         ------
         FileError
-            If the file cannot be read, is damaged or is no such batch.
+            If the file cannot be read, is damaged, or is not a batch.
         InputError
-            If the robot is another.
+            If `robot` is not the robot of the batch.
         MissingPackageError
             If h5py is needed and not installed.
         """

@@ -1,4 +1,4 @@
-"""Riccati equations of many models at rest at once, by the eigenproblem of half the size."""
+"""Batch solver for Riccati equations of models at rest, at half the Hamiltonian's size."""
 
 import numpy as np
 

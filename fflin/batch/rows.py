@@ -1,4 +1,4 @@
-"""Many configurations, velocities and inputs, a row each: the joints' values, and checks."""
+"""Arrays of configurations, velocities and inputs, one per row: joint values and checks."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def follow_rows(robot: Robot, q: Array) -> None:
 
 def checked_configurations(robot: Robot, q: Any) -> Array:
     """Return a copy of configurations (N, nq), each as `Robot.checked_configuration` has it."""
-    rows = _rows("q", q, robot.nq, "a configuration in Pinocchio's order each")
+    rows = _rows("q", q, robot.nq, "one configuration in Pinocchio's order per row")
     for start in range(0, len(rows), _BLOCK):
         block = rows[start : start + _BLOCK]
         with np.errstate(all="ignore"):
@@ -97,7 +97,7 @@ def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
     """Return velocities (N, nv) of an array (N, nv), or (nv,) for all; read-only."""
     if dimension("v", v) == 1:
         return np.broadcast_to(robot.checked_velocity(v).copy(), (count, robot.nv))
-    rows = _rows("v", v, robot.nv, "a velocity in Pinocchio's order each", count)
+    rows = _rows("v", v, robot.nv, "one velocity in Pinocchio's order per row", count)
     for row in range(count) if robot.followers else _not_finite(rows):
         _checked(robot.checked_velocity, "velocity", row, rows[row])
     rows.setflags(write=False)
@@ -109,16 +109,16 @@ def checked_inputs(names: tuple[str, ...], u: Any, count: int) -> Array:
     nu = len(names)
     if dimension("u", u) == 1:
         return np.broadcast_to(vector("u", u, nu, "the robot's inputs").copy(), (count, nu))
-    rows = _rows("u", u, nu, "the robot's inputs each", count)
+    rows = _rows("u", u, nu, "the robot's inputs in each row", count)
     for row in _not_finite(rows):
         index = int(np.isfinite(rows[row]).argmin())
-        raise InputError(f"u[{row}, {index}] is {rows[row, index]}; every entry must be finite")
+        raise InputError(f"u[{row}, {index}] is {rows[row, index]}, expected finite numbers")
     rows.setflags(write=False)
     return rows
 
 
 def _not_finite(rows: Array) -> list[int]:
-    """Return the rows with an entry that is not finite; a finite sum tells that there is none."""
+    """Return the rows with an entry that is not finite; a finite sum excludes any."""
     with np.errstate(all="ignore"):
         if np.isfinite(rows.sum()):
             return []

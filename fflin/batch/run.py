@@ -1,6 +1,6 @@
-"""Rows through a job, chunk by chunk, into a store that may have some of them from before.
+"""Run of a job over rows, chunk by chunk, into a store that may already hold some chunks.
 
-Neither knows what the rows are nor what the job makes of them.
+This module is independent of the meaning of the rows and of the job's results.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ Progress = Callable[[int, int], object]
 
 
 def check_workers(executor: Any, workers: Any, threads: Any, chunk: Any, progress: Any) -> None:
-    """Raise `InputError` where what is to do the chunks cannot be that."""
+    """Raise `InputError` if an option for the execution of the chunks is wrong."""
     if executor is not None and workers is not None:
-        raise InputError("executor and workers are both given; give either")
+        raise InputError("executor and workers are both given; give only one of them")
     if executor is not None and not hasattr(executor, "submit"):
         raise InputError(
             f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
@@ -72,7 +72,7 @@ def run_chunks(
         if progress:
             progress(count, store.count)
     if notes:
-        more = f" (and {len(notes) - 1} more such)" if len(notes) > 1 else ""
+        more = f" (and {len(notes) - 1} more such warnings)" if len(notes) > 1 else ""
         warnings.warn(notes[0] + more, FflinWarning, stacklevel=3)
     return sorted(failed)
 
@@ -90,17 +90,17 @@ def failure(
     numbers = listed(f"{start} to {stop - 1}" for (start, stop), *_ in failed)
     said = (
         f"{len(failed)} of {-(-store.count // store.chunk)} chunks "
-        f"{'has' if len(failed) == 1 else 'have'} no result, {of_what} {numbers}: "
+        f"{'has' if len(failed) == 1 else 'have'} failed, {of_what} {numbers}: "
         f"{failed[0].reason}"
     )
     batch = None
     if not kept.any():
         store.discard()
     elif store.part is not None:
-        said += f"; the others are in {store.part}, and the same call goes on from them"
+        said += f"; the other chunks are in {store.part}, and the same call resumes from them"
     else:
         batch = made(kept)
-        said += "; the others are in the `batch` of this error"
+        said += "; the other chunks are in the `batch` of this error"
     return SweepError(said, tuple((*span, reason) for span, _, reason in failed), batch)
 
 

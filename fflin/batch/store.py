@@ -1,4 +1,4 @@
-"""The result of a sweep as it grows, in memory or in a file that outlives a crash, and its room."""
+"""Storage for the chunks of a sweep: in memory, or in a file from which it can resume."""
 
 from __future__ import annotations
 
@@ -79,8 +79,10 @@ class FileStore:
             self._file = hdf5().File(self.part, mode, libver=CHECKED)
         except OSError as error:
             if self.resumed and "unable to lock" in str(error):
-                raise FileError(f"{self.part} is in use by another run; wait for it") from None
-            hint = "; remove it to begin anew" * self.resumed
+                raise FileError(
+                    f"{self.part} is in use by another run; wait for it to end"
+                ) from None
+            hint = "; remove it to start again" * self.resumed
             raise FileError(f"{self.part}: cannot be opened: {reason(error)}{hint}") from None
         try:
             if self.resumed:
@@ -107,17 +109,17 @@ class FileStore:
         with self._readable():
             if self._file.attrs.get("request") != request:
                 raise FileError(
-                    f"{self.part} is what another {self.what} left behind; remove it, or choose "
-                    "another name"
+                    f"{self.part} is the unfinished file of another {self.what}; remove it, or "
+                    "choose another name"
                 )
             self.chunk = int(self._file.attrs.get("chunk", self.chunk))
             for key, value in self._constants.items():
                 if not np.array_equal(self._file[key][()], value):
-                    raise ValueError(f"{key} is another")
+                    raise ValueError(f"{key} differs")
             if any(self._file.attrs[key] != value for key, value in self._texts.items()):
-                raise ValueError("its names are others")
+                raise ValueError("its names differ")
             if self._file[SEAL].shape != (32,):
-                raise ValueError("its digest is none")
+                raise ValueError("it has no checksum")
 
     @contextmanager
     def _readable(self) -> Iterator[None]:
@@ -127,7 +129,7 @@ class FileStore:
             raise
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
             said = " ".join(str(error).split()).strip("'\"")
-            raise FileError(f"{self.part} is damaged ({said}); remove it to begin anew") from None
+            raise FileError(f"{self.part} is damaged ({said}); remove it to start again") from None
 
     @contextmanager
     def _writable(self) -> Iterator[None]:
@@ -210,12 +212,12 @@ def part_of(path: Path) -> Path:
 
 
 def check_room(count: int, size: int, path: Path | None, what: str = "points") -> None:
-    """Raise where so many points, of so many bytes, fit neither file nor memory."""
-    said = f"{count:,} {what} are {readable(size)}"
+    """Raise if `count` points of `size` bytes in total do not fit into the file or memory."""
+    said = f"{count:,} {what} need {readable(size)}"
     if path is None:
         if size > (memory := _memory()):
             raise InputError(
-                f"{said}, and the machine has {readable(memory)} of memory; write them to a file "
+                f"{said}, but the machine has {readable(memory)} of memory; write them to a file "
                 f"with out='NAME.h5', or choose fewer {what}"
             )
     # An unfinished file has reserved its room already.
@@ -223,10 +225,16 @@ def check_room(count: int, size: int, path: Path | None, what: str = "points") -
         # An .npz is made from the unfinished file.
         twice = path.suffix == ".npz"
         if size * (1 + twice) > (free := shutil.disk_usage(path.parent).free):
-            needs = ", and .npz needs twice that on the way" * twice
-            raise FileError(f"{said}{needs}: only {readable(free)} are free in {path.parent}")
+            needs = ", and writing .npz needs twice as much" * twice
+            raise FileError(
+                f"{said}{needs}, but only {readable(free)} are free in {path.parent}; free space, "
+                f"or choose fewer {what}"
+            )
         if size + _OVERHEAD > (most := _largest_file()):
-            raise FileError(f"{said}: a file may have no more than {readable(most)} (ulimit -f)")
+            raise FileError(
+                f"{said}, but files are limited to {readable(most)} (ulimit -f); raise the limit, "
+                f"or choose fewer {what}"
+            )
 
 
 def readable(size: float) -> str:

@@ -1,4 +1,4 @@
-"""Linear models about many points."""
+"""Sweep: linear models about many points."""
 
 from __future__ import annotations
 
@@ -59,10 +59,11 @@ def sweep(
 ) -> LinearBatch:
     r"""Linearise a robot about many points.
 
-    With numba installed (``pip install 'fflin[fast]'``) a compiled kernel does eight points at a
-    time, on all threads: at rest, where M depends on the joints only and
-    :math:`B = [0;\, M^{-1}]`, and at operating points. Without it, and where the robot has other
-    outputs than its state, each point is linearised by a `Linearizer`, which processes share.
+    With numba installed (``pip install 'fflin[fast]'``), a compiled kernel processes eight points
+    at a time, on all threads. At rest M depends on the joints only, and
+    :math:`B = [0;\, M^{-1}]`. The kernel also supports operating points in motion. Without numba,
+    or if the robot has other outputs than its state, a `Linearizer` processes the points one by
+    one. These points can be distributed over worker processes.
 
     Parameters
     ----------
@@ -72,45 +73,45 @@ def sweep(
     v : array_like (N, nv) or (nv,), optional
         Velocities in Pinocchio's order; at rest by default.
     u : array_like (N, nu) or (nu,), optional
-        Over the robot's inputs; zero by default.
+        Inputs of the robot; zero by default.
     frame, reference, moving : optional
-        See `Linearizer`. The reference is the base's own at each point by default.
+        See `Linearizer`. By default the reference is the base pose at each point.
     executor : concurrent.futures.Executor, optional
-        Whose workers do the chunks: processes, dask (``Client.get_executor()``), mpi4py.futures.
-        The robot is sent to each worker once. It is not shut down.
+        Executor whose workers process the chunks: processes, dask (``Client.get_executor()``) or
+        mpi4py.futures. The robot is sent to each worker once. The executor is not shut down.
     workers : int, optional
-        Do it on so many processes of our own, at most one for each core; one that dies is
+        Number of worker processes to start, at most one per core. A process that dies is
         replaced. Call `sweep` under ``if __name__ == "__main__":`` then.
     threads : int, optional
-        Threads of the kernel in this process; all cores that it may use by default.
+        Threads of the kernel in this process; by default all available cores.
     chunk : int, optional
-        Points in a chunk; by default so many that a chunk's result is about 4 MB, or
-        as in the unfinished file.
+        Number of points in a chunk. By default the result of a chunk takes about 4 MB. A resumed
+        sweep uses the chunk size of its unfinished file.
     progress : callable, optional
-        ``progress(done, total)`` is called with the number of points after every chunk.
+        Function ``progress(done, total)``, called after every chunk with numbers of points.
     out : str or Path, optional
-        File to write, .h5 or .npz. It grows as NAME.part, chunk by chunk; the same call made again
-        after a crash goes on from the chunks that are there and intact.
+        File to write, .h5 or .npz. Chunks are first written to NAME.part. After a crash, repeat
+        the same call: it resumes with the intact chunks of that file.
 
     Returns
     -------
     LinearBatch
-        In the order of q. Where `out` is an .h5 file, it is read from it as it is used.
+        Models in the order of q. If `out` is an .h5 file, arrays are read from it on demand.
 
     Raises
     ------
     InputError
-        If a size or value is wrong; a row is named.
+        If a size or value is wrong; the message names the row.
     SweepError
-        If there is no model about a point or a worker dies again and again; the chunk is named, and
-        `SweepError.batch` or the file has the others.
+        If a point cannot be linearised, or a worker dies repeatedly. The message names the chunk;
+        `SweepError.batch` or the file holds the other chunks.
     FileError, MissingPackageError
         If the file cannot be written.
 
     Warns
     -----
     FflinWarning
-        Where M is ill-conditioned: once, with the number of points.
+        If M is ill-conditioned; one warning states the number of points.
 
     Examples
     --------
@@ -180,7 +181,7 @@ def _store(task: SweepTask, path: Path | None, size: int) -> FileStore | MemoryS
     texts = task.texts(constants)
     store = FileStore(path, task.request, task.count, size, shapes, constants, texts)
     if store.resumed:
-        _log.info("going on with %s", store.part)
+        _log.info("resuming from %s", store.part)
     return store
 
 
@@ -198,8 +199,9 @@ def _finish(task: SweepTask, store: FileStore | MemoryStore, path: Path | None) 
         batch = _written(store.path, task)
     except (MemoryError, NoRoomError):
         raise FileError(
-            f"{store.path}: the memory does not suffice for .npz; all is kept in {store.part}, "
-            "which is HDF5: rename it to end in .h5, and write to .h5 another time"
+            f"{store.path}: not enough memory to write .npz; the complete result is in "
+            f"{store.part}, an HDF5 file: rename it to end in .h5, and give out= an .h5 file next "
+            "time"
         ) from None
     store.part.unlink()
     return batch

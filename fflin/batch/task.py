@@ -1,4 +1,4 @@
-"""What a sweep is asked to do: its points, and what of the result is the same at all of them."""
+"""Task of a sweep: its points, and the part of the result that is the same at all points."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _OF_THE_ROBOT = (
 
 
 class SweepTask:
-    """A sweep's points, and what of its result is the same at all of them."""
+    """Points of a sweep, and the part of its result that is the same at all points."""
 
     def __init__(self, job: ChunkJob, configurations: Configurations, v: Any, u: Any) -> None:
         self.job, self.robot = job, job.linearizer.robot
@@ -50,7 +50,7 @@ class SweepTask:
         return {key: x for key, x in rows.items() if x is not None and x.strides[0] != 0}
 
     def constants(self, varying: Iterable[str]) -> dict[str, Array]:
-        """Return what is the same at all points, a row of each."""
+        """Return one row of each array that is the same at all points."""
         prepared, root = self.job.linearizer.prepared, self.robot.model.jointPlacements[ROOT]
         rows: dict[str, Array] = {
             **prepared.rest,
@@ -67,7 +67,7 @@ class SweepTask:
         return {key: value for key, value in rows.items() if key not in varying}
 
     def batch(self, arrays: Mapping[str, Array]) -> LinearBatch:
-        """Put a batch together of what differs from point to point."""
+        """Assemble a batch from the arrays that vary between points."""
         count = len(arrays["q"])
         rows: dict[str, Any] = {
             key: np.broadcast_to(value, (count, *value.shape))
@@ -84,7 +84,7 @@ class SweepTask:
         )
 
     def texts(self, constants: Iterable[str]) -> dict[str, str]:
-        """Return what a file of the batch has beside its arrays."""
+        """Return the texts in a file of the batch."""
         one = {key: np.empty((1, *shape)) for key, shape in self.job.shapes.items()}
         example = self.batch(one | {"q": self.points(0, 1).q})
         return {**texts_of(example, self.count), "constant": json.dumps(list(constants))}

@@ -1,4 +1,4 @@
-"""Processes of our own, each with a pipe of its own."""
+"""Executor of worker processes, each connected by a separate pipe."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ _PATIENCE = 5.0
 
 
 class WorkerDied(BrokenExecutor):
-    """The process that did a task is gone; the others are not."""
+    """Error of a task whose worker process died; other workers continue."""
 
 
 class NoWorkers(BrokenExecutor):
-    """No process can be started."""
+    """Error if no worker process can be started."""
 
 
 class OwnWorkers(Executor):
-    """Processes of our own; one that dies is replaced and harms no task but its own."""
+    """Executor of worker processes; if one dies, only its task fails and it is replaced."""
 
     def __init__(self, count: int) -> None:
         cores = available_cores()
         if count > cores:
-            said = f"{count} processes are more than there are cores; {cores} do the work"
+            said = f"{count} workers requested, but only {cores} cores are available; using {cores}"
             warnings.warn(said, FflinWarning, stacklevel=3)
             count = cores
         self._max_workers = count
@@ -70,7 +70,7 @@ class OwnWorkers(Executor):
         except (EOFError, OSError):
             self._mine.process = None
             self._end(process)
-            raise WorkerDied("its worker died each time") from None
+            raise WorkerDied("the worker process died in each attempt") from None
         if error is not None:
             raise error
         return result
@@ -81,12 +81,12 @@ class OwnWorkers(Executor):
         process = self._context.Process(target=_serve, args=(theirs,), daemon=True)
         with self._lock:
             if self._closed:
-                raise NoWorkers("the workers are shut down")
+                raise NoWorkers("the workers have been shut down")
             try:
                 with _isolated(), _deaf_to_ctrl_c():
                     process.start()
             except OSError as error:
-                raise NoWorkers(f"no worker can be started: {error}") from None
+                raise NoWorkers(f"no worker process can be started: {error}") from None
             self._processes[process] = ours
         theirs.close()
         try:
@@ -94,7 +94,7 @@ class OwnWorkers(Executor):
         except (EOFError, OSError):
             self._end(process)
             raise NoWorkers(
-                'a worker did not start; make the call under `if __name__ == "__main__":`'
+                'a worker process did not start; make the call under `if __name__ == "__main__":`'
             ) from None
         self._mine.process = process
         return process

@@ -1,1 +1,1 @@
-"""From a linear model to a law: weights, gains, filters, policies."""
+"""Control design for linear models: weights, gains, filters and policies."""

@@ -1,4 +1,4 @@
-"""The regulator with its cost on accelerations, in closed form."""
+"""Linear quadratic regulator with weighted accelerations, in closed form."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -36,38 +36,39 @@ def acceleration_lqr(
     dt: float | None = None,
     wheel_speeds: bool | None = None,
 ) -> Gain:
-    r"""Return the regulator that weighs accelerations, in closed form.
+    r"""Return the linear quadratic regulator with weighted accelerations, in closed form.
 
-    With the accelerations :math:`a = L u` as inputs, where L is the lower block of B, a model at
-    rest is one double integrator a coordinate, :math:`\ddot q_i = s_i a_i` with s = 1/2 for
-    attitude and 1 else. Diagonal weights then decouple, and for continuous time, (10.2) of
-    docs/derivation.md,
+    Let the accelerations :math:`a = L u` be the inputs, where L is the lower block of B. A model
+    at rest then has one double integrator per coordinate, :math:`\ddot q_i = s_i a_i`, with
+    s = 1/2 for attitude and s = 1 otherwise. Diagonal weights decouple the coordinates. By (10.2)
+    of docs/derivation.md, the regulator in continuous time is
 
     .. math:: k_p = \sqrt{q_p/r_a},\quad k_d = \sqrt{q_v/r_a + 2 s k_p},\quad
               u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
 
-    the poles those of :math:`\lambda^2 + k_d \lambda + s k_p`. Under an exact hold the channels
-    stay apart, and each has a closed form too. The speed of a reaction wheel whose angle is not
-    regulated is a single integrator with k_p = 0. The weight on u is :math:`L^T R_a L`, of which no
-    number is formed for the gain, so that an ill-conditioned inertia costs no digits.
+    and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. Under an exact
+    zero-order hold the coordinates remain decoupled, and each has a closed form too. The speed of
+    a reaction wheel whose angle is not regulated is a single integrator with k_p = 0. The weight
+    on u is :math:`L^T R_a L`. The gain is computed without this product, so an ill-conditioned
+    inertia costs no digits.
 
     Parameters
     ----------
     lin : LinearModel
-        At rest, without gravity, orbit, springs and dampers, every coordinate that `lqr` regulates
-        actuated; sampled or not.
+        Continuous or sampled model at rest, without gravity, orbit, springs or dampers. Every
+        coordinate that `lqr` regulates must be actuated.
     Qp, Qv, Ra : array_like (6 + n,) or float, or mapping
-        Diagonal weights on the positions (q_b, r_b, q_m), the velocities and their
-        accelerations: {name: weight} with names of states, those of velocities for `Qv` and `Ra`.
+        Diagonal weights on the positions (q_b, r_b, q_m), the velocities and the accelerations.
+        In a mapping {name: weight}, `Qp` takes names of positions, `Qv` and `Ra` of velocities.
     dt : float, optional
-        Samples a continuous model first.
+        Sampling time [s]; the continuous model is sampled first.
     wheel_speeds : bool, optional
         As in `lqr`.
 
     Returns
     -------
     Gain
-        Its residual is that of the Riccati equation in the model's own variables.
+        Its residual refers to the Riccati equation in the model's own variables.
 
     Raises
     ------
@@ -76,8 +77,8 @@ def acceleration_lqr(
     StabilizabilityError
         If a coordinate is not actuated.
     InputError
-        If the model is not of double integrators, or a weight is not a diagonal, negative, or zero
-        where it must not be: Qp and Ra are positive, and Qv of wheels' speeds.
+        If the model has other dynamics than double integrators, or a weight is negative or not a
+        diagonal. Qp and Ra must be positive, and also Qv on wheel speeds.
     ModelError
         If the robot's model was changed after it was made.
 
@@ -131,7 +132,8 @@ def acceleration_lqr(
         sound = False
     if not sound:
         raise InputError(
-            "the weights or dt make the solution overflow: scale Qp, Qv and Ra nearer to each other"
+            "the solution overflows with these weights and dt; scale Qp, Qv and Ra so that they "
+            "differ less"
         )
     R = L.T @ (ra[:, None] * L)
     solution = Solution(P, K, channel.poles, residual, "closed form")
@@ -154,13 +156,15 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
         or not np.allclose(lin.B[:p], 0.5 * h * lin.dt * double @ L, rtol=1e-12, atol=0.0)
     ):
         raise InputError(
-            "the model is not of double integrators alone, as one at rest without gravity, "
-            "orbit, springs and dampers is; use lqr"
+            "the model has other dynamics than double integrators, expected a model at rest "
+            "without gravity, orbit, springs or dampers; use lqr"
         )
     sizes = np.abs(L).max(axis=1, keepdims=True)
     if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < len(s):
         require_stabilizable(lin)
-        raise StabilizabilityError("the inputs do not accelerate every coordinate; use lqr")
+        raise StabilizabilityError(
+            "the inputs do not accelerate every coordinate independently; use lqr"
+        )
     return s, L
 
 
@@ -169,7 +173,9 @@ def _diagonal(
 ) -> Array:
     """Return the diagonal of a weight on the states that are kept of those that it may name."""
     if not isinstance(value, Mapping) and dimension(what, value) == 2:
-        raise InputError(f"{what} is a matrix; the closed form needs its diagonal alone, use lqr")
+        raise InputError(
+            f"{what} is a matrix, expected its diagonal; for a full weight matrix use lqr"
+        )
     whole = weight(what, value, names, definite=definite and len(kept) == len(names))
     diagonal = whole.diagonal()[[names.index(name) for name in kept]]
     return weight(what, diagonal, kept, definite=definite).diagonal()

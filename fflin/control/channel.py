@@ -1,4 +1,4 @@
-"""How a command reaches the robot: held between samples, late, and within limits."""
+"""Channel from command to actuator: sample and hold, delay and limits."""
 
 import math
 from collections import deque
@@ -29,7 +29,7 @@ class Law:
         self.advance: Any = getattr(policy, "advance", None)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
-        """Return the command (nu,), or raise `InputError` where it is none."""
+        """Return the command (nu,), or raise `InputError` if it is not finite or of wrong shape."""
         u = self.policy(t, q.copy(), v.copy())
         if type(u) is not np.ndarray or u.dtype is not DOUBLE:
             u = as_double(f"policy(t, q, v) at t = {t:g} s", u)
@@ -40,13 +40,13 @@ class Law:
         names = self._names
         if u.shape != self._shape:
             raise InputError(
-                f"policy(t, q, v) gave shape {u.shape} at t = {t:g} s, expected {self._shape}: "
-                f"a value for each of {', '.join(names[:8])}" + (", ..." if names[8:] else "")
+                f"policy(t, q, v) returned shape {u.shape} at t = {t:g} s, expected {self._shape}: "
+                f"one value for each of {', '.join(names[:8])}" + (", ..." if names[8:] else "")
             )
         wrong = np.flatnonzero(~np.isfinite(np.clip(u, *self._limits)))
         if len(wrong) and float(v.dot(v)) < self._slow:
             raise InputError(
-                f"policy(t, q, v) gave {u[wrong[0]]} for {names[wrong[0]]} at t = {t:g} s, "
+                f"policy(t, q, v) returned {u[wrong[0]]} for {names[wrong[0]]} at t = {t:g} s, "
                 "expected finite numbers"
             )
         return u
@@ -78,11 +78,11 @@ class Channel:
 
     @property
     def cuts(self) -> bool:
-        """Whether what acts may be another than what is asked for."""
+        """Whether the applied inputs may differ from the command."""
         return bool(self._limited or self._wheels or self._pulses)
 
     def begin(self, step: int, *point: Any) -> Array:
-        """Return what acts as a step begins."""
+        """Return the applied inputs at the start of a step."""
         if not self._sample:
             return self.ask(*point)
         if step % self._sample == 0:
@@ -97,7 +97,7 @@ class Channel:
         return self._wheels.cut(u, *point) if self._wheels else u
 
     def ask(self, *point: Any) -> Array:
-        """Return what acts of the law's command at once."""
+        """Return the applied inputs of the law's present command."""
         u = self._within(self._law(*point))
         return self._wheels.cut(u, *point) if self._wheels else u
 

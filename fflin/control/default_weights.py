@@ -1,4 +1,4 @@
-"""The weights that a regulator gets where none are given."""
+"""Default weights of a regulator, from the limits of the URDF."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -43,7 +43,7 @@ _AS_SLOW = 0.9
 # So many times the bandwidth is sought at which damping counts.
 _PASSES = 4
 
-_NOT_ENOUGH = ", which is not enough for all displacements"
+_NOT_ENOUGH = ", which is too small for these displacements"
 
 
 class Weights(NamedTuple):
@@ -57,7 +57,7 @@ class Weights(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """How fast a loop comes back that no limit slows, from which share of the displacements."""
+    """Bandwidth of a loop without active limits, and the fraction of the displacements."""
 
     bandwidth: float = BANDWIDTH  # [rad/s]
     share: float = 1.0
@@ -86,8 +86,8 @@ def default_weights(
     N = slopes(lin)[:m, m:]
     if N.shape != lin.M.shape or not np.linalg.cond(N) < 1e8:
         raise InputError(
-            f"the model of '{lin.robot}' has not the coordinates and their rates as states, which "
-            "the default weights are made for; give Q and R"
+            f"the states of the model of '{lin.robot}' are not coordinates and their rates, which "
+            "the default weights require; give Q and R"
         )
     damping, w = _damping(lin), pace.bandwidth
     for _ in range(_PASSES if damping.any() else 1):
@@ -124,8 +124,8 @@ def _of_inertia(
     cost = (S**2 / D[:, None]).sum(axis=0)
     if not cost.all():
         raise InputError(
-            f"input {lin.input_names[int(cost.argmin())]} acts on nothing; leave it out, or give "
-            "Q and R"
+            f"input {lin.input_names[int(cost.argmin())]} has no effect on any coordinate; remove "
+            "it, or give Q and R"
         )
     reach = _reach(S, cost, D)
     ratios, T = eigh(reach, M)
@@ -158,10 +158,10 @@ def _of_inertia(
     loaded = rate[m:].any() or rate[:m, :m].any()
     if loaded:
         growth = float(rates_of(np.linalg.eigvals(lin.A), lin.dt).real.max())
-        limit = max(limit, _Limit(_OF_GROWTH * growth, f"what grows by {growth:.3g} 1/s"))
+        limit = max(limit, _Limit(_OF_GROWTH * growth, f"an unstable pole at {growth:.3g} 1/s"))
     if pace.hold or lin.dt:
         fastest = pace.held / ((pace.hold or lin.dt) * rates[-1])
-        limit = min(limit, _Limit(float(fastest), "the time of the hold"))
+        limit = min(limit, _Limit(float(fastest), "the sampling time"))
     damped = (lin.M != M).any()
     on_velocities = _on_velocities(lin, S, cost, D / unit, damped) if loaded else None
 
@@ -176,7 +176,7 @@ def _of_inertia(
         driven = (S**2 / cost).sum(axis=1) > _IDLE * D / unit
         limit, achieved = _slowed(lin, costs, size, size * driven, limit)
     rule = _rule(lin, size, limit, achieved, pace.share * TURN) + (
-        "; damping is counted in" if damped else ""
+        "; joint damping is included" if damped else ""
     )
     terms = h * on_positions.diagonal() * size**2, h * cost * use**2
     return Weights(*costs(limit.bandwidth), rule, limit.bandwidth, terms)
@@ -299,10 +299,10 @@ class _Trial(NamedTuple):
 def _slowed(
     lin: LinearModel, costs: _Costs, size: Array, driven: Array, limit: _Limit
 ) -> tuple[_Limit, str]:
-    """Slow a loop with springs or gravity until it keeps within the limits; say what it achieves.
+    """Slow a loop with springs or gravity until it respects the limits; report what it achieves.
 
-    What is displaced by `size` (m,) asks for efforts at first, what inputs drive by `driven` on its
-    way back too: a joint without a motor is where its spring or gravity leaves it.
+    Displacements `size` (m,) require efforts at the start, and displacements `driven` also on the
+    way back. The latter omit joints without a motor, which springs or gravity move.
     """
     trials = list[_Trial]()
     for _ in range(_TRIALS):
@@ -325,7 +325,7 @@ def _slowed(
     most = max(trial.left for trial in trials)
     limit, _, solution, asked = next(x for x in trials if x.left >= _IN_VAIN * most)
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
-    where = "at the displacements of the default weights"
+    where = "to return from the displacements of the default weights"
     warn_beyond(lin.robot, where, lin.input_names, lin.input_units, asked[None], -high, high)
     limit = limit._replace(what=f"{limit.what or trials[-1].limit.what}{_NOT_ENOUGH}")
     return limit, _achieved(lin, solution, limit.bandwidth)
@@ -342,17 +342,18 @@ def _on_the_way(lin: LinearModel, solution: Solution, size: Array) -> Array:
 
 
 def _achieved(lin: LinearModel, solution: Solution, bandwidth: float) -> str:
-    """Say how fast a loop decays, and which of its modes are slower than at rest."""
+    """Return a report of a loop's bandwidth and decay, and of modes slower than at rest."""
     m, (poles, modes) = len(lin.M), np.linalg.eig(lin.A - lin.B @ solution.K)
     rates = rates_of(poles, lin.dt)
     decay, fast = -rates.real, np.abs(rates)
-    said = f"decay {decay.min():.3g} 1/s and damping {(decay / fast).min():.2g} at least"
+    said = f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} 1/s, "
+    said += f"damping ratio at least {(decay / fast).min():.2g}"
     slow = np.flatnonzero(decay < _AS_SLOW * math.sqrt(0.5) * bandwidth)
     large = np.abs(modes[:m, slow]) * np.sqrt(lin.M.diagonal())[:, None]
     among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
     if names := [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]:
-        said += f", slower than at rest: {listed(names)}"
-    return f"at {fast.min():.3g} rad/s or faster, {said}"
+        said += f"; slower than without springs, gravity or motion: {listed(names)}"
+    return said
 
 
 def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: float) -> str:
@@ -364,13 +365,13 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: flo
     for group, unit, d in zip(groups, lin.state_units, size, strict=False):
         if group == "q_m":
             joints[unit] = max(d, joints.get(unit, 0.0))
-    from_where = [f"the base from {' and '.join(base)}"] if base else []
+    from_where = [f"{' and '.join(base)} of the base"] if base else []
     if joints:
         sizes = " or ".join(f"{d:.2g} {unit}" for unit, d in joints.items())
-        from_where.append(f"joints from {sizes}")
+        from_where.append(f"{sizes} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size, the URDF has no limits"
-    slow = f", set by {limit.what}" if limit.what else ""
+    slow = f"; bandwidth set by {limit.what}" if limit.what else ""
     if beyond := [name for name, room in _efforts(lin).items() if room <= 0.0]:
-        slow += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
-    pace = achieved or f"at {limit.bandwidth:.3g} rad/s or faster"
-    return f"from {source}: {', '.join(from_where)} come back {pace}{slow}"
+        slow += f"; at or beyond the URDF limit at the point itself: {listed(beyond)}"
+    pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"
+    return f"from {source}, for displacements of {', '.join(from_where)}: {pace}{slow}"

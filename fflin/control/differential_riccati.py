@@ -1,4 +1,4 @@
-"""The differential Riccati equation backwards in time, by maps that keep P positive."""
+"""Differential Riccati equation, solved backwards in time with P positive semidefinite."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> t
             half = back(middle, end, P)
             double = back(start, middle, half)
             h = end - start
-            # The cubic with these values and slopes, midway.
+            # The cubic with these values and derivatives, midway.
             bend = at(start).rate(double) - at(end).rate(P)
             between = 0.5 * (double + P) + 0.125 * h * bend
             if max(_apart(single, double), _apart(between, half)) <= _ACCURACY:
@@ -142,13 +142,15 @@ def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array
 
 @contextmanager
 def bounded_by(remedy: str) -> Iterator[None]:
-    """Raise `InputError` where P changes too fast."""
+    """Raise `InputError` if P changes too fast."""
     try:
         # A P that overflows is refused, so that NumPy need not warn of it.
         with np.errstate(over="ignore", invalid="ignore"):
             yield
     except np.linalg.LinAlgError:
-        raise InputError(f"P changes too fast; give {remedy}") from None
+        raise InputError(
+            f"P of the Riccati equation changes too fast to be integrated; give {remedy}"
+        ) from None
 
 
 class Passed:

@@ -1,4 +1,4 @@
-"""A state feedback with the figures that prove it, and how it is shown."""
+"""State-feedback gain with its Riccati residual, poles and margins, and its report."""
 
 from __future__ import annotations
 
@@ -31,35 +31,38 @@ _FRAGILE = 0.3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Gain(Design):
-    r"""A state feedback ``u = u0 - K (x - x0)`` with the figures that prove it.
+    r"""State-feedback gain ``u = u0 - K (x - x0)`` with its residual, poles and margins.
 
     Attributes
     ----------
     K : ndarray (nu, nx)
+        Gain.
     P : ndarray (nx, nx)
-        The cost from x on is ``(x - x0)' P (x - x0)``.
+        Cost matrix: the optimal cost from x on is ``(x - x0)' P (x - x0)``.
     poles : ndarray (nz,) of complex
-        Eigenvalues of ``A - B K`` [1/s] over what is regulated; of a sampled model of the step.
+        Eigenvalues of ``A - B K`` over the regulated states: [1/s] for a continuous model,
+        discrete-time poles z for a sampled one.
     residual : float
-        Of the Riccati equation: its norm relative to the sum of the norms of its terms.
+        Norm of the Riccati equation's residual, relative to the sum of the norms of its terms.
     margin : float
-        Distance of the poles to the boundary of stability: the slowest decay [1/s]; of a sampled
-        model 1 less the largest modulus.
+        Distance of the poles to the stability boundary. For a continuous model, the slowest decay
+        rate [1/s]. For a sampled model, 1 minus the largest modulus.
     method : str
-        "structured" (half-size), "general" (SciPy) or "closed form".
+        Solver: "structured" (half-size), "general" (SciPy) or "closed form".
     A, B, Q, R, N : ndarray
-        The model and the weights on deviations; N is zero where there was none.
+        The model and the weights on deviations; N is zero if no cross weight was given.
     x0 : ndarray (nx,)
     u0 : ndarray (nu,)
+        State and inputs at the point.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, state_units, input_units : tuple of str
     frame, robot : str
-        Of the model.
+        Frame of the model and name of the robot.
     weights : str
-        The rule that made the weights, in words.
+        Description of the rule that made the weights.
     regulated : tuple of str (nz,)
-        The states that are fed back, all where it is empty; K, P, Q and N are zero elsewhere.
+        States that are fed back; if empty, all are. K, P, Q and N are zero for the other states.
 
     Examples
     --------
@@ -101,14 +104,14 @@ class Gain(Design):
         return titled(self, nx=self.K.shape[1], nu=len(self.K))
 
     def __str__(self) -> str:
-        """Show the gain, its poles, and the figures that prove it."""
+        """Return the report: the gain, its poles, residual, margins, weights and warnings."""
         nu, nx = self.K.shape
         time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
         head = f"{self.robot}: u = u0 - K (x - x0), {nx} states, {nu} inputs"
         if self.K.size <= _LARGE:
             shown = f"\n\n{matrix(self.K, self.input_names, self.state_names)}"
         else:
-            shown = f": norms of its blocks; a file holds all of it\n\n{_blocks(self)}"
+            shown = f", norms of its blocks; save() writes every entry\n\n{_blocks(self)}"
         fold = partial(textwrap.fill, width=width())
         more = {
             "not regulated": _unregulated(self),
@@ -126,22 +129,28 @@ class Gain(Design):
 
     @property
     def closed_loop(self) -> Array:
-        """A - B K (nx, nx)."""
+        """Closed-loop matrix A - B K (nx, nx)."""
         return self.A - self.B @ self.K
 
     def to_control(self) -> Any:
-        """Return -K as a `control.StateSpace` from x - x0 to u - u0, if that is installed."""
+        """Return -K as a `control.StateSpace` from x - x0 to u - u0, with signal names.
+
+        Raises
+        ------
+        MissingPackageError
+            If python-control is not installed.
+        """
         return state_space(([], [], [], -self.K), self.dt, (), self.state_names, self.input_names)
 
     @cached_property
     def margins(self) -> Margins:
-        """Gain and phase margins at the inputs, computed when first asked for."""
+        """Gain and phase margins at the inputs, computed at first access."""
         S = picked(self.regulated or self.state_names, self.state_names)
         return input_margins(S @ self.A @ S.T, S @ self.B, self.K @ S.T, self.R, self.dt)
 
 
 def titled(record: Any, **sizes: int) -> str:
-    """Say in a line of what robot a record is, its sizes and time, and how well it is solved."""
+    """Return a one-line title: the robot, the sizes, the sampling time and the residual."""
     time = f"dt={record.dt:g} s" if record.dt else "continuous"
     parts = [f"'{record.robot}'", *(f"{key}={size}" for key, size in sizes.items()), time]
     if hasattr(record, "residual"):
@@ -184,7 +193,7 @@ _FROM_MODEL = (
 
 
 def fragility(gain: Gain) -> str:
-    """Say what to do about a gain that bears little at its inputs; else nothing."""
+    """Return a warning if the disk margin at the inputs is small, else an empty string."""
     # A continuous optimal loop with a diagonal R has a disk margin of 2/3 at least.
     R = gain.R
     alone = np.count_nonzero(R) == np.count_nonzero(R.diagonal())
@@ -193,16 +202,16 @@ def fragility(gain: Gain) -> str:
     margins = gain.margins
     if margins.disk >= _FRAGILE:
         return ""
-    remedy = "shorten dt, or slow the loop" if gain.dt else "weigh each input alone"
+    remedy = "shorten dt, or slow the loop" if gain.dt else "give a diagonal R"
     return (
-        f"the loop bears only {margins.phase:.2g} deg of phase at its inputs (disk margin "
-        f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or error of the model makes it "
+        f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
+        f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or model error makes the loop "
         f"unstable; {remedy}, as the default weights do"
     )
 
 
 def one_sided(gain: Gain) -> str:
-    """Say which thrusters a gain lets pull; else nothing."""
+    """Return a warning if a gain commands negative thrust, else an empty string."""
     thrusters = [
         name
         for key, name, row, at in zip(
@@ -213,9 +222,9 @@ def one_sided(gain: Gain) -> str:
     if not thrusters:
         return ""
     return (
-        f"the design lets thrusters pull ({listed(thrusters)}): thrust below zero is cut, so that "
-        "poles and margins do not hold; design with torque and force on the base, which "
-        "fflin.Allocation shares out among thrusters, as fflin simulate does (--allocate)"
+        f"the design requires thrusters to pull ({listed(thrusters)}): negative thrust is cut at "
+        "zero, so the poles and margins do not hold; design with torque and force on the base, "
+        "and allocate them to thrusters with fflin.Allocation (fflin simulate --allocate)"
     )
 
 
@@ -224,7 +233,7 @@ def _unregulated(gain: Gain) -> str:
     left = [name for name in gain.state_names if gain.regulated and name not in gain.regulated]
     base = [name for name in left if name.startswith(("r_b.", "v_b."))]
     shown = "r_b, v_b" if len(base) == 6 else ", ".join(base)
-    parts = [f"{shown} (no input pushes it)"] if base else []
+    parts = [f"{shown} (no input pushes the base)"] if base else []
     if any(name.startswith("q_m.") for name in left):
         parts.append("wheel angles (ignorable)")
     if speeds := [name for name in left if name.startswith("qdot_m.")]:
@@ -235,8 +244,8 @@ def _unregulated(gain: Gain) -> str:
         )
         tied = "tied to the body's rate by the conserved momentum"
         if gain.frame in ("lvlh", "hill"):
-            tied = "tied to the body's rate but for the field of the orbit"
-        why = tied if held == both else "wheel_speeds=True regulates those that can be"
+            tied = "tied to the body's rate, except for the forces of the orbit"
+        why = tied if held == both else "wheel_speeds=True regulates the controllable ones"
         parts.append(f"wheel speeds ({why})")
     return ", ".join(parts)
 
@@ -269,7 +278,7 @@ def _poles(gain: Gain) -> str:
     ]
     if len(order) > 24:
         body.insert(12, [f"... {len(order) - 16} more", "", ""])
-    title = "poles of A - B K, the slowest first"
+    title = "poles of A - B K, slowest first"
     return f"{title}\n\n{grid([heads, *body], 'l')}"
 
 
@@ -285,7 +294,6 @@ def _figures(gain: Gain) -> str:
     damping = float((-rates.real / np.abs(rates)).min())
     return (
         f"Riccati residual {gain.residual:.1e} ({gain.method}); {slowest} {gain.margin:.5g}, least "
-        f"damping {damping:.2g}; "
-        f"all inputs at once bear gains of {low:.3g} to {high:.3g} and {margins.phase:.3g} deg of "
-        f"phase (disk margin {margins.disk:.3g})"
+        f"damping ratio {damping:.2g}; margins for simultaneous changes of all inputs: gain "
+        f"{low:.3g} to {high:.3g}, phase {margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
     )

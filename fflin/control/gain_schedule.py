@@ -1,4 +1,4 @@
-"""A time-varying feedback along a trajectory."""
+"""Time-varying feedback gain along a trajectory."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _nothing = partial(np.zeros, 0)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Schedule(Design):
-    """What `Passed` has of a trajectory's knots or samples."""
+    """A gain over time, at the knots or samples of a trajectory."""
 
     WIDTH: ClassVar = "nu"
 
@@ -44,9 +44,10 @@ class Schedule(Design):
         return self.gain(t)
 
     def gain(self, t: float) -> Array:
-        """Return the gain at a time; InputError where it is not within the knots.
+        """Return the gain at a time; `InputError` if the time is outside the knots.
 
-        Between the knots that of the model and P there; of samples that of the last one.
+        Between knots, the gain follows from the interpolated model and P. A sampled schedule
+        returns the gain of the last sample.
         """
         passed = self.passed
         if type(t) is not float or not passed.first <= t <= passed.last:
@@ -67,30 +68,33 @@ class Schedule(Design):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GainSchedule(Schedule):
-    r"""A time-varying feedback ``u = u*(t) - K(t) e`` of the error e from a trajectory.
+    r"""Time-varying feedback ``u = u*(t) - K(t) e`` of the error e from a trajectory.
 
     Attributes
     ----------
     t : ndarray (M,)
-        Times of the knots [s]: the trajectory's and those that P needs, or the samples.
+        Times [s] of the knots: the trajectory's knots and those added to interpolate P. For a
+        sampled schedule, the sample times.
     K : ndarray (M, nu, nx)
-        Of samples the last row repeats what acts to the end.
+        Gains. In a sampled schedule the last row repeats the gain before it.
     P : ndarray (M, nx, nx)
-        The cost from t on is e' P(t) e.
+        Cost matrix: the optimal cost from t on is e' P(t) e.
     A : ndarray (M, nx, nx)
     B : ndarray (M, nx, nu)
-        The model at the knots; or M - 1 that take a sample to the next.
+        Linear model at the knots. A sampled schedule has M - 1 of each, from one sample to the
+        next.
     Q, R, Qf : ndarray
         Weights of the continuous cost.
     residual : float
         Largest residual of the differential Riccati equation midway between the knots, relative
-        to the sum of the norms of its terms; of samples that of the difference equation.
+        to the sum of the norms of its terms. For a sampled schedule, the residual of the
+        difference equation.
     state_names, input_names : tuple of str
     robot : str
     dt : float
-        Time [s] between samples, over which u is held; 0 for continuous time.
+        Sampling time [s], over which u is held; 0 for continuous time.
     weights : str
-        The rule that made the weights, in words.
+        Description of the rule that made the weights.
     knots, q, v, u, hold, frame
         The trajectory, see `trajectory`.
 
@@ -129,16 +133,19 @@ class GainSchedule(Schedule):
     frame: str = field(default_factory=str)
 
     def __str__(self) -> str:
-        """Show the rule of its weights too."""
+        """Return the report: the sizes, the residual and the rule of the weights."""
         verdict = [] if self.verified else [NOT_VERIFIED]
         said = [repr(self), f"weights: {self.weights or 'as given'}", *verdict]
         return "\n".join(folded([each]) for each in said)
 
     def trajectory(self, robot: Robot) -> Trajectory:
-        """Return the trajectory that it keeps a robot on."""
+        """Return the trajectory that the gains were designed for."""
         if not self.knots.size:
-            raise InputError("the file has no trajectory; load it with fflin.Trajectory.load")
-        state, made = StateMap(robot), f"the gains are those of '{self.robot}'"
+            raise InputError(
+                "the file of gains contains no trajectory; load one with fflin.Trajectory.load "
+                "and use TrajectoryFeedback"
+            )
+        state, made = StateMap(robot), f"the gains are for a model of '{self.robot}'"
         inputs = Actuation(state).names, self.input_names
         for kind, there, own in (
             ("state", state.names, self.state_names),
@@ -149,7 +156,7 @@ class GainSchedule(Schedule):
         return Trajectory(robot, self.knots, **values, hold=self.hold, frame=self.frame)
 
     def cost_to_go(self, t: float) -> Array:
-        """Return P (nx, nx) at a time: a cubic between the knots, or that of the last sample."""
+        """Return P (nx, nx) at a time: cubic between knots, or the value at the last sample."""
         return self.passed.cost(self._within(t))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Modes, Lyapunov equations by them, and the optimal loop of half the usual eigenproblem."""
+"""Modal Lyapunov solver, and optimal loops from an eigenproblem of half the usual size."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fflin.base.validation import Array
 
 
 class ModalMatrix:
-    """The modes V (n, n) of a real matrix F, those of complex pairs side by side."""
+    """Modes V (n, n) of a real matrix F, with complex pairs side by side."""
 
     def __init__(self, V: Any, poles: Any, discrete: bool) -> None:
         self.V, self.inverse, self.values = V, np.linalg.inv(V), poles

@@ -1,4 +1,4 @@
-"""A receding horizon: the quadratic program of each sample, and the command that solves it."""
+"""Receding horizon: the quadratic program of each sample, and its solution by DAQP."""
 
 import warnings
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ _OPEN, _SOFT, _PASSES, _MOST = 1e30, 8, 2, 10_000
 
 
 class Stage(NamedTuple):
-    """A sample, e' = A e + B d with d = u - u*, and limits on E e' + D d, first those of inputs."""
+    """Stage e' = A e + B d with d = u - u*, and limits on E e' + D d, input limits first."""
 
     A: Array  # (nx, nx)
     B: Array  # (nx, nu)
@@ -38,18 +38,34 @@ class Stage(NamedTuple):
 
 
 class Matrices(NamedTuple):
-    """Least d'H d / 2 + g'd with low <= G d <= high over the d = u - u* of N samples."""
+    """Quadratic program over the d = u - u* of N samples: min d'H d / 2 + g'd, low <= G d <= high.
 
-    H: Array  # (N nu, N nu)
-    g: Array  # (N nu,)
-    G: Array  # (m, N nu)
-    low: Array  # (m,)
-    high: Array  # (m,)
-    soft: NDArray[np.bool_]  # (m,), what may be passed where nothing else is left
-    Phi: Array  # (N + 1, nx, nx): e_k = Phi_k e + Gamma_k d
-    Gamma: Array  # (N + 1, nx, N nu)
-    inputs: tuple[str, ...]  # "name[k]" of d
-    limits: tuple[str, ...]  # of the rows of G; of states and outputs at the end of sample k
+    Attributes
+    ----------
+    H, g : ndarray (N nu, N nu), (N nu,)
+        Cost.
+    G, low, high : ndarray (m, N nu), (m,), (m,)
+        Limits.
+    soft : ndarray (m,) of bool
+        Limits that may be exceeded if the program is otherwise infeasible.
+    Phi, Gamma : ndarray (N + 1, nx, nx), (N + 1, nx, N nu)
+        Predicted errors ``e_k = Phi_k e + Gamma_k d``.
+    inputs : tuple of str
+        Names "name[k]" of the entries of d.
+    limits : tuple of str
+        Names of the rows of G; limits of states and outputs apply at the end of sample k.
+    """
+
+    H: Array
+    g: Array
+    G: Array
+    low: Array
+    high: Array
+    soft: NDArray[np.bool_]
+    Phi: Array
+    Gamma: Array
+    inputs: tuple[str, ...]
+    limits: tuple[str, ...]
 
 
 def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
@@ -127,14 +143,14 @@ class Receding:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is to be said of the run."""
+        """Notes on the run: plans, exceeded limits and failures of the solver."""
         said = f"{self.solves} plans of {self.of.samples} samples of {self.of.dt:g} s"
         if self.softened:
-            said += f", {self.softened} beyond a limit, the farthest {self._said}"
+            said += f"; {self.softened} plans exceed a soft limit (worst: {self._said})"
         if self.passed:
-            said += f"; the robot passed one at {self.passed} samples, the farthest {self._met}"
+            said += f"; the robot exceeds one at {self.passed} samples (worst: {self._met})"
         if self.unfinished:
-            said += f", {self.unfinished} not found, where the regulator acted, cut at the limits"
+            said += f"; {self.unfinished} plans not found: regulator used, cut at the limits"
         return (said,) if self.solves else ()
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
@@ -165,9 +181,13 @@ class Receding:
             self._count(t, free + self._G @ z)
         if flag <= 0:
             self.unfinished += 1
-            said = f"at t = {t:g} s no plan is found (DAQP ends with {flag}): where that is so the "
             if self.unfinished == 1:
-                warnings.warn(f"{said}regulator acts, cut at the limits", FflinWarning, 2)
+                warnings.warn(
+                    f"no plan was found at t = {t:g} s (DAQP exit flag {flag}): at such samples "
+                    "the regulator's command is applied, cut at the limits",
+                    FflinWarning,
+                    2,
+                )
         d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
         self._due = now, d
         return d

@@ -1,4 +1,4 @@
-"""The steady Kalman filter of a linear model, and the compensator of filter and gain."""
+"""Steady-state Kalman filter of a linear model, and the LQG compensator."""
 
 from __future__ import annotations
 
@@ -24,36 +24,40 @@ from fflin.linear.model import LinearModel, state_space
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimator(Design):
-    r"""A steady Kalman filter of the deviations from the point.
+    r"""Steady-state Kalman filter of the deviations from the point.
 
-    For continuous time ``d(xh)/dt = A xh + B u + L (y - C xh - D u)``; sampled, the left side is
-    the prediction of the next sample, and ``xh + L_update (y - C xh - D u)`` the estimate that
-    has seen the present one.
+    In continuous time, ``d(xh)/dt = A xh + B u + L (y - C xh - D u)``. For a sampled model, the
+    left side is the prediction for the next sample. The filtered estimate, which includes the
+    present measurement, is ``xh + L_update (y - C xh - D u)``.
 
     Attributes
     ----------
     L : ndarray (nx, ny)
+        Filter gain.
     L_update : ndarray (nx, ny)
-        ``L = A L_update`` of a sampled model; L itself for continuous time.
+        Gain of the measurement update: ``L = A L_update`` for a sampled model; equal to L in
+        continuous time.
     P : ndarray (nx, nx)
-        Covariance of the error of xh.
+        Covariance of the estimation error.
     poles : ndarray (nz,) of complex
-        Eigenvalues of ``A - L C`` [1/s] over what is estimated; of a sampled model of the step.
+        Eigenvalues of ``A - L C`` over the estimated states: [1/s] for a continuous model,
+        discrete-time poles z for a sampled one.
     residual : float
-        Of the Riccati equation, relative to the sum of the norms of its terms.
+        Residual of the Riccati equation, relative to the sum of the norms of its terms.
     margin : float
-        Distance of the poles to the boundary of stability, as in `Gain`.
+        Distance of the poles to the stability boundary, as in `Gain`.
     A, B, C, D : ndarray
         The model.
     W, V : ndarray
-        Covariances of the disturbance of the state and of the noise of the outputs.
+        Covariances of the state disturbance and of the measurement noise.
     x0, u0, y0 : ndarray
+        State, inputs and outputs at the point.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
     robot : str
     estimated : tuple of str (nz,)
-        The states that are, all where it is empty; L, P and W are zero elsewhere.
+        Estimated states; if empty, all are. L, P and W are zero for the other states.
 
     Examples
     --------
@@ -91,7 +95,13 @@ class Estimator(Design):
         return titled(self, nx=len(self.L), ny=self.L.shape[1])
 
     def to_control(self) -> Any:
-        """Return a `control.StateSpace` from u - u0 and y - y0 to xh, if that is installed."""
+        """Return a `control.StateSpace` from u - u0 and y - y0 to xh, with signal names.
+
+        Raises
+        ------
+        MissingPackageError
+            If python-control is not installed.
+        """
         L, both = self.L, (*self.input_names, *self.output_names)
         system = self.A - L @ self.C, np.hstack((self.B - L @ self.D, L)), np.eye(len(L)), 0.0
         return state_space(system, self.dt, self.state_names, both, self.state_names)
@@ -99,9 +109,10 @@ class Estimator(Design):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Compensator(Design):
-    r"""A dynamic feedback from y - y0 to u - u0: ``d(z)/dt = A z + B (y - y0)``, ``u - u0 = C z``.
+    r"""Output-feedback compensator ``d(z)/dt = A z + B (y - y0)``, ``u - u0 = C z``.
 
-    Sampled, the left side is the next sample's z. Its state z is the estimate of x - x0.
+    For a sampled model, the left side is z at the next sample. The state z is the estimate of
+    x - x0.
 
     Attributes
     ----------
@@ -109,11 +120,13 @@ class Compensator(Design):
     B : ndarray (nz, ny)
     C : ndarray (nu, nz)
     poles : ndarray (2 nz,) of complex
-        Of the loop that it closes around the model: those of the gain and of the estimator.
+        Closed-loop poles around the model: the poles of the gain and of the estimator.
     y0, u0 : ndarray
+        Outputs and inputs at the point.
     dt : float
+        Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
-        Its inputs are the outputs of the model.
+        Signals of the compensator. Its inputs are the outputs of the model.
     robot : str
 
     Examples
@@ -161,27 +174,29 @@ def kalman(
     *,
     wheel_speeds: bool | None = None,
 ) -> Estimator:
-    r"""Return the steady Kalman filter of a model about a fixed point.
+    r"""Return the steady-state Kalman filter of a model about a fixed point.
 
-    The model is disturbed by white noises, ``dx/dt = ... + w`` and ``y = ... + n`` of intensities
-    W and V; of a sampled model they are covariances of each sample's. P solves
+    White noise w acts on the state and n on the outputs, ``dx/dt = ... + w`` and ``y = ... + n``,
+    with intensities W and V. For a sampled model, W and V are the covariances per sample. P solves
 
     .. math:: A P + P A^T - P C^T V^{-1} C P + W = 0,\qquad L = P C^T V^{-1}
 
-    or its sampled counterpart, by SciPy's solver and Newton's method, see `lqr`. Of a model with
-    reaction wheels what `lqr` regulates is estimated, by the outputs that see nothing else.
+    or its discrete-time counterpart. SciPy's solver and Newton's method solve the equation, see
+    `lqr`. For a model with reaction wheels, the filter estimates only the states that `lqr`
+    regulates. It uses only the outputs that depend on no other states.
 
     Parameters
     ----------
     lin : LinearModel
     W : array_like (nx, nx) or (nx,), float, or mapping
-        Positive semidefinite: a matrix, its diagonal, or {name: intensity} with names of states
-        or of their groups.
+        Intensity of the disturbance, positive semidefinite: a matrix, its diagonal, or
+        {name: intensity} with names of states or of their groups.
     V : array_like (ny, ny) or (ny,), float, or mapping
-        Positive definite; likewise with names of outputs.
+        Intensity of the measurement noise, positive definite, in the same forms with names of
+        outputs.
     G : array_like (nx, nw), optional
-        The disturbance acts through G and W is (nw, nw): ``G=lin.B`` for noisy inputs, whose
-        names W then takes.
+        Input matrix of the disturbance; W is then (nw, nw). With ``G=lin.B`` the inputs are
+        noisy, and W takes their names.
     wheel_speeds : bool, optional
         As in `lqr`.
 
@@ -192,12 +207,12 @@ def kalman(
     Raises
     ------
     DetectabilityError
-        If the outputs do not show a mode that does not settle by itself; it is named.
+        If the outputs do not observe a mode that does not decay by itself; the message names it.
     EquilibriumError
         If the point is not a fixed point.
     InputError
-        If a size or value is wrong, or no disturbance reaches a mode that does not settle by
-        itself, so that a filter would stop correcting it.
+        If a size or value is wrong, or if no disturbance reaches a mode that does not decay by
+        itself. The filter would stop correcting such a mode.
     UnknownNameError
         If a name does not exist.
     ModelError
@@ -247,18 +262,18 @@ def kalman(
 
 
 def lqg(gain: Gain, estimator: Estimator) -> Compensator:
-    r"""Return the compensator that feeds an estimate back, u - u0 = -K xh.
+    r"""Return the LQG compensator, which feeds back the estimate: u - u0 = -K xh.
 
     .. math:: \dot z = (A - B K - L C + L D K) z + L (y - y_0),\qquad u - u_0 = -K z
 
-    Sampled, the estimate is the prediction from the samples before, so that a sample of time is
-    left for computing.
+    For a sampled model, xh is the prediction from earlier samples, which leaves one sampling time
+    for the computation.
 
     Parameters
     ----------
     gain : Gain
     estimator : Estimator
-        Of the same model.
+        Estimator for the same model.
 
     Returns
     -------
@@ -267,7 +282,8 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     Raises
     ------
     InputError
-        If the two are of different models, or the gain feeds back what is not estimated.
+        If the two belong to different models, or the gain feeds back a state that is not
+        estimated.
 
     Examples
     --------
@@ -278,10 +294,15 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     0.1
     """
     if not isinstance(gain, Gain) or not isinstance(estimator, Estimator):
-        raise InputError("lqg takes a Gain, as lqr returns it, and an Estimator, as kalman does")
+        raise InputError(
+            f"lqg got a {type(gain).__name__} and a {type(estimator).__name__}, expected a Gain "
+            "from lqr and an Estimator from kalman"
+        )
     e = estimator
     if gain.dt != e.dt or not (np.array_equal(gain.A, e.A) and np.array_equal(gain.B, e.B)):
-        raise InputError("the gain and the estimator are of different models; use one for both")
+        raise InputError(
+            "the gain and the estimator belong to different models; use one model for both"
+        )
     names = e.estimated or e.state_names
     if unseen := [name for name in gain.regulated if name not in names]:
         raise InputError(
@@ -321,7 +342,9 @@ def disturbance(
     if dimension("G", G) == np.ndim(of.A) == 3:
         through = np.array([columns("G", each, nx) for each in np.asarray(G)])
         if len(through) != len(of.A):
-            raise InputError(f"G has {len(through)} matrices, expected {len(of.A)}, one a knot")
+            raise InputError(
+                f"G has {len(through)} matrices, expected {len(of.A)}, one for each knot"
+            )
     else:
         through = columns("G", G, nx)
     same = np.array_equal(through, of.B)

@@ -1,4 +1,4 @@
-"""Feedback of the robot's outputs by a linear system, whoever designed it."""
+"""Output feedback by any linear system, such as a controller designed in another tool."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Sample(NamedTuple):
 
 
 class Compensation:
-    """What a law does from sample to sample or, where dt is 0, stage to stage, from z = 0 on."""
+    """Control law with a state z, advanced from sample to sample, or per stage if dt is 0."""
 
     def __init__(self, size: int, at: Callable[[float], Sample], dt: float = 1.0) -> None:
         self.at, self.dt = at, dt
@@ -90,7 +90,7 @@ class Compensation:
 
 
 class Loop(Compensation):
-    """The policy of a law on what the robot measures, relative to where it is to be."""
+    """Policy of a control law on the robot's outputs, relative to its reference."""
 
     def __init__(
         self, state: StateMap, dt: float, noise: Any, size: int, at: Any, there: Any
@@ -112,8 +112,8 @@ class Loop(Compensation):
             self._clock.tick(t)
         elif len(self.estimate) and len(self.rates) != self.stages + 1:
             raise InputError(
-                "the states of a continuous controller are integrated along by fflin.simulate, "
-                "which must be given itself as the policy; or sample it"
+                "the states of a continuous controller are integrated by fflin.simulate; give it "
+                "the LinearController itself as the policy, or sample the controller"
             )
         measure, near = self._there(t)
         state, x = measure.state, measure.state.read(q, v, near=near)
@@ -136,46 +136,57 @@ class Loop(Compensation):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearController:
-    r"""The feedback ``u - u0 = system (y - y0)`` of the robot's outputs by any linear system.
+    r"""Output feedback ``u - u0 = system (y - y0)`` by any linear system.
 
     .. math:: \dot z = A z + B (y - y_0),\qquad u - u_0 = C z + D (y - y_0),\qquad z(0) = 0
 
-    y is what the robot's outputs measure in the chart of the model, as `outputs` returns it. What
-    the system gives is added to u0: that is positive feedback, as of ``hinfsyn`` and ``h2syn``.
+    y is the vector of the robot's outputs in the chart of the model, as `outputs` returns it. The
+    output of the system is added to u0: positive feedback, as with ``hinfsyn`` and ``h2syn``.
 
-    In continuous time z is integrated along with the robot, by the same stages; where `simulate`
-    is given `sample` or `delay`, y is held from sample to sample and z follows exactly. A sampled
-    system is asked at its own times, multiples of the step, and u is held between them.
+    A continuous system is integrated together with the robot, in the same Runge-Kutta stages. If
+    `simulate` is given `sample` or `delay`, y is held between samples and z is advanced exactly. A
+    sampled system is evaluated at its own sample times, which must be multiples of the step. Its
+    u is held between them.
 
     Parameters
     ----------
     system : python-control or SciPy system, array_like, tuple, `Compensator` or path
-        A state space or transfer function, a gain D (nu, ny), (A, B, C, D) or (A, B, C, D, dt), or
-        a .mat, .npz or .json file with A, B, C, D, and dt or Ts where it is sampled, or D alone.
-        Where it names its inputs and outputs (in a file ``input_names`` or ``InputName``, ...),
-        they are outputs and inputs of the model, dots or underscores, and need not be all of
-        them; else all are there, in order. A dt that is not said is the model's.
+        The system, in one of these forms:
+
+        - a state space or transfer function;
+        - a gain D (nu, ny);
+        - (A, B, C, D) or (A, B, C, D, dt);
+        - a .mat, .npz or .json file with A, B, C, D, and with dt or Ts if sampled;
+        - such a file with D alone.
+
+        Input and output names of the system (in a file ``input_names`` or ``InputName``, ...) must
+        be names of the model's outputs and inputs, with dots or underscores. They may be a subset.
+        Without names, the system must have all outputs and inputs of the model, in order. If the
+        system states no dt, the model's dt is used.
     lin : LinearModel
-        The model about whose point it acts, continuous or sampled.
+        Continuous or sampled model; the controller acts about its point.
     sign : {1, -1}
-        -1 of a system that was designed for negative feedback.
+        Give -1 for a system that was designed for negative feedback.
     noise : callable, optional
         noise(t) -> (ny,), added to y.
 
     Attributes
     ----------
     system : tuple of A, B, C, D, dt, inputs, outputs
-        Over all outputs and inputs of the model, with its sign.
+        The system over all outputs and inputs of the model, with the sign applied.
     loop : ndarray (nx + nz, nx + nz)
-        Matrix of the linear loop, of the model's state and z.
+        Closed-loop matrix of the model's state and z.
 
     Raises
     ------
     InputError
-        If a size, name or sampling time does not fit the model, an entry is not finite, a transfer
-        function is improper, or D acts on an output that feels the input at once.
+        If one of these holds:
+
+        - a size, name or sampling time does not fit the model;
+        - an entry is not finite, or a transfer function is improper;
+        - D acts on an output with direct feedthrough from the inputs (algebraic loop).
     FileError
-        If the file cannot be read or lacks what is named above.
+        If the file cannot be read or lacks the matrices named above.
 
     Examples
     --------
@@ -196,7 +207,10 @@ class LinearController:
     def __post_init__(self) -> None:
         lin = instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
         if lin.moving or number("sign", self.sign) not in (1.0, -1.0):
-            raise InputError("expected a model about a point that stays, and sign 1 or -1")
+            raise InputError(
+                f"sign is {self.sign!r} and lin.moving is {lin.moving}, expected sign 1 or -1 and "
+                "a model about a fixed point, with moving False"
+            )
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
         by = fitted(system_of(self.system), lin)
@@ -204,20 +218,22 @@ class LinearController:
         if felt.any():
             raise InputError(
                 f"D of the controller acts on {listed(compress(lin.output_names, felt))}, which "
-                "feels the input at once: an algebraic loop; take D = 0 there, such as behind a "
-                "low-pass filter"
+                "depends directly on the inputs: an algebraic loop; set D to 0 there, for example "
+                "with a low-pass filter on this output"
             )
         dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
         dt = lin.dt or dt if dt < 0.0 else dt
         if dt < 0.0:
-            raise InputError("the controller is sampled at a dt that it does not say; give it one")
+            raise InputError(
+                "the controller is sampled, but states no sampling time; give its dt [s]"
+            )
         if lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt:
             times = (
                 f"sampled at dt = {each:g} s" if each else "continuous" for each in (dt, lin.dt)
             )
             raise InputError(
-                "the controller is {}, the model {}; give the continuous model, or sample both "
-                "alike".format(*times)
+                "the controller is {}, the model is {}; give the continuous model, or sample both "
+                "with the same dt".format(*times)
             )
         by = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
         vars(self).update(system=by, sign=1.0)
@@ -234,17 +250,18 @@ class LinearController:
 
     @property
     def terms(self) -> Sample:
-        """What it does at each sample or stage."""
+        """Matrices and offsets that apply at each sample or stage."""
         (A, B, C, D, *_), lin = self.system, self.lin
         return Sample(A, B, C, D, lin.u0, lin.y0, lin.C, lin.D)
 
     def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot, with a state of its own.
+        """Return policy(t, q, v) -> u for a robot, with a separate state z for each call.
 
         Raises
         ------
         InputError
-            If the robot has not the model's states, inputs and outputs; its masses may be others.
+            If the robot's states, inputs or outputs differ from the model's. Its masses may
+            differ.
         """
         lin, stays = self.lin, self.terms
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
@@ -253,7 +270,7 @@ class LinearController:
         return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
 
     def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
-        """Return a model with the system's states besides, and K and u of u + K e of the two."""
+        """Return the model augmented by the system's states, and K and u of u + K e."""
         A, B, C, D, u0, y0, *_ = self.terms
         apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
         both = replace(
@@ -267,13 +284,13 @@ class LinearController:
 
     @cached_property
     def loop(self) -> Array:
-        """The closed loop's matrix (nx + nz, nx + nz): of the model's state and the system's."""
+        """Closed-loop matrix (nx + nz, nx + nz) of the model's state and the system's state."""
         lin = self.lin.discretize(self.dt) if self.dt and not self.lin.dt else self.lin
         both, K, _ = self.around(lin)
         return both.A + both.B @ K
 
     def sampled(self, dt: float) -> LinearController:
-        """Return it in samples of dt [s], y held between them; itself where it is sampled."""
+        """Return the controller sampled at dt [s], with y held; itself if already sampled."""
         by = self.system
         if by.dt or not len(by.A):
             return self
@@ -282,7 +299,7 @@ class LinearController:
 
 
 def growing(policy: Any) -> tuple[str, ...]:
-    """Say which poles grow, of the loop of a linear controller and of itself."""
+    """Return warnings on unstable poles of a linear controller and of its linear loop."""
     said, by = [], decider(policy)
     of = ("linear loop", "controller by itself") if isinstance(by, LinearController) else ()
     for what in of:
@@ -294,9 +311,9 @@ def growing(policy: Any) -> tuple[str, ...]:
             poles = np.linalg.eigvals(LinearController(by.system, by.lin, sign=-1.0).loop)
             if what == "linear loop" and ((np.abs(poles) < 1) if by.dt else (poles.real < 0)).all():
                 said[-1] += (
-                    "; with the other sign it is stable: try sign=-1 (--negative-feedback), "
+                    "; it is stable with the other sign: set sign=-1 (--negative-feedback), "
                 )
-                said[-1] += "or leave it out where it is given"
+                said[-1] += "or remove it if it is set"
     return tuple(said)
 
 

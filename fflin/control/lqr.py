@@ -40,28 +40,34 @@ def lqr(
 ) -> Gain:
     r"""Return the linear quadratic regulator of a model about a fixed point.
 
-    For a continuous model u = u0 - K (x - x0) minimises
+    For a continuous model, the feedback u = u0 - K (x - x0) minimises
 
     .. math:: \int_0^\infty \delta x^T Q\,\delta x + 2\,\delta x^T N\,\delta u
               + \delta u^T R\,\delta u\;dt,
 
-    for a sampled one the same sum over its samples; `sampled_cost` takes the weights of the
-    integral to those of the sum. The Riccati equation of a fully actuated model is solved by
-    half its usual size, any other by SciPy's solver; either is refined by Newton's method, and
-    the residual in the model's own variables comes with the result. A weight that is formed with
-    the inertia, such as M^-1 R_a M^-1 on accelerations, has lost what the inertia's condition
-    takes before any solver sees it: `acceleration_lqr` does without.
+    For a sampled model, it minimises the same sum over the samples. `sampled_cost` converts the
+    weights of the integral to weights of the sum.
 
-    Without weights the regulator is one that the robot can bear: its slowest motion comes back at
-    0.2 rad/s, or as much slower as the efforts and speeds of the URDF ask for where the base is
-    turned by 30 deg and the joints by 0.3 rad; see (10.7) of docs/derivation.md. Every input
-    then bears 60 deg of phase, and any gain from a half up. With springs or gravity each mode that
-    the inputs reach keeps the decay that it has at rest (10.8); ``gain.weights`` has the
-    bandwidth, decay and damping of the loop, and names the modes that are slower.
+    For a fully actuated model, the Riccati equation is solved by an eigenproblem of half the usual
+    size. For any other model, SciPy solves it. Newton's method refines both solutions. The result
+    contains the residual in the model's own variables. A weight formed with the inertia, such as
+    M^-1 R_a M^-1 on accelerations, loses digits to the condition number of the inertia before any
+    solver sees it. `acceleration_lqr` avoids this loss.
 
-    Of a model with reaction wheels what can be is regulated, and named in ``gain.regulated``:
-    wheels' angles are ignorable, their speeds follow the body's rate where only they turn it, and
-    no input may push the base, (9.4) of docs/derivation.md. Weights on these have no effect.
+    Without weights, the regulator respects the limits of the URDF, (10.7) of docs/derivation.md.
+    Its slowest motion has a bandwidth of 0.2 rad/s. The bandwidth is lower if the robot would
+    otherwise exceed an effort or speed limit. The limits are checked for a return from a
+    displacement of 30 deg of the base and 0.3 rad of each joint. Each input then has a phase
+    margin of 60 deg and tolerates any gain factor above one half. With springs or gravity, each
+    mode that the inputs reach decays as fast as without them (10.8). ``gain.weights`` states the
+    bandwidth, decay rate and damping of the loop, and names slower modes.
+
+    For a model with reaction wheels, only the controllable part is regulated, (9.4) of
+    docs/derivation.md; ``gain.regulated`` lists its states. Weights have no effect on the others:
+
+    - wheel angles, which are ignorable;
+    - wheel speeds that follow the body's rate, if the wheels alone turn the body;
+    - the position and velocity of the base, if no input pushes it.
 
     Parameters
     ----------
@@ -69,18 +75,20 @@ def lqr(
         About a fixed point, or about a steady motion with ``moving=True``.
     Q : array_like (nx, nx) or (nx,), float, or mapping, optional
         Weight on the state, positive semidefinite: a matrix, its diagonal, or {name: weight}
-        with names of states or of their groups, such as ``q_b``; what is not named costs nothing.
+        with names of states or of their groups, such as ``q_b``. Unnamed states cost nothing.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
-        Weight on the inputs, positive definite; likewise.
+        Weight on the inputs, positive definite, in the same forms.
     N : array_like (nx, nu), optional
-        Cross weight, with which Q - N R^-1 N' is positive semidefinite.
+        Cross weight. Q - N R^-1 N' must be positive semidefinite.
     weights : {"urdf", "identity"}, optional
-        Instead of Q and R: those above (default), or 1 on every state and input. Of a sampled
-        model they are those of the continuous cost under the hold.
+        Rule for the weights, instead of Q and R: "urdf" is the rule above (default), "identity"
+        is 1 on every state and input. For a sampled model, the rule applies to the continuous
+        cost, which is then sampled under zero-order hold.
     wheel_speeds : bool, optional
-        Whether wheels come back to the speeds of the point: by default where other inputs can
-        bring them; True also where wheels turn against each other, False none. The default
-        weights bring them back at a tenth of w.
+        Whether to regulate the wheel speeds to their values at the point. By default they are
+        regulated if inputs other than the wheels can do it. With True they are also regulated if
+        only wheels turning against each other can do it. With False they are never regulated. The
+        default weights return wheel speeds at a tenth of the bandwidth.
 
     Returns
     -------
@@ -89,12 +97,12 @@ def lqr(
     Raises
     ------
     EquilibriumError
-        If the point is not a fixed point; with the rows of f0 that are not zero.
+        If the point is not a fixed point; the message lists the nonzero rows of f0.
     StabilizabilityError
-        If the inputs cannot hold a mode that does not settle by itself; it is named.
+        If the inputs cannot stabilise a mode that does not decay by itself; the message names it.
     InputError
-        If a weight is of a wrong size, not positive (semi)definite, or leaves out a mode that does
-        not settle by itself.
+        If a weight has a wrong size, is not positive (semi)definite, or omits a mode that does not
+        decay by itself.
     UnknownNameError
         If a name does not exist.
     ModelError
@@ -103,7 +111,7 @@ def lqr(
     Warns
     -----
     FflinWarning
-        If the weights are so badly scaled that the equation is solved to less than 1e-8.
+        If the weights are so badly scaled that the relative residual exceeds 1e-8.
 
     References
     ----------
@@ -123,7 +131,7 @@ def lqr(
     if Q is None and R is None and N is None:
         Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
     elif weights is not None or Q is None or R is None:
-        raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
+        raise InputError("give both Q and R, or neither and weights='urdf' or 'identity'")
     Q, R, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:
@@ -134,10 +142,10 @@ def lqr(
 
 
 def require_fixed_point(lin: LinearModel) -> None:
-    """Raise `EquilibriumError` with what of f0 is not zero; `ModelError` of a changed robot."""
+    """Raise `EquilibriumError` if f0 is not zero, `ModelError` if the robot has changed."""
     if not isinstance(lin, LinearModel):
         raise InputError(
-            f"lin is a {type(lin).__name__}, expected a LinearModel; fflin.linearize makes one"
+            f"lin is a {type(lin).__name__}, expected a LinearModel; fflin.linearize returns one"
         )
     lin.require_unchanged()
     if lin.is_equilibrium():
@@ -153,10 +161,10 @@ def require_fixed_point(lin: LinearModel) -> None:
     raise EquilibriumError(
         f"the point is not a fixed point: {shown}{more}; "
         + (
-            "the reference does not move steadily; take fflin.tvlqr along its trajectory"
+            "the reference does not move steadily; use fflin.tvlqr along its trajectory"
             if lin.moving
-            else "linearise about one, with the q and u of fflin.equilibrium, or about a steady "
-            "motion with moving=True"
+            else "linearise about a fixed point, with the q and u of fflin.equilibrium, or about "
+            "a steady motion with moving=True"
         )
     )
 
@@ -197,12 +205,12 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
         forces = slopes(lin)[len(lin.M) - len(lin.A) :].any()
         raise StabilizabilityError(
             f"no stabilising solution of the Riccati equation was found: {error}; scale the "
-            f"weights, with bryson{'' if forces else ', or use acceleration_lqr'}"
+            f"weights, for example with bryson{'' if forces else ', or use acceleration_lqr'}"
         ) from None
     if solution.residual > _COARSE:
         warnings.warn(
-            f"the Riccati equation is solved to {solution.residual:.0e} only: the weights are "
-            "badly scaled; scale them, with bryson",
+            f"the relative residual of the Riccati equation is {solution.residual:.0e}, so the "
+            "gain is inaccurate: the weights are badly scaled; scale them, for example with bryson",
             FflinWarning,
             stacklevel=3,
         )

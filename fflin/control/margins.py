@@ -1,4 +1,4 @@
-"""How much a loop's inputs may change before it is unstable: all at once, or each alone."""
+"""Stability margins at the inputs of a loop: all inputs together, or one at a time."""
 
 import math
 from collections.abc import Callable
@@ -17,11 +17,21 @@ _NOTHING = 1e-6
 
 
 class Margins(NamedTuple):
-    """Changes that every input tolerates at once, whatever the others do."""
+    """Margins of gain and phase for simultaneous changes of all inputs.
 
-    disk: float  # the symmetric disk margin, 2 at most; 0 where the loop is at the limit
-    gain: tuple[float, float]  # factors between which the gain of each input may lie
-    phase: float  # lag or lead of each input [deg]
+    Attributes
+    ----------
+    disk : float
+        Symmetric disk margin, at most 2; 0 at the stability boundary.
+    gain : tuple of float
+        Least and largest factor on the gain of each input.
+    phase : float
+        Phase lag or lead of each input [deg].
+    """
+
+    disk: float
+    gain: tuple[float, float]
+    phase: float
 
 
 def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:

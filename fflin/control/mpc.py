@@ -1,4 +1,4 @@
-"""Model predictive control: limits are foreseen, about a point or along a trajectory."""
+"""Model predictive control about a fixed point or along a trajectory."""
 
 from __future__ import annotations
 
@@ -48,49 +48,58 @@ def mpc(
 ) -> Mpc | TrajectoryMpc:
     r"""Return the model predictive controller about a fixed point or along a trajectory.
 
-    At each sample it plans the inputs of the next N, within the limits and of the least
+    At each sample it computes the inputs of the next N samples that respect the limits and
+    minimise
 
     .. math:: e_N^T Q_f\,e_N + \int_0^{N h} e^T Q\,e + \delta u^T R\,\delta u\;dt,
 
-    and commands the first: where no limit is near the regulator of `lqr` or `tvlqr`. Inputs never
-    pass their limits. States and outputs keep within theirs at the samples, as the linear model
-    has it; where they cannot, they pass them by little, which the motion's `notes` say. Where no
-    plan is found, the regulator acts, cut at the limits, and a warning says so. The quadratic
-    program (docs/guide/mpc.md) is solved by DAQP (``pip install 'fflin[mpc]'``), which begins with
-    the limits that were active a sample before.
+    and applies the first input. If no limit is active over the horizon, this is the regulator of
+    `lqr` or `tvlqr`.
+
+    - Input limits are hard: inputs never exceed them.
+    - Limits of states and outputs are soft and hold at the samples, as the linear model predicts.
+      If the program is infeasible, they are exceeded slightly; the motion's `notes` report it.
+    - If the solver finds no plan, the regulator's command is applied, cut at the input limits,
+      and a warning is issued.
+
+    DAQP solves the quadratic program (docs/guide/mpc.md; ``pip install 'fflin[mpc]'``). It starts
+    from the limits that were active at the previous sample.
 
     Parameters
     ----------
     lin : LinearModel or LinearTrajectory
-        Continuous, or a model with ``dt`` that was made of one.
+        Continuous model or trajectory, or a sampled model that `discretize` returned.
     Q, R : see `lqr`, optional
-        Of the integral; by default the weights of `lqr` or `tvlqr`, by the rule `weights`.
+        Weights of the integral. By default the weights of `lqr` or `tvlqr`, by the rule `weights`.
     horizon : int
-        Samples N that it looks ahead.
+        Number N of samples in the horizon.
     dt : float
         Sampling time h [s].
     limits : "urdf", float, mapping or list of them, optional
-        As in `simulate`, also of states and outputs: {name, group or pattern: magnitude, or (least,
-        largest)} of the values themselves; along a trajectory of q_b and r_b those of the error.
-        None for none but that thrusters do not pull.
+        Limits as in `simulate`, for inputs, states and outputs: {name, group or pattern:
+        magnitude, or (least, largest)}. They apply to the values themselves; along a trajectory,
+        limits of q_b and r_b apply to the error. With None there are no limits, except that
+        thrusters cannot pull.
     Qf : "steady", or as Q
-        Weight on the error after N samples; of a trajectory at its end. "steady" is the
+        Weight on the error after N samples, or at the end of a trajectory. "steady" is the
         regulator's cost from there on.
+    weights : {"urdf", "identity"}, optional
+        Rule for the weights, instead of Q and R, as in `lqr`.
 
     Returns
     -------
     Mpc or TrajectoryMpc
-        A policy for `simulate` and `monte_carlo`. Its ``matrices(e)``, along a trajectory
-        ``matrices(e, t)``, are the program at an error of the state, for other solvers.
+        Policy for `simulate` and `monte_carlo`. Its method ``matrices(e)``, or along a trajectory
+        ``matrices(e, t)``, returns the quadratic program at a state error, for other solvers.
 
     Raises
     ------
     InputError
-        If an argument has a wrong size or value, or the point is beyond the limits.
+        If an argument has a wrong size or value, or the point exceeds the limits.
     EquilibriumError, StabilizabilityError
         See `lqr` and `tvlqr`.
     MissingPackageError
-        If DAQP is not installed, when it is first needed.
+        If DAQP is not installed, at its first use.
     UnknownNameError
         If a name does not exist.
 
@@ -112,7 +121,7 @@ def mpc(
     if not isinstance(lin, LinearModel | LinearTrajectory):
         raise InputError(
             f"lin is a {type(lin).__name__}, expected a LinearModel or a LinearTrajectory; "
-            "fflin.linearize and fflin.linearize_trajectory make them"
+            "fflin.linearize and fflin.linearize_trajectory return them"
         )
     samples = whole("horizon", horizon, 1)
     if dt is None and not lin.dt:
@@ -120,10 +129,16 @@ def mpc(
     dt = number("dt", lin.dt if dt is None else dt)
     source = lin if isinstance(lin, LinearTrajectory) else lin.generator
     if source is None or source.dt or dt != (lin.dt or dt):
-        raise InputError("lin is sampled otherwise; give the continuous one that it is of, and dt=")
+        raise InputError(
+            "lin is sampled with another dt, or its continuous model is not known; give the "
+            "continuous model and dt="
+        )
     names, at, rows, ranges = _limits(source, limits)
     if samples**2 * (len(at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
-        raise InputError(f"horizon is {samples}, expected fewer samples of so many limits")
+        raise InputError(
+            f"horizon is {samples} samples with {len(at)} limits, which makes the program too "
+            "large; give a shorter horizon or fewer limits"
+        )
     designed: Any = _along if isinstance(source, LinearTrajectory) else _about
     made, stages = designed(source, (Q, R, weights), Qf, samples, dt, names, rows)
     acting = at[at < len(lin.input_names)]
@@ -149,18 +164,28 @@ class _Shown:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mpc(_Shown):
-    """The controller about a point: its sampled model and regulator, and what it looks ahead."""
+    """Model predictive controller about a point.
+
+    Attributes
+    ----------
+    lin : LinearModel
+        The sampled model.
+    gain : Gain
+        The regulator that acts if no limit is active.
+    horizon : Horizon
+        The stages of the quadratic program.
+    """
 
     lin: LinearModel
     gain: Gain
     horizon: Horizon
 
     def matrices(self, e: ArrayLike | None = None) -> Matrices:
-        """Return the quadratic program at x - x0 = e (nx,), 0 by default."""
+        """Return the quadratic program at the deviation e = x - x0 (nx,), by default zero."""
         return self.horizon.matrices(e, 0.0)
 
     def bind(self, robot: Any) -> Policy:
-        """Return policy(t, q, v) -> u for a robot that has the model's states and inputs."""
+        """Return policy(t, q, v) -> u for a robot with the model's states and inputs."""
         lin = self.lin
         StateFeedback(lin, self.gain.K).bind(robot)  # refuses another robot
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
@@ -175,21 +200,24 @@ class Mpc(_Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TrajectoryMpc(_Shown, TrajectoryFeedback):
-    """The controller along a trajectory and about its end, with the regulator's schedule."""
+    """Model predictive controller along a trajectory and about its end.
+
+    The attributes of `TrajectoryFeedback` hold the trajectory and the regulator's schedule.
+    """
 
     horizon: Horizon
 
     def matrices(self, e: ArrayLike | None = None, t: float = 0.0) -> Matrices:
-        """Return the quadratic program of the sample at t [s] at the error e (nx,), or 0."""
+        """Return the quadratic program at time t [s] and error e (nx,), by default zero."""
         return self.horizon.matrices(e, t)
 
     def law(self) -> Callable[[float, Array], Array]:
-        """Return law(t, e) -> u of the error at a time of the run."""
+        """Return law(t, e) -> u: the inputs at an error e and a time of the run."""
         plans = Receding(self.horizon)
         return lambda t, e: self.commanded(t)[2] + plans.step(t, e)
 
     def bind(self, robot: Any) -> Policy:
-        """Return policy(t, q, v) -> u for a robot that has the trajectory's states and inputs."""
+        """Return policy(t, q, v) -> u for a robot with the trajectory's states and inputs."""
         super().bind(robot)  # refuses another robot
         state = StateMap(robot, frame=self.frame)
 
@@ -203,7 +231,7 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
 def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any], Array]:
     """Return what has limits, where among inputs, states and outputs, a stage's rows, ranges."""
     if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
-        raise InputError("lin is from a file, which has no robot; linearise it again")
+        raise InputError("lin was loaded from a file, which contains no robot; linearise again")
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
     beside = [name for name in outputs if name not in states]
     known = (*state_keys(robot.joint_names), *input_keys(of))
@@ -222,7 +250,9 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
     others = [found.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
     low, high = np.hstack((of_inputs, np.array(others).T))
     if (least := low > high).any():
-        raise InputError(f"limits leave nothing to {names[least.argmax()]}: the least is above")
+        raise InputError(
+            f"the lower limit of {names[least.argmax()]} is above its upper limit; correct limits="
+        )
     at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
 
     def rows(C: Array, D: Array, *target: Array) -> tuple[Array, ...]:
@@ -245,7 +275,10 @@ def _about(
     limited = rows(lin.C, lin.D, lin.u0, lin.x0, lin.y0)
     far = np.maximum(limited[2], -limited[3]) > 1e-9
     if beyond := [name for name, out in zip(names, far, strict=True) if out]:
-        raise InputError(f"the point is beyond the limits of {listed(beyond)}; give wider ones")
+        raise InputError(
+            f"the point exceeds the limits of {listed(beyond)}; give wider limits, or linearise "
+            "about another point"
+        )
     total = np.block([[gain.Q, gain.N], [gain.N.T, gain.R]])
     end = gain.P if asks_steady(Qf) else weight("Qf", Qf, lin.state_names)
     whole = np.hstack((sampled.A, sampled.B))

@@ -1,4 +1,4 @@
-"""Feedback of what is measured, by a compensator that estimates the state."""
+"""Output feedback by a compensator that estimates the state."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from fflin.robot.robot import Robot
 
 
 class OutputFeedback(LinearController):
-    """The feedback of a sampled compensator, such as `lqg` makes, on the robot's outputs.
+    """Feedback of the robot's outputs by a sampled compensator, such as the result of `lqg`.
 
-    At each sample u - u0 = C z acts, then y is measured and z brought up to the next sample. An
-    accelerometer is taken to feel u as it is commanded, before limits. The estimate begins at
-    zero: the point itself.
+    At each sample, u - u0 = C z is applied. Then y is measured, and z is advanced to the next
+    sample. The accelerometer model uses the commanded u, before limits. The estimate starts at
+    zero deviation from the point.
 
     Parameters
     ----------
     lin : LinearModel
-        The sampled model that the compensator was made for.
+        Sampled model that the compensator was designed for.
     compensator : Compensator
     noise : callable, optional
         noise(t) -> (ny,), added to y.
@@ -42,7 +42,7 @@ class OutputFeedback(LinearController):
     Raises
     ------
     InputError
-        If the compensator is of another model or not sampled.
+        If the compensator was designed for another model, or is not sampled.
 
     Examples
     --------
@@ -63,18 +63,19 @@ class OutputFeedback(LinearController):
     ) -> None:
         if not isinstance(lin, LinearModel) or not isinstance(compensator, Compensator):
             raise InputError(
-                "OutputFeedback takes a LinearModel and a Compensator, as fflin.lqg returns it"
+                f"OutputFeedback got a {type(lin).__name__} and a {type(compensator).__name__}, "
+                "expected a LinearModel and a Compensator, as fflin.lqg returns it"
             )
         if not lin.dt or lin.moving:
             raise InputError(
-                "the model must be sampled and about a point that stays; take "
-                "lin.discretize(dt), and the gain and the estimator of that"
+                "the model must be sampled and about a fixed point; take lin.discretize(dt), and "
+                "design the gain and the estimator for it"
             )
         signals = (compensator.input_names, compensator.output_names, compensator.dt)
         if signals != (lin.output_names, lin.input_names, lin.dt):
             raise InputError(
-                f"the compensator is of another model than '{lin.robot}' with its "
-                f"{len(lin.output_names)} outputs at dt = {lin.dt:g} s; use one for both"
+                f"the compensator was designed for another model than '{lin.robot}' with "
+                f"{len(lin.output_names)} outputs at dt = {lin.dt:g} s; use one model for both"
             )
         super().__init__(compensator, lin, noise=noise)
         vars(self)["compensator"] = compensator
@@ -82,27 +83,27 @@ class OutputFeedback(LinearController):
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryOutputFeedback(TrajectoryFeedback):
-    r"""The feedback ``u = u*(t) - K(t) eh`` of the error from a trajectory as it is estimated.
+    r"""Feedback ``u = u*(t) - K(t) eh`` of the estimated error from a trajectory.
 
-    At each sample u acts, then y is measured and the estimate eh of the filter brought up to the
-    next sample, as in `OutputFeedback`. Positions and attitudes are measured relative to where the
-    trajectory has the base. What `bind` returns has the estimate (nx,) of the sample to come as
-    ``estimate``.
+    At each sample, u is applied. Then y is measured, and the filter advances the estimate eh to
+    the next sample, as in `OutputFeedback`. Positions and attitudes are measured relative to the
+    base pose of the trajectory. The policy that `bind` returns has an attribute ``estimate``
+    (nx,): the estimate for the next sample.
 
     Parameters
     ----------
     trajectory : LinearTrajectory
     schedule : GainSchedule
-        Of `tvlqr` with a sampling time.
+        Result of `tvlqr` with a sampling time.
     filter : FilterSchedule
-        Of `tvkalman` with the same.
+        Result of `tvkalman` with the same sampling time.
     noise : callable, optional
         noise(t) -> (ny,), added to y.
 
     Raises
     ------
     InputError
-        If the two are not sampled alike or of different trajectories.
+        If the gains and the filter differ in sampling time or trajectory.
 
     Examples
     --------
@@ -130,21 +131,21 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         if not (gains.dt and gains.dt == seen.dt and np.array_equal(gains.A, seen.A)):
             raise InputError(
                 f"the gains are sampled at dt = {gains.dt:g} s, the filter at {seen.dt:g} s, "
-                "expected the same sample= and the same trajectory of both"
+                "expected the same sample= and the same trajectory for both"
             )
 
     def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot, with an estimate of its own.
+        """Return policy(t, q, v) -> u for a robot, with a separate estimate for each call.
 
         Raises
         ------
         InputError
-            If the robot has not the trajectory's states, inputs and outputs.
+            If the robot's states, inputs or outputs differ from the trajectory's.
         """
         super().bind(robot)  # refuses another robot
         origin, home = self.trajectory.robot, StateMap(robot, frame="local")
         own = sensed(StateMap(origin, frame="local"))
-        made = f"the trajectory is one of '{origin.name}'"
+        made = f"the trajectory is a motion of '{origin.name}'"
         require_same(made, robot, "output", own, sensed(home))
 
         def there(t: float) -> tuple[Measuring, Array]:
@@ -155,7 +156,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         return Loop(home, self.filter.dt, self.noise, self._size, self._sample, there)
 
     def law(self) -> Callable[[float, Array], Array]:
-        """Return law(t, e) -> u at the samples, on what the linear models measure."""
+        """Return law(t, e) -> u at the samples, with the outputs of the linear models."""
         law = Compensation(self._size, self._sample)
         return lambda t, e: law.step(
             t, lambda by, u: by.y0 + by.seen @ (e + by.jump) + by.through @ (u - by.u0)

@@ -1,4 +1,4 @@
-"""Motions from one state to another within limits, of the least inputs."""
+"""Trajectory planning: low-effort motions between two states within limits."""
 
 from __future__ import annotations
 
@@ -66,52 +66,60 @@ def plan(
     R: Weight | None = None,
     free: Sequence[str] = (),
 ) -> Trajectory:
-    r"""Plan a motion to a goal within limits: a slew from rest to rest, or the end of a tumble.
+    r"""Plan a low-effort trajectory to a goal within limits, such as a slew or detumbling.
 
-    Of all inputs that stay within their limits, and keep joints and wheels within theirs, those of
-    a least :math:`\int u^T R\,u\;dt`: a local minimum, or as near to one as 50 iterations of
-    sequential quadratic programming come, with the start of each interval a variable of its own
-    (multiple shooting). The linear models along the motion make the quadratic programs, which PIQP
-    solves (``pip install 'fflin[mpc]'``). The attitude may turn by any angle, and goes round where
-    the rates at both ends have it so; continuous joints take the shorter way.
-    Limits of joints and wheels hold at the knots. Between knots they hold to 1 %: where the
-    integrated motion exceeds one, the limit is tightened at the knots beside and the plan is made
-    again. A warning says if more than 1 % is left, and the printed trajectory states how much.
+    The plan minimises :math:`\int u^T R\,u\;dt`. Inputs, joints and wheels stay within their
+    limits. The method is multiple shooting: the start of each interval is a variable. Sequential
+    quadratic programming searches for a local minimum in at most 50 iterations. The quadratic
+    programs are built from the linear models along the motion and solved by PIQP
+    (``pip install 'fflin[mpc]'``).
+
+    The attitude may turn by any angle. It makes whole turns if the angular rates at both ends
+    require them. Continuous joints take the shorter way.
+
+    Limits of joints and wheels hold at the knots, and to 1 % between knots. If the integrated
+    motion exceeds a limit between knots, the limit is tightened at the neighbouring knots and the
+    plan is repeated. If more than 1 % remains, a warning is issued. The printed trajectory states
+    the largest excess.
 
     Parameters
     ----------
     robot : Robot
     goal : LinearModel, (q, v) or array_like (nx,)
-        Where it ends: the point of a model, a configuration and velocity in Pinocchio's order, of
-        which None is neutral and rest, or a state of `StateMap` in frame "hybrid". Wheels may end
-        at any angle.
+        End of the motion: the point of a model, a configuration and velocity in Pinocchio's
+        order, or a state of `StateMap` in frame "hybrid". In (q, v), None means neutral or at
+        rest. Wheels may end at any angle.
     duration : float
-        [s]
+        Duration of the motion [s].
     x0, q0, v0 : array_like, optional
-        Where it begins, as in `simulate`: a state, or a configuration and velocity; by default the
-        robot's `start`.
+        Start of the motion, as in `simulate`: a state, or a configuration and velocity. By default
+        the robot's `start`.
     knots : int
-        How many, equally far apart.
+        Number of equally spaced knots.
     hold : {"previous", "linear"}
-        Whether inputs stay what they were at the knot before, or are linear between knots.
+        Inputs between knots: held at the value of the previous knot, or linearly interpolated.
     limits : "urdf", float, mapping or list of them, optional
-        As in `simulate`, and of states too; None for none but that thrusters do not pull.
+        Limits of inputs and states, as in `simulate`. With None there are no limits, except that
+        thrusters cannot pull.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
-        Weight on the inputs as `lqr` takes it, diagonal; by default 1/limit^2, and 1 of inputs
-        without one.
+        Diagonal weight on the inputs, as in `lqr`. By default 1/limit^2, or 1 for an input without
+        a limit.
     free : sequence of str
-        States that may end anywhere, by name, group or pattern: ``["r_b", "qdot_m.wheel_*"]``.
+        States whose end value is free, by name, group or pattern:
+        ``["r_b", "qdot_m.wheel_*"]``.
 
     Returns
     -------
     Trajectory
-        A motion of the robot under its inputs, those on the base in and held in base axes.
+        Motion of the robot under its inputs. Torques and forces on the base are expressed, and
+        held between knots, in base axes.
 
     Raises
     ------
     InputError
-        If an argument has a wrong size or value, or no motion to the goal within the limits is
-        found: what the last one tried misses. That none exists is not said.
+        If an argument has a wrong size or value, or if no motion to the goal within the limits is
+        found. The message states by how much the last trial misses the goal or exceeds a limit. A
+        feasible motion may still exist.
     MissingPackageError
         If PIQP is not installed.
     UnknownNameError
@@ -144,13 +152,13 @@ def plan(
         raise InputError(f"hold is {hold!r}, expected 'linear' or 'previous'")
     listed_names = isinstance(free, list | tuple) and all(isinstance(name, str) for name in free)
     if not listed_names:
-        raise InputError(f"free is {free!r}, expected a list of names of states")
+        raise InputError(f"free is {free!r}, expected a list of state names, such as ['r_b']")
     t, actuation = np.linspace(0.0, duration, knots), Actuation(state)
     shooting = Shooting(robot, t, hold == "previous")
     acting = chosen_limits(robot, limits)[0]
     low, high = saturation(robot, acting, start[0], float(t[1]), 0)[:2]
     if (low > high).any():
-        raise InputError("limits leave an input nothing: its least is above its largest")
+        raise InputError("the lower limit of an input is above its upper limit; correct limits=")
     if R is None:
         size = np.maximum(np.abs(low), np.abs(high))
         weights: Array = np.where(np.isfinite(size) & (size > 0.0), size, 1.0) ** -2.0
@@ -158,7 +166,9 @@ def plan(
         matrix = weight("R", R, input_keys(actuation), definite=True)
         weights = matrix.diagonal()
         if (matrix != np.diag(weights)).any():
-            raise InputError("R has entries off its diagonal; a plan takes a diagonal weight")
+            raise InputError(
+                "R has nonzero off-diagonal entries, expected a diagonal weight; give its diagonal"
+            )
     left = {*shooting.wheels, *chosen("state", free, state.names)}
     asked = np.array([i not in left for i in range(state.nx)])
     bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in state.names]).T
@@ -176,7 +186,9 @@ def plan(
             q[-1], v[-1] = end  # at rest, rounding would be all that a check sees
         note = _note(state, largest / size)
         if (largest > _BETWEEN * size).any():
-            warnings.warn(f"{note}; give more knots or more time", FflinWarning, stacklevel=2)
+            warnings.warn(
+                f"{note}; give more knots or a longer duration", FflinWarning, stacklevel=2
+            )
         return Trajectory(robot, t, q, v, u, hold=hold, _note=note)
     units = ["rad"] * 3 + [*state.units[3:]]
     by = [
@@ -187,18 +199,18 @@ def plan(
     ]
     raise InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
-        f"last one tried {listed(by) if by else 'diverges'}; give more time, wider limits, more "
-        "knots, or in `free` what may end anywhere"
+        f"last trial {listed(by) if by else 'diverges'}; give a longer duration, wider limits, "
+        "more knots, or list states with a free end value in `free`"
     )
 
 
 def _note(state: StateMap, shares: Array) -> str:
-    """Say which limit of a state (nx,) the integrated motion exceeds most, as a fraction of it."""
+    """Return a note on the state (nx,) whose limit the integrated motion exceeds most."""
     i = int(shares.argmax())
-    most = "exceeds none"
+    most = "exceeds no limit of a state"
     if shares[i] > 0.0:
-        most = f"exceeds that of {state.names[i]} by {100.0 * shares[i]:.2g} %"
-    return f"limits of states: at {_PARTS} points an interval the integrated motion {most}"
+        most = f"exceeds the limit of {state.names[i]} by {100.0 * shares[i]:.2g} %"
+    return f"the integrated motion {most}, checked at {_PARTS} points per interval"
 
 
 def _kept_between(
@@ -284,7 +296,7 @@ def _sought(
 
 
 class _Search(NamedTuple):
-    """What stays the same while a plan is sought."""
+    """Constant data of a search for a plan."""
 
     shooting: Shooting
     limits: Array  # least and largest inputs (2, nu)
@@ -295,7 +307,7 @@ class _Search(NamedTuple):
     def step(
         self, q: Array, v: Array, u: Array, missed: Array, near: Array, effort: Array
     ) -> StageSolution | None:
-        """Return the best step of all knots and inputs; None where there is none."""
+        """Return the best step of all knots and inputs; None if no step is found."""
         space, nx = self.room(q, v), self.shooting.state.nx
         if not max(_excess(space).max(), np.abs(missed).max()) < np.inf:
             return None
@@ -331,12 +343,12 @@ class _Search(NamedTuple):
         return u
 
     def acting(self, u: Array) -> Array:
-        """Return inputs of which the last, where they are held, is that of the last interval."""
+        """Return the inputs; if held, the last row repeats the input of the last interval."""
         return np.vstack((u[:-1], u[-2])) if self.shooting.held else u
 
 
 def _shares(shooting: Shooting, R: Array, u: Array) -> Array:
-    """Return what the squares of inputs (N + 1, nu) cost, so that those of the guess cost one."""
+    """Return the cost of squared inputs (N + 1, nu), scaled so that the guess costs 1."""
     cost = np.tile(R, (len(u), 1))
     # Of the knots in an integral: by the trapezoidal rule, or as long as each input is held.
     if not shooting.held:
@@ -356,7 +368,7 @@ def _room(shooting: Shooting, end: Point, bounds: Array, asked: Array, q: Array,
 
 
 def _limited(state: StateMap, q: Array, v: Array) -> Array:
-    """Return what limits are of (N, nx): places and rates of joints, zero for the base."""
+    """Return the limited values (N, nx): positions and rates of joints, zero for the base."""
     n, values = state.robot.n, np.zeros((len(q), state.nx))
     values[:, 6 : 6 + n] = state.joint_positions(q)
     values[:, state.nx - n :] = state.velocities(v)[:, 6:]

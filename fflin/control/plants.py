@@ -1,4 +1,4 @@
-"""How far a robot is from the one that a controller was made for."""
+"""Differences between a simulated robot and the robot that a controller was designed for."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ _LEAST = 1e-2
 
 
 def notes_of(policy: Any, robot: Robot) -> tuple[str, ...]:
-    """Say how far a robot is from the one that a policy was made for; nothing for the same."""
+    """Return a note on how a robot differs from a policy's design; none if they are the same."""
     design = getattr(policy, "design", None)  # of an allocation
     along = getattr(policy, "trajectory", None)
     # An allocation asks its design for wrenches, and the robot's own wheels for torques.
@@ -42,12 +42,12 @@ def notes_of(policy: Any, robot: Robot) -> tuple[str, ...]:
     usual = _usual(here, own_A, other_A) if whole else 0.0
     said = {"inputs": _apart(own_B, other_B, 0.0), "states": _apart(own_A, other_A, usual)}
     parts = [
-        f"that its {what} cause differ by up to {most:{'.0f' if most >= 10.0 else '.2g'}} %"
+        f"due to {what} differ by up to {most:{'.0f' if most >= 10.0 else '.2g'}} %"
         for what, most in said.items()
         if most
     ]
-    start = f"the controller is one of '{lin.robot}', the robot another: the accelerations "
-    return (start + ", those ".join(parts),) if parts else ()
+    start = f"the robot differs from '{lin.robot}' of the controller's design: accelerations "
+    return (start + ", accelerations ".join(parts),) if parts else ()
 
 
 def _caused(lin: LinearModel, whole: bool, rows: list[int]) -> tuple[Array, Array]:

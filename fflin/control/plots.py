@@ -1,4 +1,4 @@
-"""Figures of loops: where their poles are, and what each input bears."""
+"""Plots of control loops: pole maps, Bode plots and margins."""
 
 from __future__ import annotations
 
@@ -26,17 +26,24 @@ _LINE = "#888888"
 def plot_poles(
     poles: Any, path: str | Path | None = None, *, dt: float = 0.0, title: str = "poles"
 ) -> Figure:
-    """Draw a pole map; where poles differ by more than a factor of 10, on logarithmic axes.
+    """Plot a pole map.
+
+    The axes are logarithmic if the poles differ by more than a factor of 10.
 
     Parameters
     ----------
     poles : array_like or Gain or LinearModel
-        Poles [1/s], or what has them; several of these as {label: poles}.
+        Poles [1/s], or an object that has poles. Give several sets as {label: poles}.
     path : str or Path, optional
-        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+        File to write, .png, .pdf or .svg. Errors are as in `plot_motion`.
     dt : float
-        Sampling time of poles that are given as numbers; then the unit circle is drawn.
+        Sampling time [s] of poles given as numbers. If not 0, the unit circle is drawn.
     title : str
+        Title of the figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
 
     Examples
     --------
@@ -57,13 +64,17 @@ def plot_poles(
 
 
 def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
-    """Draw the loop of each input, the others closed: Bode plot, margins, and the poles of all.
+    """Plot the loop at each input, with the other loops closed: Bode plot, margins and poles.
 
     Parameters
     ----------
     gain : Gain
     path : str or Path, optional
-        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+        File to write, .png, .pdf or .svg. Errors are as in `plot_motion`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
 
     Examples
     --------
@@ -71,7 +82,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     >>> figure = fflin.plot_loops(fflin.lqr(lin), "loops.png")
     """
     if not isinstance(gain, Gain):
-        raise InputError(f"gain is a {type(gain).__name__}, expected what fflin.lqr returns")
+        raise InputError(f"gain is a {type(gain).__name__}, expected a Gain, as from fflin.lqr")
     tall = max(8.5, 1.5 + 0.12 * len(gain.K))
     with drawing(path, 11.0, tall) as figure:
         w, response, loops = input_loops(gain)
@@ -84,19 +95,19 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
         figure.legend(
             sizes.get_lines()[: len(loops)],
             names,
-            title="margins: phase, factors on the gain",
+            title="margins at each input: phase, gain factors",
             loc="outside right upper",
             fontsize=letters_of(1.3 * len(loops), 72.0 * (tall - 1.5)),
         )
         # Those of a step lie close to one, and their rates apart.
         rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt if gain.dt else gain.poles
         _pole_map(poles, {"": rates}, 0.0)
-        poles.set_title("poles z of A - B K as rates ln(z)/dt" if gain.dt else "poles of A - B K")
+        poles.set_title("poles of A - B K as ln(z)/dt" if gain.dt else "poles of A - B K")
         low, high = gain.margins.gain
         figure.suptitle(
             f"{gain.robot}{f', sampled at {gain.dt:g} s' if gain.dt else ''}: loop of each input, "
-            f"the others closed\nall at once bear {gain.margins.phase:.3g} deg, {low:.2g} to "
-            f"{high:.3g} (disk margin {gain.margins.disk:.3g})",
+            f"the others closed\nmargins for simultaneous changes: phase {gain.margins.phase:.3g} "
+            f"deg, gain {low:.2g} to {high:.3g} (disk margin {gain.margins.disk:.3g})",
             x=0.02,
             ha="left",
         )
@@ -122,8 +133,8 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Any, loops: Sequence[Lo
     sizes.axhline(1.0, color=_LINE, lw=0.8)
     phases.axhline(-180.0, color=_LINE, lw=0.8)
     phases.locator_params("y", nbins=6, steps=[1, 1.5, 3, 4.5, 6, 9, 10])
-    sizes.set(title="gain of the loop (dot: 1, square: phase -180 deg)", ylabel="|L|")
-    phases.set(title="phase of the loop", ylabel="[deg]")
+    sizes.set(title="loop gain (dot: gain 1, square: phase -180 deg)", ylabel="|L|")
+    phases.set(title="loop phase", ylabel="[deg]")
     for axes in (sizes, phases):
         axes.set(xlabel="frequency [rad/s]", xlim=(w[0], w[-1]))
 
@@ -164,7 +175,7 @@ def _poles_of(given: Any) -> tuple[Any, float]:
     right = poles.dtype.kind in "fiuc" and poles.ndim == 1 and poles.size
     if not right or not np.isfinite(poles).all():
         raise InputError(
-            f"poles is a {type(given).__name__} of shape {poles.shape}, expected several finite "
-            "numbers (k,), a Gain, a LinearModel or {label: poles}"
+            f"poles is a {type(given).__name__} of shape {poles.shape}, expected finite numbers "
+            "(k,), a Gain, a LinearModel or {label: poles}"
         )
     return poles, 0.0

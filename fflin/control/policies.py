@@ -1,4 +1,4 @@
-"""What decides on the inputs: feedback of the state about a point, and allocation."""
+"""Policies that compute the inputs: state feedback about a point, and allocation."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,31 +27,33 @@ Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
 @runtime_checkable
 class Gridded(Protocol):
-    """A state feedback whose gain is that between the points of a grid."""
+    """A state feedback whose gain is interpolated between the points of a grid."""
 
     lin: LinearModel
 
     def table(self) -> tuple[dict[str, Array], Array]:
-        """Return the joints of the grid and their values, and the gains (N, nu, nx) in order."""
+        """Return the grid axes {joint: values} and the gains (N, nu, nx) in grid order."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class StateFeedback:
-    """The feedback ``u = u0 - K (x - x0)`` of a linear model's state.
+    """State feedback ``u = u0 - K (x - x0)`` about the point of a linear model.
 
-    The angle of a continuous joint is taken on the turn nearest to x0.
+    The angle of a continuous joint is unwrapped to within half a turn of x0.
 
     Parameters
     ----------
     lin : LinearModel
-        The model that K was made for; of a reduced one the states that it has are fed back.
+        Model that K was designed for. With a reduced model, only the states of that model are
+        fed back.
     K : array_like (nu, nx)
+        Gain.
 
     Raises
     ------
     InputError
-        If K has another shape or the model is one about a moving reference.
+        If K has a wrong shape, or the model is about a moving reference.
 
     Examples
     --------
@@ -71,12 +73,13 @@ class StateFeedback:
             raise InputError(f"lin is a {type(self.lin).__name__}, expected a fflin.LinearModel")
         if self.lin.moving:
             raise InputError(
-                "the model is about a moving reference; follow it with TrajectoryFeedback"
+                "the model is about a moving reference, expected one about a fixed point; follow "
+                "a moving reference with TrajectoryFeedback"
             )
         K, shape = as_double("K", self.K), self.lin.B.shape[::-1]
         if K.shape != shape:
             raise InputError(
-                f"K has shape {K.shape}, expected {shape} (nu, nx); take the gain that was "
+                f"K has shape {K.shape}, expected {shape} (nu, nx); give the gain that was "
                 "designed for this model"
             )
         if not np.isfinite(K).all():
@@ -100,7 +103,7 @@ class StateFeedback:
         Raises
         ------
         InputError
-            If the robot has not the model's states and inputs; its masses may be others.
+            If the robot's states or inputs differ from the model's. Its masses may differ.
         """
         lin = self.lin
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
@@ -115,17 +118,18 @@ class StateFeedback:
 
 @dataclass(frozen=True, eq=False)
 class Allocation:
-    """Thrusts, none negative or beyond its limit, that come nearest to what a policy asks for.
+    """Allocation of a policy's commands to thrusters and motors within their limits.
 
-    The policy decides on the inputs of the robot `design`, such as torque and force on the base;
-    the thrusters and motors of the simulated robot give the generalised force that it means, in
-    the least squares of the accelerations that the two would cause.
+    The policy commands the inputs of the robot `design`, such as torque and force on the base.
+    The thrusters and motors of the simulated robot then produce the closest generalised force.
+    "Closest" is in the least squares of the accelerations that the two forces would cause. No
+    thrust is negative, and no input exceeds its limit.
 
     Parameters
     ----------
     policy : policy or StateFeedback
     design : Robot
-        The same robot with the inputs that the policy decides on.
+        The same robot with the inputs that the policy commands.
 
     Examples
     --------
@@ -143,7 +147,7 @@ class Allocation:
 
     @property
     def lin(self) -> LinearModel | None:
-        """The model that the policy was made for, where it has one; its inputs are the design's."""
+        """Model that the policy was made for, or None; its inputs are the design's."""
         return getattr(self.policy, "lin", None)
 
     def bind(self, robot: Robot) -> Policy:
@@ -152,15 +156,16 @@ class Allocation:
         Raises
         ------
         InputError
-            If the two robots have not the same joints.
+            If the two robots have different joints.
         """
         if not isinstance(self.design, Robot):
             raise InputError(f"design is a {type(self.design).__name__}, expected a fflin.Robot")
         if self.design.joint_names != robot.joint_names:
             raise InputError(
-                f"the design's joints are not those of '{robot.name}'; allocate for the same robot"
+                f"the design's joints differ from the joints of '{robot.name}'; give the same "
+                "robot, with other inputs, as the design"
             )
-        require_turns(f"the design is '{self.design.name}'", self.design.nq, robot)
+        require_turns(f"the design is a variant of '{self.design.name}'", self.design.nq, robot)
         frame, reference = axes_of(self)
         asked, given = (
             StateMap(each, reference=reference, frame=frame) for each in (self.design, robot)
@@ -199,14 +204,14 @@ class Clock:
         apart = t - self._last
         if self._last >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
             raise InputError(
-                f"the controller is asked {apart:g} s after its last sample, expected "
-                f"{self._dt:g} s; leave `sample` out"
+                f"the controller is called {apart:g} s after its last sample, expected "
+                f"{self._dt:g} s; leave out `sample`, or give it this value"
             )
         self._last = t
 
 
 def decider(policy: Any) -> Any:
-    """Return what decides on commands: of an allocation its policy."""
+    """Return the policy that computes the commands: for an allocation, its inner policy."""
     return policy.policy if isinstance(policy, Allocation) else policy
 
 
@@ -219,7 +224,7 @@ def axes_of(policy: Any) -> tuple[Frame | None, pin.SE3 | None]:
 
 
 def bound(policy: Any, robot: Robot) -> Policy:
-    """Return a policy for a robot, or raise `InputError` where it is none."""
+    """Return a policy for a robot, or raise `InputError` if the object is not a policy."""
     result = policy.bind(robot) if hasattr(policy, "bind") else policy
     if not callable(result):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Algebraic Riccati equations: a solution with its residual, from half the size where possible."""
+"""Algebraic Riccati equations: a solution with its residual, at half the size if possible."""
 
 import math
 import warnings
@@ -26,7 +26,7 @@ _APART = 1e-5
 
 
 class Solution(NamedTuple):
-    """P and K, the poles of A - B K, the relative residual, and what found them."""
+    """Solution of a Riccati equation: P, K, the poles of A - B K, residual and method."""
 
     P: Array
     K: Array
@@ -41,7 +41,7 @@ class Solution(NamedTuple):
 
 
 def rates_of(poles: Any, dt: float) -> Any:
-    """Return poles [1/s] of a continuous system, or of the one that samples of dt [s] show."""
+    """Return poles [1/s] in continuous time, converted from samples of dt [s] if dt is not 0."""
     return np.log(np.where(poles == 0.0, 1e-300, poles) + 0j) / dt if dt else poles
 
 
@@ -188,7 +188,7 @@ def _finished(
 def _refined(
     equation: Riccati, P: Array, modes: ModalMatrix | None
 ) -> tuple[_Trial, ModalMatrix | None]:
-    """Apply Newton steps; `modes` are those of a closed loop near that of P, where known."""
+    """Apply Newton steps; `modes` belong to a closed loop near the loop of P, if known."""
     enough = 0.5 * _EPS * len(P) ** 0.5
     trial = best = equation.trial(P)
     fresh = False

@@ -1,4 +1,4 @@
-"""What acts of a command: within limits, up to the largest speed of a wheel, in pulses."""
+"""Actuator saturation: input limits, wheel speed limits and thruster pulses."""
 
 import math
 import warnings
@@ -30,7 +30,7 @@ class Wheels(NamedTuple):
     speeds: Callable[..., Array]  # (k,) [rad/s], of whatever the law is given
 
     def cut(self, u: Array, *point: object) -> Array:
-        """Return u (nu,) without what would take a wheel beyond its speed within a step."""
+        """Return u (nu,) with torques cut that would exceed a wheel's speed limit in a step."""
         room = np.clip(self.stiffness * (self.limits - self.speeds(*point)), *self.torques)
         # It cuts, and drives nothing of itself.
         given = np.clip(u[self.at], np.minimum(room[0], 0.0), np.maximum(room[1], 0.0))
@@ -41,7 +41,7 @@ class Wheels(NamedTuple):
 
 
 class Pulses:
-    """What thrusters (place, name, thruster) that fire in pulses make of each sample's command."""
+    """Pulses of thrusters (index, name, thruster) that realise the command of each sample."""
 
     # What is asked for and not fired, for whole steps or the least impulse, is carried to the next.
     # `high` (nu,) is what they give; where it is infinite, one that is on-off gives its own `max`.
@@ -60,13 +60,14 @@ class Pulses:
         for (_, name, item), most in zip(thrusters, self.most.tolist(), strict=True):
             if not sample:
                 raise InputError(
-                    f"thruster '{name}' fires from sample to sample (on_off, least_impulse); give "
-                    "the time between samples, or a policy on a sampled model"
+                    f"thruster '{name}' is pulsed (on_off, least_impulse), which needs sampled "
+                    "commands; give the time between samples, or a policy on a sampled model"
                 )
             if (item.least_impulse or 0.0) > most * self.time:
                 raise InputError(
                     f"thruster '{name}' has a least impulse of {item.least_impulse:g} N s, but "
-                    f"gives {most * self.time:.3g} N s in a sample; take longer samples"
+                    f"can give only {most * self.time:.3g} N s within a sample; give a longer "
+                    "sampling time"
                 )
 
     def begin(self, step: int, u: Array) -> None:
@@ -85,7 +86,7 @@ class Pulses:
         self._acting[self.places] = 0.0
 
     def at(self, step: int) -> Array:
-        """Return what acts (nu,) in a step; the same array while nothing changes."""
+        """Return the applied inputs (nu,) in a step; the same array while nothing changes."""
         firing = step < self._end
         if (firing != self._firing).any():
             self._firing, self._acting = firing, self._acting.copy()
@@ -94,7 +95,7 @@ class Pulses:
 
 
 class Saturation(NamedTuple):
-    """What acts of a command of the inputs of a robot."""
+    """Limits, wheels and pulses that act on the commands of a robot's inputs."""
 
     low: Array  # (nu,)
     high: Array
@@ -105,7 +106,7 @@ class Saturation(NamedTuple):
 def saturation(
     robot: Robot, limits: Mapping[str, Range], q: Array, dt: float, sample: int
 ) -> Saturation:
-    """Return what acts of a command at q, in steps of dt [s], `sample` steps to a sample or 0."""
+    """Return the saturation of commands at q, in steps of dt [s], `sample` steps a sample or 0."""
     inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
     names = list(inputs)
     low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in names]).T
@@ -148,10 +149,10 @@ def warn_beyond(
         share = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
     worst = share.argmax(axis=0)
     beyond = [
-        f"{name} is asked for {asked[row, k]:.3g} {unit}, limit {bounds[row, k]:g}"
+        f"{name} requires {asked[row, k]:.3g} {unit}, its limit is {bounds[row, k]:g}"
         for k, (name, unit, row) in enumerate(zip(names, units, worst, strict=True))
         if share[row, k] > 1.0 + 1e-6
     ]
     if beyond:
-        said = f"the limits do not hold '{robot}' {where}: {listed(beyond)}"
+        said = f"the input limits are too small for '{robot}' {where}: {listed(beyond)}"
         warnings.warn(said, FflinWarning, stacklevel=3)

@@ -1,4 +1,4 @@
-"""What a robot makes of knots and inputs: the guess, what each interval misses, and its slopes."""
+"""Multiple shooting: the initial guess, the gaps between intervals, and their Jacobians."""
 
 import numpy as np
 import pinocchio as pin
@@ -75,7 +75,7 @@ class Shooting:
                 break
 
     def slopes(self, q: Array, v: Array, u: Array) -> list[Array]:
-        """Return those of the intervals' ends over z, the input there and the next one."""
+        """Return Jacobians of the intervals' ends over z, the input there and the next one."""
         # By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
         flow, (nx, nu), steps = self._flow(q, v, u), (len(self._size), u.shape[1]), self.steps // 4
         h, Z = self.t[1] / steps, np.tile(np.eye(nx, nx + 2 * nu), (len(q) - 1, 1, 1))

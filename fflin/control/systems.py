@@ -1,4 +1,4 @@
-"""Linear systems of other tools: what has A, B, C, D, transfer functions, matrices and files."""
+"""Linear systems from other tools: state spaces, transfer functions, matrices and files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ def system_of(given: Any) -> System:
         return _read(as_path(given))
     if isinstance(given, tuple):
         if len(given) not in (4, 5):
-            raise InputError(f"system has {len(given)} parts, expected (A, B, C, D) and perhaps dt")
+            raise InputError(
+                f"system has {len(given)} parts, expected (A, B, C, D) or (A, B, C, D, dt)"
+            )
         return _checked(*given)
     if not hasattr(given, "A") and (hasattr(given, "to_ss") or hasattr(given, "ninputs")):
         given = _realised(given)
@@ -61,8 +63,8 @@ def _realised(given: Any) -> Any:
         return control.ss(given)
     except Exception as error:  # each of the tools has its own
         raise InputError(
-            f"the {type(given).__name__} has no state space: {reason(error)}; a transfer function "
-            "must be proper, without more zeros than poles"
+            f"the {type(given).__name__} cannot be converted to a state space: {reason(error)}; a "
+            "transfer function must be proper, with no more zeros than poles"
         ) from None
 
 
@@ -82,8 +84,8 @@ def _checked(
     for key, each, shape in zip("ABCD", (A, B, C, D), shapes, strict=True):
         if each.shape != shape or not np.isfinite(each).all():
             raise InputError(
-                f"{key} of the controller has shape {each.shape}, expected {shape} finite numbers, "
-                f"with {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
+                f"{key} of the controller has shape {each.shape}, expected {shape} with finite "
+                f"entries, for {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
             )
     if dt is not None:
         # True is of a system that is sampled nobody knows how, -1 MATLAB's word for it.
@@ -108,8 +110,8 @@ def _read(path: Path) -> System:
     if any(each is None for each in (A, B, C)):
         if D is None or A is not None:
             raise FileError(
-                f"{path}: it has {listed(sorted(found)) or 'no arrays'}, expected A, B, C, D, and "
-                "Ts where it is sampled, or D alone: in MATLAB [A, B, C, D] = ssdata(K); "
+                f"{path}: it has {listed(sorted(found)) or 'no arrays'}, expected A, B, C, D, "
+                "and Ts if sampled, or D alone; in MATLAB, write it by [A, B, C, D] = ssdata(K); "
                 "Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
             )
         A = B = C = ()
@@ -130,12 +132,12 @@ def fitted(system: System, lin: LinearModel) -> System:
 
 
 def _places(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -> list[int]:
-    """Return which signals of a model those of a controller are."""
+    """Return the indices of a controller's signals among the signals of a model."""
     named = not all(map(_NUMBERED.fullmatch, names))
     if size != len(names if named else known):
         raise InputError(
             f"the controller has {size} {kind}s and {len(names) if named else 'no'} names, "
-            f"expected a name for each, or one for each {of} of the model: {listed(known)}"
+            f"expected a name for each, or a {kind} for each {of} of the model: {listed(known)}"
         )
     if not named:
         return list(range(size))
@@ -145,7 +147,9 @@ def _places(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -
     for name, key in zip(names, own, strict=True):
         if key not in there:
             text = unknown(f"{of} of the model", name, known)
-            raise InputError(f"{kind} of the controller: {text}; or leave all names out")
+            raise InputError(f"{kind} of the controller: {text}; or leave out all names")
         if own.count(key) > 1:
-            raise InputError(f"two {kind}s of the controller are called '{name}'; name them apart")
+            raise InputError(
+                f"two {kind}s of the controller are named '{name}'; give them different names"
+            )
     return [there.index(key) for key in own]

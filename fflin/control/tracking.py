@@ -1,4 +1,4 @@
-"""Feedback along a trajectory, and the reference that it follows."""
+"""Trajectory tracking: feedback along a trajectory, and its reference."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -33,20 +33,21 @@ Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryFeedback:
-    """The feedback ``u = u*(t) - K(t) e`` of the error from a trajectory.
+    """Trajectory tracking ``u = u*(t) - K(t) e`` with the error e from a trajectory.
 
-    The error is that of `linearize_trajectory`, u on the base is in base axes, and t is the time
-    since the first knot. After the end the last configuration at rest is the target, with what
-    holds the robot there and the regulator of the same weights about it.
+    The error is defined as in `linearize_trajectory`. Torques and forces on the base are in base
+    axes, and t is the time since the first knot. After the end, the target is the last
+    configuration at rest. The command is then the sum of the inputs that hold the robot there and
+    the feedback of the regulator with the same weights.
 
     Parameters
     ----------
     trajectory : Trajectory
     schedule : GainSchedule
-        As `tvlqr` returns it.
+        Result of `tvlqr`.
     held : bool
-        Whether what it commands is held for a while, as it is of a sampled schedule in any case:
-        then what it commands at the very end is what holds the robot there.
+        Whether commands are held between samples; for a sampled schedule they always are. If
+        so, the command at the last knot already contains the inputs that hold the robot there.
 
     Examples
     --------
@@ -70,8 +71,9 @@ class TrajectoryFeedback:
             isinstance(self.trajectory, Trajectory) and isinstance(self.schedule, GainSchedule)
         ):
             raise InputError(
-                "TrajectoryFeedback takes a LinearTrajectory and a GainSchedule, as "
-                "fflin.linearize_trajectory and fflin.tvlqr return them"
+                f"TrajectoryFeedback got a {type(self.trajectory).__name__} and a "
+                f"{type(self.schedule).__name__}, expected a LinearTrajectory and a GainSchedule, "
+                "as fflin.linearize_trajectory and fflin.tvlqr return them"
             )
 
     @property
@@ -87,17 +89,17 @@ class TrajectoryFeedback:
 
     @cached_property
     def end(self) -> LinearModel:
-        """The model at rest in the last configuration; InputError where nothing holds it."""
+        """Model at rest in the last configuration; `InputError` if no inputs hold it there."""
         try:
             return resting_end(self.trajectory)
         except EquilibriumError as error:
             raise InputError(
-                f"after the trajectory's {self.duration:g} s nothing holds the robot: {error}; "
-                "give no longer duration"
+                f"no inputs hold the robot after the end of the trajectory at {self.duration:g} s: "
+                f"{error}; give a duration within the trajectory"
             ) from None
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
-        """Return q, v, and u in base axes that are followed at a time of the run."""
+        """Return the reference q, v, and u in base axes at a time of the run."""
         return self._point(t, self.duration * AT_THE_END)
 
     def _point(self, t: float, over: float) -> tuple[Array, Array, Array]:
@@ -108,22 +110,22 @@ class TrajectoryFeedback:
 
     @property
     def over(self) -> float:
-        """The time [s] after which it commands what holds the end."""
+        """Time [s] after which the command holds the robot at the end."""
         held = self.held or self.schedule.dt
         return self.duration * (2.0 - AT_THE_END if held else AT_THE_END)
 
     @property
     def jumps(self) -> bool:
-        """Whether what it commands jumps at knots, where inputs are held between them."""
+        """Whether the command jumps at knots, because inputs are held between them."""
         return self.trajectory.hold == "previous" and not self.schedule.dt
 
     @property
     def ahead(self) -> float:
-        """How far after a sample [s] an input that changes is most like its mean over it."""
+        """Time [s] after a sample at which a changing input is closest to its mean over it."""
         return 0.5 * self.schedule.dt if self.trajectory.hold == "linear" else 0.0
 
     def commanded(self, t: float) -> tuple[Array, Array, Array]:
-        """Return q, v, u of what a command at a time of the run is for."""
+        """Return q, v, u of the point that the command at a time of the run refers to."""
         q, v, u = self._point(t, self.over)
         if self.ahead and t <= self.over:
             u = self._point(min(t + self.ahead, self.duration), self.duration)[2]
@@ -131,25 +133,25 @@ class TrajectoryFeedback:
 
     @cached_property
     def end_gain(self) -> Array:
-        """K (nu, nx) of the regulator of the same weights about `end`."""
+        """Gain K (nu, nx) of the regulator with the same weights about `end`."""
         by = self.schedule
         return steady_regulator(self.end, by.Q, by.R, by.dt)[1]
 
     def beside(self, offset: Mapping[str, float]) -> tuple[Array, Array]:
-        """Return q (nq,) and v (nv,) that are beside where the trajectory begins.
+        """Return q (nq,) and v (nv,) at an offset from the start of the trajectory.
 
         Parameters
         ----------
         offset : mapping
-            {name, group or pattern of states: error in the base's axes there}; or instead of q_b
-            the angles roll, pitch, yaw [deg].
+            {name, group or pattern of states: error, in the base axes at the start}. The angles
+            roll, pitch, yaw [deg] may be given instead of q_b.
 
         Raises
         ------
         InputError
-            If the attitude is given twice or is none.
+            If the attitude is given twice, or ``|q_b|`` is not less than 1.
         UnknownNameError
-            If there is no such state.
+            If a state does not exist.
         """
         robot, (q, v, _) = self.trajectory.robot, self.reference(0.0)
         # A chart about where it begins, which may be turned by any angle itself.
@@ -163,7 +165,9 @@ class TrajectoryFeedback:
                 angles[index - chart.nx] = value
         if angles.any():
             if e[:3].any():
-                raise InputError("the offset has q_b and an angle; give either")
+                raise InputError(
+                    "the offset has both q_b and an angle roll, pitch or yaw; give only one of them"
+                )
             turn = pin.Quaternion(pin.rpy.rpyToMatrix(*np.radians(angles))).coeffs()
             e[:3] = turn[:3] if turn[3] >= 0.0 else -turn[:3]
         if not np.linalg.norm(e[:3]) < 1.0:
@@ -173,14 +177,14 @@ class TrajectoryFeedback:
         return chart.to_pinocchio(moved_by(self.frame, chart.to_state(q, v)[None], e[None])[0])
 
     def gain(self, t: float) -> Array:
-        """Return K (nu, nx) at a time of the run."""
+        """Return the gain K (nu, nx) at a time of the run."""
         knots = self.schedule.t
         if t > self.over:
             return self.end_gain
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
 
     def law(self) -> Callable[[float, Array], Array]:
-        """Return law(t, e) -> u of the error at a time of the run."""
+        """Return law(t, e) -> u: the inputs at an error e and a time of the run."""
         return lambda t, e: self.commanded(t)[2] - self.gain(t) @ e
 
     def bind(self, robot: Robot) -> Policy:
@@ -189,11 +193,11 @@ class TrajectoryFeedback:
         Raises
         ------
         InputError
-            If the robot has not the trajectory's states and inputs; its masses may be others.
+            If the robot's states or inputs differ from the trajectory's. Its masses may differ.
         """
         origin = self.trajectory.robot
         state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
-        made = f"the trajectory is one of '{origin.name}'"
+        made = f"the trajectory is a motion of '{origin.name}'"
         for kind, pair in (("input", map(Actuation, (own, state))), ("state", (own, state))):
             require_same(made, robot, kind, *((each.names, each.units) for each in pair))
         require_turns(made, origin.nq, robot)
@@ -219,7 +223,7 @@ def followed(policy: Any, robot: Robot, held: float = 0.0) -> Any:
 
 
 def reference_of(policy: Any) -> Reference | None:
-    """Return what a policy follows, where it follows a motion."""
+    """Return the reference of a policy that follows a motion, else None."""
     found = getattr(decider(policy), "reference", None)
     return found if callable(found) else None
 

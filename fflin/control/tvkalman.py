@@ -1,4 +1,4 @@
-"""The Kalman filter along a trajectory."""
+"""Time-varying Kalman filter along a trajectory."""
 
 from __future__ import annotations
 
@@ -27,34 +27,37 @@ from fflin.linear.trajectory_sampling import transitions
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FilterSchedule(Schedule):
-    r"""A time-varying Kalman filter of the error e from a trajectory.
+    r"""Time-varying Kalman filter of the error e from a trajectory.
 
-    With :math:`\nu = y - y^*(t) - C \hat e - D\,\delta u`, the left side that of the next sample
-    where the filter is sampled,
+    With the innovation :math:`\nu = y - y^*(t) - C \hat e - D\,\delta u`,
 
     .. math:: \dot{\hat e} = A(t)\,\hat e + B(t)\,\delta u + L(t)\,\nu.
+
+    For a sampled filter, the left side is the estimate for the next sample.
 
     Attributes
     ----------
     t : ndarray (M,)
-        Times of the knots [s]: the trajectory's and those that P needs, or the samples.
+        Times [s] of the knots: the trajectory's knots and those added to interpolate P. For a
+        sampled filter, the sample times.
     L : ndarray (M, nx, ny)
-        Of samples the last row repeats what acts to the end.
+        Filter gains. In a sampled filter the last row repeats the gain before it.
     P : ndarray (M, nx, nx)
-        Covariance of the error of the estimate, of a sample before its y is seen.
+        Covariance of the estimation error; for a sampled filter, before the measurement update.
     A, B, W : ndarray (M, nx, nx), (M, nx, nu), (M, nx, nx)
-        The model and the intensity of its disturbance; or M - 1 that take a sample to the next,
-        and the covariance of what the disturbance does meanwhile.
+        Linear model and intensity of the disturbance at the knots. A sampled filter has M - 1 of
+        each: the transitions from one sample to the next, and the covariance of the disturbance
+        over that time.
     C, D, y : ndarray (M, ny, nx), (M, ny, nu), (M, ny)
-        The outputs, and what they are on the motion.
+        Output matrices, and the outputs along the trajectory.
     V : ndarray (ny, ny)
-        Intensity of the noise of the outputs, or its covariance in a sample.
+        Intensity of the measurement noise; for a sampled filter, its covariance per sample.
     residual : float
-        As that of `GainSchedule`.
+        Residual of the Riccati equation, as in `GainSchedule`.
     state_names, input_names, output_names : tuple of str
     robot : str
     dt : float
-        Time [s] between samples; 0 for continuous time.
+        Sampling time [s]; 0 for continuous time.
 
     Examples
     --------
@@ -87,11 +90,11 @@ class FilterSchedule(Schedule):
     dt: float = field(default_factory=float)
 
     def gain(self, t: float) -> Array:
-        """Return L (nx, ny) at a time, as `GainSchedule.gain` does K."""
+        """Return the filter gain L (nx, ny) at a time; see `GainSchedule.gain`."""
         return super().gain(t).T
 
     def covariance(self, t: float) -> Array:
-        """Return P (nx, nx) at a time: a cubic between the knots, or that of the last sample."""
+        """Return P (nx, nx) at a time: cubic between knots, or the value at the last sample."""
         return self.passed.cost(self._within(t))
 
     @cached_property
@@ -110,34 +113,36 @@ def tvkalman(
     P0: Weight | str = "steady",
     sample: float | None = None,
 ) -> FilterSchedule:
-    r"""Return the Kalman filter along a trajectory.
+    r"""Return the time-varying Kalman filter along a trajectory.
 
-    The error is disturbed as a model of `kalman` is, by white noises of intensities W and V, and
-    P, the covariance of the estimate's error, goes forward from P0 by
+    White noise of intensities W and V acts on the error and on the outputs, as in `kalman`. The
+    covariance P of the estimation error is integrated forward from P0,
 
     .. math:: \dot P = A P + P A^T - P C^T V^{-1} C P + W,\qquad L = P C^T V^{-1}.
 
-    In the time to the start this is the equation of `tvlqr` for :math:`A^T, C^T, W, V`, and is
-    solved in the same way. With `sample` it is the filter of a computer that measures y so often
-    and holds :math:`\delta u` in between, (10.4): V is the covariance of a sample's noise then, and
-    W still the intensity of what disturbs the robot all the time.
+    In reversed time this is the equation of `tvlqr` for :math:`A^T, C^T, W, V`. It is solved in
+    the same way.
+
+    With `sample`, the filter is sampled, (10.4): a computer measures y at the samples and holds
+    :math:`\delta u` between them. V is then the noise covariance per sample. W remains the
+    intensity of the continuous disturbance.
 
     Parameters
     ----------
     traj : LinearTrajectory
-        Of a robot whose outputs are what is measured.
+        Trajectory of a robot whose outputs are the measurements.
     W : array_like (nx, nx) or (nx,), float, or mapping
-        Positive semidefinite, as `kalman` takes it.
+        Intensity of the disturbance, positive semidefinite, as in `kalman`.
     V : array_like (ny, ny) or (ny,), float, or mapping
-        Positive definite.
+        Intensity of the measurement noise, positive definite.
     G : array_like (nx, nw) or (N, nx, nw), optional
-        The disturbance acts through G, linear between the knots, and W is (nw, nw):
-        ``G=traj.B`` for noisy inputs, whose names W then takes.
+        Input matrix of the disturbance, linear between the knots; W is then (nw, nw). With
+        ``G=traj.B`` the inputs are noisy, and W takes their names.
     P0 : "steady", or as W
-        Covariance at the start. "steady" is that of `kalman` about the robot at rest in the first
-        configuration, or in its motion there if that is steady.
+        Covariance at the start. "steady" is the covariance of `kalman` about the start point: the
+        first configuration at rest, or the motion there if it is steady.
     sample : float, optional
-        Sampling time [s], of which the duration is a multiple.
+        Sampling time [s]. It must divide the duration.
 
     Returns
     -------
@@ -146,12 +151,13 @@ def tvkalman(
     Raises
     ------
     InputError
-        If a size or value is wrong, P changes so fast that the knots run out, or the sampling time
-        does not divide the duration.
+        If a size or value is wrong, if P changes so fast that too many knots are needed, or if
+        the sampling time does not divide the duration.
     UnknownNameError
         If a name does not exist.
     EquilibriumError, DetectabilityError
-        If P0 is "steady", and no inputs hold the robot there or outputs do not show it.
+        If P0 is "steady" and no inputs can hold the robot at the start point, or if the model
+        there is not detectable.
 
     References
     ----------
@@ -209,7 +215,9 @@ def _steady(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Array:
     try:
         return kalman(lin, W, V).P
     except (DetectabilityError, InputError) as error:
-        raise type(error)(f"at the start: {error}; give P0") from None
+        raise type(error)(
+            f"no steady filter exists at the start of the trajectory: {error}; give P0"
+        ) from None
 
 
 def _sampled(

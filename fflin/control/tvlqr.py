@@ -1,4 +1,4 @@
-"""The linear quadratic regulator along a trajectory, over a finite horizon."""
+"""Time-varying linear quadratic regulator along a trajectory."""
 
 from __future__ import annotations
 
@@ -40,40 +40,42 @@ def tvlqr(
     weights: str | None = None,
     rule: str = "as given",
 ) -> GainSchedule:
-    r"""Return the regulator along a trajectory, over its finite horizon.
+    r"""Return the time-varying linear quadratic regulator along a trajectory.
 
-    From any time t to the end T it minimises
+    From any time t to the end T, it minimises the finite-horizon cost
 
     .. math:: e(T)^T Q_f\,e(T) + \int_t^T e^T Q\,e + \delta u^T R\,\delta u\;d\tau.
 
-    P of the differential Riccati equation :math:`-\dot P = A^T P + P A - P B R^{-1} B^T P + Q`,
-    :math:`P(T) = Q_f`, is carried backwards from knot to knot by maps of the form
-    :math:`P_0 = W + T^T P_1 (E + G P_1)^{-1} T` with W and G positive semidefinite, each of which
-    comes from a short exponential by doubling: P stays positive semidefinite however long the
-    horizon. The method is of order four in the trajectory's changes and exact where it does not
-    change; knots are added until halving and interpolation agree to 1e-7.
+    The differential Riccati equation is :math:`-\dot P = A^T P + P A - P B R^{-1} B^T P + Q`, with
+    :math:`P(T) = Q_f`. It is solved backwards from knot to knot by maps
+    :math:`P_0 = W + T^T P_1 (E + G P_1)^{-1} T`. Here E is the identity, and W and G are positive
+    semidefinite. Each map is computed from a short matrix exponential by doubling, so P stays
+    positive semidefinite over any horizon. The method is of fourth order along a changing
+    trajectory and exact along a constant one. Knots are added until halving and interpolation
+    agree to 1e-7.
 
-    With `sample` it is the regulator of a computer that measures e every so often and holds
-    :math:`\delta u` in between, at the same cost, by (10.1) and (10.3) along the motion.
+    With `sample`, the regulator is sampled: a computer measures e at the samples and holds
+    :math:`\delta u` between them. The cost is the same, by (10.1) and (10.3) along the motion.
 
     Parameters
     ----------
     traj : LinearTrajectory
     Q : array_like (nx, nx) or (nx,), float, or mapping, optional
-        Weight on the error, as `lqr` takes it; positive semidefinite.
+        Weight on the error, positive semidefinite, as in `lqr`.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
-        Positive definite.
+        Weight on the inputs, positive definite.
     Qf : "steady", or as Q
-        Weight on the error at the end. "steady" is the cost from there on of `lqr` about the robot
-        at rest in the last configuration, or in its motion there if that is steady; what the
-        inputs cannot hold is left out, see `momentum_reduction`.
+        Weight on the error at the end. "steady" is the infinite-horizon cost of `lqr` about the
+        end point: the last configuration at rest, or the motion there if it is steady. It omits
+        the states that the inputs cannot stabilise, see `momentum_reduction`.
     sample : float, optional
-        Sampling time [s], of which the duration is a multiple.
+        Sampling time [s]. It must divide the duration.
     weights : {"urdf", "identity"}, optional
-        Instead of Q and R: the rule of `lqr`, about that same point, from a tenth of its
-        displacements, and fast enough to bring errors to nothing within the trajectory.
+        Rule for the weights, instead of Q and R: the rule of `lqr` about that end point, for a
+        tenth of its displacements. The loop is fast enough for errors to vanish within the
+        trajectory.
     rule : str
-        What made Q and R, in words.
+        Description of the rule that made Q and R.
 
     Returns
     -------
@@ -82,12 +84,12 @@ def tvlqr(
     Raises
     ------
     InputError
-        If a weight is of a wrong size or not positive (semi)definite, P changes so fast that
-        the knots run out, or the sampling time does not divide the duration.
+        If a weight has a wrong size or is not positive (semi)definite, if P changes so fast that
+        too many knots are needed, or if the sampling time does not divide the duration.
     UnknownNameError
         If a name does not exist.
     EquilibriumError, StabilizabilityError
-        If Qf is "steady" and no inputs hold the robot there.
+        If Qf is "steady" and no inputs can hold the robot at the end point.
 
     References
     ----------
@@ -109,7 +111,7 @@ def tvlqr(
     steady = asks_steady(Qf)
     given, by_rule = list[Any]((Q, R)), Q is None and R is None
     if not by_rule and (weights is not None or Q is None or R is None):
-        raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
+        raise InputError("give both Q and R, or neither and weights='urdf' or 'identity'")
     end: Any = steady_end(traj) if steady or by_rule else None
     if by_rule:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
@@ -137,7 +139,7 @@ def tvlqr(
 
 
 def asks_steady(Qf: Any) -> bool:
-    """Whether Qf is "steady", or raise `InputError` where it is another word."""
+    """Return whether Qf is "steady"; raise `InputError` if it is another string."""
     if isinstance(Qf, str) and Qf != "steady":
         raise InputError(f"Qf is {Qf!r}, expected 'steady' or a weight")
     return isinstance(Qf, str)
@@ -157,14 +159,14 @@ def held_stages(
 
 
 def require_continuous(traj: LinearTrajectory) -> None:
-    """Raise `InputError` where something is no LinearTrajectory in continuous time."""
+    """Raise `InputError` if traj is not a LinearTrajectory in continuous time."""
     if not isinstance(traj, LinearTrajectory):
         raise InputError(
             f"traj is a {type(traj).__name__}, expected a LinearTrajectory; "
-            "fflin.linearize_trajectory makes one"
+            "fflin.linearize_trajectory returns one"
         )
     if traj.dt:
-        raise InputError("traj is sampled; give the continuous one, and sample=")
+        raise InputError("traj is sampled; give the continuous trajectory and sample=")
 
 
 def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
@@ -176,7 +178,9 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
         return resting_end(traj, end)
     except EquilibriumError as error:
         where, given = ("end", "Q, R and Qf") if end else ("start", "P0")
-        raise EquilibriumError(f"at the {where}: {error}; give {given}") from None
+        raise EquilibriumError(
+            f"no inputs hold the robot at the {where} of the trajectory: {error}; give {given}"
+        ) from None
 
 
 def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:

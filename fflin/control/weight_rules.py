@@ -1,4 +1,4 @@
-"""The weights that a regulator gets by a rule, and by name."""
+"""Weights of a regulator by a rule, and by name."""
 
 import math
 import warnings
@@ -29,7 +29,7 @@ _APART = 1e4
 
 
 class _Given(NamedTuple):
-    """A weight that is given, and whether as a largest value."""
+    """Given weight, and whether it was given as a largest value."""
 
     value: float
     largest: bool
@@ -74,7 +74,7 @@ def rule_weights(
     if named:
         Q, R = _reweighed(lin, Q, R, terms, given_weights)
         rule = f"{', '.join(named)} as given, the others {rule}"
-        rule += " by this rule alone" if terms.any() else ""
+        rule += " (figures of this rule alone)" if terms.any() else ""
     if source.dt == lin.dt:
         return Q, R, None, rule
     return (*sampled_cost(source, lin.dt, Q, R), rule)
@@ -83,9 +83,10 @@ def rule_weights(
 def _of_regulated(
     lin: LinearModel, pace: Pace, wheel_speeds: bool | None
 ) -> tuple[Array, Array, str, Array]:
-    """Return Q (nx, nx), R and the rule of what is regulated of a model that may have wheels.
+    """Return Q (nx, nx), R, the rule and costs, for a model that may have wheels.
 
-    Last is what the largest of each state and input (nx + nu,) costs, 0 where the rule has none.
+    The costs (nx + nu,) are those of the largest value of each state and input, 0 if the rule has
+    none.
     """
     part = regulated_part(lin, wheel_speeds)
     if part is lin:
@@ -101,7 +102,7 @@ def _of_regulated(
     found = default_weights(body, pace, dict(zip(names, room, strict=True)))
     Q, R, rule, bandwidth, (of_positions, of_inputs) = found
     if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
-        rule += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
+        rule += f"; at or beyond the URDF limit at the point itself: {listed(beyond)}"
     S = picked(body.state_names, lin.state_names)
     Q = S.T @ Q @ S
     terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
@@ -131,7 +132,9 @@ def _weights_of(
     for name, size in parts["bryson"].items():
         side = r if is_input("state or input", name, lin) else q
         if name in side:
-            raise InputError(f"'{name}' has a weight and a largest value; give either")
+            raise InputError(
+                f"'{name}' has both a weight and a largest value (bryson); give only one of them"
+            )
         side[name] = _Given(inverse_square(f"largest value of '{name}' (--bryson)", size), True)
     of_inputs = by_name("input", r, input_keys(lin))
     nx = len(lin.x0)
@@ -144,8 +147,8 @@ def _reweighed(
 ) -> tuple[Array, Array]:
     """Return Q and R, scaled to the largest values that are given, with what is given in them.
 
-    A common factor of Q and R changes no gain. That of the rule takes what it lets the largest of
-    the named states and inputs cost to 1, as Bryson's rule does.
+    A common factor of Q and R does not change the gain. The rule's weights are scaled so that the
+    largest values of the named states and inputs cost 1, as in Bryson's rule.
     """
     costs = [terms[index] for index, each in given.items() if each.largest and terms[index]]
     scale = math.exp(-np.log(costs).mean()) if costs else 1.0
@@ -157,13 +160,13 @@ def _reweighed(
         if terms.any() and not largest and value > 0.0 and own > 0.0:
             ratio = value / own
             if not 1.0 / _APART < ratio < _APART:
-                apart[names[index]] = f"{names[index]} weighs {value:.3g} as given, {own:.3g} by it"
+                apart[names[index]] = f"{names[index]} is {value:.3g}, by the rule {own:.3g}"
         matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
     if apart:
         warnings.warn(
-            f"the weights given are on another scale than the rule's: {listed(apart.values())}; "
-            "what is not given hardly counts beside it, or alone does; give largest values "
-            "(bryson), which the rule's weights follow",
+            f"the weights given differ in scale from the rule's weights: {listed(apart.values())}; "
+            "one of the two groups will dominate the cost; give largest values (bryson) instead, "
+            "to which the rule's weights are scaled",
             FflinWarning,
             stacklevel=4,
         )

@@ -1,4 +1,4 @@
-"""Weights of a quadratic cost: from matrices, diagonals, numbers and names."""
+"""Weights of a quadratic cost, given as matrices, diagonals, numbers or names."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -20,31 +20,35 @@ _ROUNDING = 1e-9
 
 
 def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) -> Array:
-    r"""Return the diagonal of a weight by Bryson's rule, :math:`1/\text{largest}^2` each.
+    r"""Return the diagonal of a weight by Bryson's rule: :math:`1/\text{largest}^2` per entry.
 
-    A deviation as large as is acceptable then costs 1, whatever its unit.
+    The largest acceptable deviation then costs 1, whatever its unit.
 
     Parameters
     ----------
     lin : LinearModel or LinearTrajectory
     largest : mapping
-        {name: largest acceptable value}, of states or of inputs. A name is one of
-        ``lin.state_names`` or ``lin.input_names``, or that of a group such as ``q_b``, ``r_b``,
-        ``q_m``, ``omega_b``, ``v_b``, ``qdot_m``, ``tau_b``, ``F_b``, ``tau_m``, or a pattern
-        such as ``q_m.hinge_*``; a single name goes before both. States that are not named cost
-        nothing; inputs must all be named.
+        {name: largest acceptable value}, for states or for inputs. A name is one of
+
+        - a single name in ``lin.state_names`` or ``lin.input_names``;
+        - a group such as ``q_b``, ``r_b``, ``q_m``, ``omega_b``, ``v_b``, ``qdot_m``, ``tau_b``,
+          ``F_b``, ``tau_m``;
+        - a pattern such as ``q_m.hinge_*``.
+
+        A single name takes precedence over groups and patterns. Unnamed states cost nothing.
+        Inputs must all be named.
 
     Returns
     -------
     ndarray (nx,) or (nu,)
-        For states or for inputs, as `lqr` takes it.
+        Diagonal of Q or of R, for `lqr`.
 
     Raises
     ------
     UnknownNameError
-        If there is no such name.
+        If a name does not exist.
     InputError
-        If `lin` is no model, a value is not positive, or states and inputs are named together.
+        If `lin` is not a model, a value is not positive, or the names mix states and inputs.
 
     References
     ----------
@@ -65,7 +69,8 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     if len(set(sides.values())) > 1:
         one = {side: name for name, side in sides.items()}
         raise InputError(
-            f"'{one[True]}' is an input and '{one[False]}' a state; ask for one weight of each"
+            f"'{one[True]}' is an input and '{one[False]}' a state; call bryson once for the "
+            "states and once for the inputs"
         )
     of_inputs = all(sides.values())
     names = input_keys(lin) if of_inputs else lin.state_names
@@ -81,16 +86,16 @@ def is_input(kind: str, key: str, lin: Any) -> bool:
     found = matching(kind, key, (*lin.state_names, *input_keys(lin)))
     sides = {index >= len(lin.state_names) for index in found}
     if len(sides) > 1:
-        raise InputError(f"{kind} '{key}' is of states and of inputs; name one group of them")
+        raise InputError(f"{kind} '{key}' matches states and inputs; give a name of one kind")
     return sides.pop()
 
 
 def inverse_square(what: str, size: float) -> float:
-    """Return 1/size^2, or raise `InputError` where that is no positive number."""
+    """Return 1/size^2, or raise `InputError` if it is not a positive finite number."""
     if size <= 0.0:
         raise InputError(f"{what} is {size:g}, expected a positive number")
     if not 1e-150 <= size <= 1e150:
-        raise InputError(f"{what} is {size:g}, expected one between 1e-150 and 1e150")
+        raise InputError(f"{what} is {size:g}, expected a number between 1e-150 and 1e150")
     return size**-2
 
 
@@ -129,7 +134,7 @@ def columns(what: str, value: ArrayLike, rows: int) -> Array:
 def require_semidefinite(
     what: str, matrix: Array, names: Sequence[str], definite: bool = False
 ) -> None:
-    """Raise `InputError` with the lowest eigenvalue where a symmetric matrix is not so."""
+    """Raise `InputError` with the lowest eigenvalue if a matrix is not positive semidefinite."""
     values, directions = np.linalg.eigh(matrix)
     if definite or values[0] < -_ROUNDING * np.abs(matrix).max(initial=0.0):
         where = names[int(np.abs(directions[:, 0]).argmax())]
@@ -157,7 +162,7 @@ def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool)
         i, j = np.unravel_index(int(skew.argmax()), skew.shape)
         raise InputError(
             f"{what} is not symmetric: {what}[{i}, {j}] is {matrix[i, j]:g} and {what}[{j}, {i}] "
-            f"is {matrix[j, i]:g}"
+            f"is {matrix[j, i]:g}; give a symmetric matrix"
         )
     matrix = 0.5 * (matrix + matrix.T)
     try:
@@ -174,7 +179,7 @@ def named_weights(what: str, values: Mapping[str, float], names: Sequence[str]) 
 
 
 class SampledCost(NamedTuple):
-    """Weights of a sum over samples: ``lqr(lin.discretize(dt), *cost)``."""
+    """Weights (Q, R, N) of a cost summed over samples, for ``lqr(lin.discretize(dt), *cost)``."""
 
     Q: Array
     R: Array
@@ -184,7 +189,9 @@ class SampledCost(NamedTuple):
 def sampled_cost(
     lin: LinearModel, dt: float, Q: Weight, R: Weight, N: ArrayLike | None = None
 ) -> SampledCost:
-    r"""Return the sum over samples that equals an integral cost under held inputs.
+    r"""Return the weights of the sum over samples that equals an integral cost.
+
+    The inputs are held between samples (zero-order hold).
 
     Equation (10.1) of docs/derivation.md:
 
@@ -192,27 +199,29 @@ def sampled_cost(
               \begin{bmatrix} Q & N \\ N^T & R \end{bmatrix} e^{F t}\,dt,\qquad
               F = \begin{bmatrix} A & B \\ 0 & 0 \end{bmatrix}
 
-    At rest F^3 = 0, and the integral is a polynomial in h, exact; elsewhere it is that of a
-    short step (van Loan), doubled.
+    At rest F^3 = 0, and the integral is an exact polynomial in h. Otherwise the integral over a
+    short step (van Loan) is computed and doubled repeatedly.
 
     Parameters
     ----------
     lin : LinearModel
-        Continuous.
+        Continuous model.
     dt : float
         Sampling time h [s].
     Q, R : see `lqr`
+        Weights of the integral.
     N : array_like (nx, nu), optional
+        Cross weight of the integral.
 
     Returns
     -------
     SampledCost
-        (Q, R, N) as `lqr` takes them.
+        Weights (Q, R, N) for `lqr`.
 
     Raises
     ------
     InputError
-        If the model is sampled already, `dt` is not positive, or a weight is not one of `lqr`.
+        If the model is already sampled, `dt` is not positive, or `lqr` would refuse a weight.
 
     References
     ----------
@@ -227,7 +236,9 @@ def sampled_cost(
     0.1
     """
     if not isinstance(lin, LinearModel) or lin.dt:
-        raise InputError("lin must be a continuous LinearModel; give the one before discretize")
+        raise InputError(
+            "lin must be a continuous LinearModel; give the model from before discretize"
+        )
     h = number("dt", dt)
     if h <= 0.0:
         raise InputError(f"dt is {h:g} s, expected a positive sampling time")
@@ -240,7 +251,7 @@ def sampled_cost(
         W[:nx, nx:], W[nx:, :nx] = cross, cross.T
     total = held_cost(F, W, h)
     if not np.isfinite(total).all():
-        raise InputError(f"dt is {h:g} s, over which the model overflows")
+        raise InputError(f"dt is {h:g} s, within which the model overflows; give a shorter dt")
     return SampledCost(total[:nx, :nx], total[nx:, nx:], total[:nx, nx:])
 
 
@@ -250,13 +261,13 @@ def _diagonal(
     found = named_weights(f"entry of {what}", values, names)
     if complete and len(found) < len(names):
         missing = next(name for index, name in enumerate(names) if index not in found)
-        raise InputError(f"{what} has no value for {missing}; each needs one")
+        raise InputError(f"{what} has no value for {missing}; give a value for each entry")
     return np.array([found.get(index, 0.0) for index in range(len(names))])
 
 
 def _negative(what: str, value: float, where: str, definite: bool) -> InputError:
     kind = "definite" if definite else "semidefinite"
     return InputError(
-        f"{what} is not positive {kind}: its eigenvalue {value:.6g} has its direction mostly "
-        f"along {where}"
+        f"{what} is not positive {kind}: it has the eigenvalue {value:.6g} with an eigenvector "
+        f"mainly along {where}; increase the weight there"
     )

@@ -1,1 +1,1 @@
-"""What a robot's parameters change in its models, and models whose parameters are uncertain."""
+"""Sensitivity of models to the robot's parameters, and uncertain models (LFT)."""

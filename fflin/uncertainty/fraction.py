@@ -1,4 +1,4 @@
-r"""The linear-fractional form of a robot at rest: which signals each parameter multiplies.
+r"""Linear-fractional form of a robot at rest: the signals that each parameter multiplies.
 
 The force that a link takes of an acceleration a is the chain
 
@@ -29,7 +29,7 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Range(NamedTuple):
-    """A parameter, the middle of its range, and how far a delta of 1 is from it."""
+    """Range of a parameter: the parameter, its middle value and half width."""
 
     parameter: Parameter
     middle: float
@@ -37,12 +37,12 @@ class Range(NamedTuple):
 
     @property
     def shift(self) -> float:
-        """How far the middle is from what the robot has."""
+        """Difference between the middle and the nominal value."""
         return self.middle - self.parameter.value
 
     @property
     def repeats(self) -> int:
-        """How many signals it multiplies."""
+        """Number of signals that the parameter multiplies."""
         part = self.parameter.part
         if part[:8] == "inertia." and part[8] == part[9]:
             return 1
@@ -50,9 +50,9 @@ class Range(NamedTuple):
 
 
 class Block(NamedTuple):
-    """What one delta varies: a parameter, or several that are tied.
+    """Block of an uncertain model: one delta, which varies a parameter or several tied ones.
 
-    Tied parameters have a common value in a range, or a common factor of what the robot has.
+    Tied parameters have a common value, or a common factor on their nominal values.
     """
 
     name: str
@@ -63,11 +63,11 @@ class Block(NamedTuple):
 
     @property
     def repeats(self) -> int:
-        """How many signals its delta multiplies."""
+        """Number of signals that the delta multiplies."""
         return sum(each.repeats for each in self.ranges)
 
     def values(self, value: float) -> dict[str, float]:
-        """Return {parameter: value} of the value or factor that they have in common."""
+        """Return {parameter: value} for a common value or factor of the block."""
         delta = (value - self.middle) / self.half
         return {each.parameter.name: each.middle + each.half * delta for each in self.ranges}
 

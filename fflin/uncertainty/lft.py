@@ -22,24 +22,32 @@ from fflin.linear.model import state_space
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LFT(Design):
-    r"""An uncertain linear model, exact for every value of its parameters; prints its blocks.
+    r"""Uncertain linear model in linear-fractional form (LFT), exact in its parameters.
+
+    .. math:: \dot x = A x + B_1 w + B_2 u,\quad z = C_1 x + D_{11} w + D_{12} u,\quad
+              y = C_2 x + D_{21} w + D_{22} u,\quad w = \Delta z
+
+    :math:`\Delta` is diagonal and repeats each delta, between -1 and 1. Printing the model lists
+    its blocks.
 
     Attributes
     ----------
-    A, B1, B2 : ndarray
-        Of the state: (nx, nx), (nx, nw), (nx, nu).
-    C1, D11, D12 : ndarray
-        Of z (nw,).
-    C2, D21, D22 : ndarray
-        Of the outputs (ny,).
+    A, B1, B2 : ndarray (nx, nx), (nx, nw), (nx, nu)
+        Matrices of the state equation.
+    C1, D11, D12 : ndarray (nw, nx), (nw, nw), (nw, nu)
+        Matrices of z.
+    C2, D21, D22 : ndarray (ny, nx), (ny, nw), (ny, nu)
+        Matrices of the outputs y.
     parameters : tuple of str
-        What is uncertain, in the order of the blocks; of tied parameters their pattern.
+        Uncertain parameters in the order of the blocks. Tied parameters have their pattern as
+        name.
     repeats : ndarray (k,)
-        How often each delta stands in Delta.
+        Number of times that each delta is repeated in :math:`\Delta`.
     middle, half : ndarray (k,)
-        A parameter is middle + half delta; what is tied is a common value, or factor of the
-        robot's own.
+        A parameter is ``middle + half * delta``. For tied parameters this is their common value,
+        or the common factor on their nominal values.
     units : tuple of str
+        Units of the parameters; "1" for a factor.
     state_names, input_names, output_names : tuple of str
     robot : str
 
@@ -84,16 +92,16 @@ class LFT(Design):
         ):
             ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
             rows.append((name, *ends, "" if unit == "1" else unit, f"{repeats:g}"))
-        rows.append(("in all", "", "", "", f"{self.repeats.sum():g}"))
+        rows.append(("total", "", "", "", f"{self.repeats.sum():g}"))
         return f"{self!r}\n{grid(rows, 'lrrlr')}"
 
     @property
     def dt(self) -> float:
-        """Zero: it is continuous."""
+        """Sampling time: 0, the model is continuous."""
         return 0.0
 
     def deltas(self, values: Mapping[str, float]) -> Array:
-        """Return delta (k,) of {parameter or pattern: value}; 0 where nothing is given."""
+        """Return delta (k,) for {parameter or pattern: value}; 0 for unnamed parameters."""
         found = np.zeros(len(self.parameters))
         for key, value in numbers("values", values, "parameter", "value").items():
             for at in matching("parameter", key, self.parameters):
@@ -101,29 +109,31 @@ class LFT(Design):
         return found
 
     def at(self, values: Mapping[str, float] | Array) -> tuple[Array, Array, Array, Array]:
-        r"""Return A, B, C and D of parameters.
+        r"""Return A, B, C and D at values of the parameters.
 
         Parameters
         ----------
         values : mapping or array_like (.., k)
-            {parameter: value}, in the middle of its range where it is not named; or rows of deltas.
+            {parameter: value}, or rows of deltas. Unnamed parameters are at the middle of their
+            ranges.
 
         Returns
         -------
         A, B, C, D : ndarray
-            :math:`A + B_1 \Delta (E - D_{11} \Delta)^{-1} C_1` and so on, of each row.
+            :math:`A + B_1 \Delta (E - D_{11} \Delta)^{-1} C_1` and so on, for each row, with E the
+            identity.
 
         Raises
         ------
         InputError
-            If there are others than k deltas, or M is singular there.
+            If a row does not have k finite deltas, or the inertia M is singular at these values.
         """
         if isinstance(values, Mapping):
             values = self.deltas(values)
         rows = as_double("values", values)
         if not np.isfinite(rows).all() or rows.shape[-1:] != self.repeats.shape:
             raise InputError(
-                f"deltas have shape {rows.shape}, expected (.., {len(self.repeats)}), finite"
+                f"deltas have shape {rows.shape}, expected (.., {len(self.repeats)}) finite numbers"
             )
         delta = np.repeat(rows, self.repeats.astype(int), axis=-1)
         within = np.eye(len(self.D11)) - self.D11 * delta[..., None, :]
@@ -133,7 +143,9 @@ class LFT(Design):
                 within, np.broadcast_to(given, (*delta.shape, given.shape[1]))
             )
         except np.linalg.LinAlgError:
-            raise InputError("M is singular at these parameters; give narrower ranges") from None
+            raise InputError(
+                "the inertia M is singular at these parameters; give narrower ranges"
+            ) from None
         nx = len(self.A)
         return (
             self.A + self.B1 @ by[..., :nx],
@@ -143,9 +155,10 @@ class LFT(Design):
         )
 
     def to_control(self) -> Any:
-        """Return a `control.StateSpace` from (w, u) to (z, y), its channels named.
+        """Return a `control.StateSpace` from (w, u) to (z, y), with signal names.
 
-        w and z are named ``w.PARAMETER.1`` and ``z.PARAMETER.1``, with underscores for the dots.
+        The channels of w and z are named ``w.PARAMETER.1`` and ``z.PARAMETER.1``, with
+        underscores instead of dots.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What slopes of the accelerations over parameters make of the matrices of a linear model."""
+"""Derivatives of a linear model's matrices with respect to the robot's parameters."""
 
 from __future__ import annotations
 
@@ -135,9 +135,12 @@ def with_bodies(robot: Robot, one: Parameter, size: float) -> dict[int, pin.Iner
 
 
 def difference(slopes: ModelSlopes, one: Parameter) -> float:
-    """Return how far fourth-order differences of A and B over a parameter are from its slopes."""
+    """Return the relative error of the derivatives of A and B, by fourth-order differences."""
     if not one.bodies:
-        raise InputError(f"'{one.name}' is no parameter of a body; only these are checked so")
+        raise InputError(
+            f"'{one.name}' is not a parameter of a link or body; check takes only these, such as "
+            "'base.mass'"
+        )
     lin, robot = slopes.lin, slopes.robot
     step = _STEP / slopes.bodies.share(one.bodies)
 

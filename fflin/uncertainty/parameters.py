@@ -1,4 +1,4 @@
-"""The parameters of a robot by name, and what each of them is a change of."""
+"""Named parameters of a robot, and the change of the robot per unit of each."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class Parameter:
 
     @property
     def name(self) -> str:
-        """Whose it is and which."""
+        """Name of the parameter: its owner and its part, such as "arm.inertia.xx"."""
         return f"{self.of}.{self.part}"
 
 
 class Parameters(dict[str, Parameter]):
-    """What can be changed of a robot, by name; a body of one link has that of its joint too."""
+    """Parameters of a robot by name; a body of one link can also be named by its joint."""
 
     def __init__(self, robot: Robot) -> None:
         pieces, self._also = pieces_of(robot)

@@ -1,7 +1,7 @@
-r"""How the accelerations and their slopes at a point change with the parameters of a robot.
+r"""Derivatives of the accelerations and their Jacobians with respect to the robot's parameters.
 
-What M and RNEA take of a body is linear in its ten dynamic parameters, so that each derivative over
-one of them is M or RNEA of the bodies that are the change alone.
+M and RNEA are linear in the ten dynamic parameters of a body. The derivative with respect to one of
+them is therefore M or RNEA of bodies that consist of the unit change alone.
 """
 
 from __future__ import annotations

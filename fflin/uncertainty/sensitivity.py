@@ -1,4 +1,4 @@
-"""Exact derivatives of a linear model over the parameters of its robot."""
+"""Exact derivatives of a linear model with respect to the robot's parameters."""
 
 from __future__ import annotations
 
@@ -27,19 +27,20 @@ _EQUAL = 1e-6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Slope(FrozenArrays):
-    """Derivatives of a linear model over one parameter, or along a direction of several.
+    """Derivatives of a linear model with respect to one parameter, or along a direction.
 
     Attributes
     ----------
     name, unit : str
-        Of the parameter; what is derived is per unit of it.
+        Name and unit of the parameter. Derivatives are per this unit.
     value : float
-        What the parameter is; of a direction 0.
+        Value of the parameter; 0 for a direction.
     dA, dB, dC, dD : ndarray
-        Of the shape of A, B, C and D.
+        Derivatives, with the shapes of A, B, C and D.
     df0, dy0 : ndarray (nx,), (ny,)
-        Of the state's rate and the outputs at the point, state and inputs held. Of a model with
-        `moving`, df0 is the rate at which a robot with other parameters leaves the reference.
+        Derivatives of the state's rate and of the outputs at the point, for constant state and
+        inputs. For a model with `moving`, df0 is the rate at which a robot with the changed
+        parameter departs from the reference.
     """
 
     name: str
@@ -58,24 +59,28 @@ class Slope(FrozenArrays):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivity:
-    """Derivatives of a linear model over every parameter of its robot; ``S["arm.mass"].dA``.
+    """Derivatives of a linear model with respect to each robot parameter: ``S["arm.mass"].dA``.
 
-    The parameters are, of each link by its name in the URDF, and of each body, links that are
-    fixed to each other, by its joint or as ``base``:
+    Links have their names in the URDF. A body is a group of links fixed to each other, named
+    after its joint or ``base``. The parameters of a link or body are:
 
-    - ``LINK.mass`` [kg], its centre of mass and inertia about it held;
-    - ``LINK.com.x`` [m] in the link's axes, mass and inertia about it held;
+    - ``LINK.mass`` [kg], with constant centre of mass and inertia about it;
+    - ``LINK.com.x`` [m] in the link's axes, with constant mass and inertia about the centre of
+      mass;
     - ``LINK.inertia.xx`` .. ``.yz`` [kg m^2] about the centre of mass, in the axes of the URDF's
-      <inertial>; of a body, in its joint's;
-    - ``LINK.density``, of the whole link, relative; ``BODY.mass`` of `monte_carlo` is one too;
+      <inertial>; for a body, in the axes of its joint;
+    - ``LINK.density``, a relative factor on mass and inertia; ``BODY.mass`` of `monte_carlo` is
+      also such a factor.
 
-    and ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
-    ``THRUSTER.direction.x`` (what of it turns the unit vector) and ``WHEEL.inertia``, which the
-    carrier's inertia counts.
+    Other parameters are ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
+    ``THRUSTER.direction.x`` (its part that rotates the unit vector) and ``WHEEL.inertia``. The
+    inertia of a carrier includes its wheels. A larger wheel inertia therefore reduces the inertia
+    of the rest of the carrier.
 
     Attributes
     ----------
     lin : LinearModel
+        The linear model.
     parameters : Parameters
         {name: Parameter} in the robot's order.
 
@@ -103,25 +108,28 @@ class Sensitivity:
         return tuple(self.parameters)
 
     def __getitem__(self, name: str) -> Slope:
-        """Return the derivatives over one parameter."""
+        """Return the derivatives with respect to one parameter."""
         one = self._one(name)
         return Slope(one.name, one.unit, one.value, *(x[0] for x in self._slopes.over([one])))
 
     def _one(self, name: str) -> Parameter:
         found = self.parameters.find(name)
         if len(found) > 1:
-            raise InputError(f"'{name}' stands for {len(found)} parameters; take along({{...}})")
+            raise InputError(
+                f"'{name}' matches {len(found)} parameters, expected one; for several use "
+                "along({...})"
+            )
         return self.parameters[found[0]]
 
     def along(self, direction: Mapping[str, float]) -> Slope:
-        """Return the derivatives along a direction.
+        """Return the directional derivatives along a change of several parameters.
 
         Parameters
         ----------
         direction : mapping
-            {parameter or pattern: change of it for a unit of the direction, in its unit}.
-            ``{"payload.density": 0.1}`` is a payload that is heavier by a tenth, all of its
-            inertia with it; ``{"panel_*.stiffness": 1.0}`` all of these at once.
+            {parameter or pattern: change per unit of the direction, in the parameter's unit}.
+            ``{"payload.density": 0.1}`` increases mass and inertia of the payload by a tenth.
+            ``{"panel_*.stiffness": 1.0}`` changes all matching stiffnesses together.
         """
         given = numbers("direction", direction, "parameter", "change")
         named = {name: value for key, value in given.items() for name in self.parameters.find(key)}
@@ -137,17 +145,17 @@ class Sensitivity:
 
     @property
     def dA(self) -> Array:
-        """Derivatives (P, nx, nx) of A over each parameter."""
+        """Derivatives (P, nx, nx) of A with respect to each parameter."""
         return self._all[0]
 
     @property
     def dB(self) -> Array:
-        """Derivatives (P, nx, nu) of B over each parameter."""
+        """Derivatives (P, nx, nu) of B with respect to each parameter."""
         return self._all[1]
 
     @property
     def df0(self) -> Array:
-        """Derivatives (P, nx) of f0 over each parameter."""
+        """Derivatives (P, nx) of f0 with respect to each parameter."""
         return self._all[4]
 
     def poles(self, gain: Any = None) -> tuple[Array, Array]:
@@ -156,12 +164,12 @@ class Sensitivity:
         Parameters
         ----------
         gain : Gain or array_like (nu, nx), optional
-            K; zero by default.
+            Gain K; zero by default.
 
         Returns
         -------
-        poles, slopes : ndarray
-            NaN where poles coincide, which have no derivative: they part like a root.
+        poles, derivatives : ndarray
+            Derivatives are NaN for poles that coincide: such poles are not differentiable.
         """
         lin = self.lin
         K = np.zeros(lin.B.T.shape) if gain is None else getattr(gain, "K", gain)
@@ -180,35 +188,44 @@ class Sensitivity:
         return poles, slopes
 
     def check(self, names: Sequence[str] | None = None) -> dict[str, float]:
-        """Hold derivatives of A and B against differences of another route to them.
+        """Compare the derivatives of A and B with finite differences.
 
-        The robot is changed by small steps, and A and B are built from the derivatives of ABA.
+        The parameter is changed in small steps. At each step, A and B are computed independently,
+        from the derivatives of ABA.
 
         Parameters
         ----------
         names : sequence of str, optional
-            Parameters of bodies; all of them by default.
+            Parameters of links and bodies; by default all of them.
 
         Returns
         -------
         dict
-            {parameter: largest difference, relative to what it changes of A and B}: of the order
-            1e-9, the differences' own.
+            {parameter: largest difference, relative to the derivatives}. About 1e-9 is expected,
+            the accuracy of the finite differences.
         """
         if names is None:
             names = [name for name, one in self.parameters.items() if one.bodies]
         if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-            raise InputError(f"names is {names!r}, expected several, such as ['base.mass']")
+            raise InputError(f"names is {names!r}, expected a list, such as ['base.mass']")
         return {name: difference(self._slopes, self._one(name)) for name in names}
 
     def __str__(self) -> str:
-        """Tell what 10 % of each parameter changes, the most first; 1 cm of a centre of mass."""
+        """Return `table` with its default arguments."""
         return self.table()
 
     def table(self, top: int = 15, only: str | None = None) -> str:
-        """Return the `top` rows of what 10 % of a parameter changes, or 1 cm, the most first.
+        """Return a table of the parameters with the largest effect on A and B.
 
-        Only of ``mass``, ``link_3``, ``*.density``; bodies stand beside no links of theirs.
+        Each parameter is changed by 10 %, positions and centres of mass by 1 cm.
+
+        Parameters
+        ----------
+        top : int
+            Number of rows.
+        only : str, optional
+            Restriction to a kind, link or pattern: ``mass``, ``link_3``, ``*.density``. A body is
+            not listed beside its links.
         """
         shown = self.parameters.ranked(only)
         lin, sizes = self.lin, [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
@@ -223,20 +240,21 @@ class Sensitivity:
                 rows.append((max(effect), one.name, f"{one.value:.5g}", change, *shares))
         rows.sort(key=lambda row: -row[0])
         most = [row[1:] for row in rows[: whole("top", top, 1)]]
-        title = f"{lin.robot}: what changes A and B most, to first order, of the largest entry"
-        most = most or [("none of these changes them", *"    ")]
-        return f"{title}\n" + grid([("parameter", "is", "changed by", "A", "B"), *most], "lrrrr")
+        title = f"{lin.robot}: first-order change of A and B, relative to their largest entries"
+        most = most or [("no effect on A or B", *"    ")]
+        heads = ("parameter", "value", "changed by", "A", "B")
+        return f"{title}\n" + grid([heads, *most], "lrrrr")
 
     def save(self, path: str | Path) -> None:
-        """Write the derivatives to a .npz, .mat or .json file, whole or not at all.
+        """Write the derivatives to a .npz, .mat or .json file, atomically.
 
-        Besides the model's own keys parameters, units and values (P,), dA (P, nx, nx),
-        dB (P, nx, nu), dC, dD, df0 and dy0.
+        The file has the model's keys and these: parameters, units and values (P,),
+        dA (P, nx, nx), dB (P, nx, nu), dC, dD, df0 and dy0.
 
         Raises
         ------
         FileError
-            If the ending is another or the file cannot be written.
+            If the file has another ending or cannot be written.
         """
         every = self.parameters.values()
         record = record_of(self.lin) | {
@@ -249,27 +267,27 @@ class Sensitivity:
 
 
 def sensitivity(lin: LinearModel) -> Sensitivity:
-    r"""Differentiate a linear model over the parameters of its robot, exactly.
+    r"""Return the exact derivatives of a linear model with respect to the robot's parameters.
 
-    M and RNEA are linear in the dynamic parameters of bodies, so that derivatives of A, B and f0
-    are those of the linear model's own equations:
-    :math:`(M^{-1})_p = -M^{-1} M_p M^{-1}` and so on; docs/derivation.md has them.
+    M and RNEA are linear in the dynamic parameters of the bodies. The derivatives of A, B and f0
+    therefore follow from the equations of the linear model itself, such as
+    :math:`(M^{-1})_p = -M^{-1} M_p M^{-1}`; see docs/derivation.md.
 
     Parameters
     ----------
     lin : LinearModel
-        Made by `linearize` in this session, about any point and in any frame; of one that
-        `discretize` sampled, derivatives are those of its A, B and f0 over a sample.
+        Result of `linearize` in this session, about any point and in any frame. If `discretize`
+        sampled it, the sampled A, B and f0 are differentiated.
 
     Returns
     -------
     Sensitivity
-        Derivatives are computed when they are asked for.
+        Derivatives are computed at first access.
 
     Raises
     ------
     InputError
-        If the model is from a file.
+        If the model was loaded from a file.
     ModelError
         If the robot was changed after the model was made.
 
@@ -281,12 +299,18 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     ((18, 9), False)
     """
     if not isinstance(lin, LinearModel):
-        raise InputError(f"lin is a {type(lin).__name__}, expected a LinearModel of linearize")
+        raise InputError(
+            f"lin is a {type(lin).__name__}, expected a LinearModel; fflin.linearize returns one"
+        )
     robot = lin._robot
     if robot is None:
-        raise InputError("the model is from a file, without its robot; make it with linearize")
+        raise InputError(
+            "the model was loaded from a file, which contains no robot; linearise the robot again"
+        )
     source = lin.generator
     if source is None:
-        raise InputError("the model is sampled from one that is not known; make it by discretize")
+        raise InputError(
+            "the continuous model of this sampled model is not known; sample one with discretize"
+        )
     lin.require_unchanged()
     return Sensitivity(lin, Parameters(robot), ModelSlopes(lin, robot, source))

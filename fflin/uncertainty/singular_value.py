@@ -1,7 +1,8 @@
-"""Upper bounds of the structured singular value of parameters that are real and repeated.
+"""Upper bounds of the structured singular value for real repeated parameters.
 
-Of real ones it jumps with the frequency, where a pole crosses the axis, and values at a grid's own
-frequencies say nothing of those between. So each interval has one scaling for all of it.
+For real parameters it is discontinuous in the frequency, if a pole crosses the axis. Values on a
+grid of frequencies then say nothing about the frequencies between. So one scaling is used for each
+whole interval.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def largest_bound(
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
     def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
-        """Return the bound of an interval and what gives it, and that of its middle alone."""
+        """Return the bound of an interval with its scaling, and the bound of its middle alone."""
         Z = response(np.linspace(a, b, _HELD))
         middle = Z[_HELD // 2]
         found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]
@@ -84,7 +85,7 @@ def largest_bound(
 
 
 def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
-    """Return scalings that are good for Z, with those of AB13MD where blocks are told."""
+    """Return scalings that are good for Z, with the scaling of AB13MD if blocks are given."""
     none: Array = np.zeros(len(Z))
     found: list[Scaling] = [(perron(Z)[:, 0], none)]
     if len(Z) == 1 and len(blocks) and Z[0, 0].imag:

@@ -1,4 +1,4 @@
-"""A robot with uncertain parameters: its linear-fractional form, its samples, its worst."""
+"""Robot with uncertain parameters: linear-fractional model, samples and worst case."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ _TRIES = 1000
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Uncertain:
-    """A robot some of whose parameters lie in ranges; made by `uncertain`.
+    """Robot with uncertain parameters, each in a range; made by `uncertain`.
 
     Attributes
     ----------
     robot : Robot
-        As it is.
+        The nominal robot.
     blocks : tuple of Block
-        What one delta varies each: a parameter, or several that are tied.
+        Blocks of the uncertainty. One delta varies each block: a parameter, or several tied
+        parameters.
 
     Examples
     --------
@@ -58,7 +59,7 @@ class Uncertain:
         return f"Uncertain('{self.robot.name}', {len(self.ranges)} parameters)"
 
     def __str__(self) -> str:
-        rows: list[tuple[str, ...]] = [("parameter", "is", "least", "largest", "")]
+        rows: list[tuple[str, ...]] = [("parameter", "nominal", "least", "largest", "")]
         for name, unit, middle, half, ranges in self.blocks:
             tied = len(ranges) > 1
             now = "" if tied else f"{ranges[0].parameter.value:.6g}"
@@ -69,12 +70,12 @@ class Uncertain:
 
     @property
     def ranges(self) -> tuple[Range, ...]:
-        """Parameters with the `middle` of each range and `half` its width, block by block."""
+        """Ranges of the parameters, block by block: `middle` and half width `half` of each."""
         return tuple(each for block in self.blocks for each in block.ranges)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the blocks: of a parameter, or the pattern of those that are tied."""
+        """Names of the blocks: the parameter's name, or the pattern of tied parameters."""
         return tuple(block.name for block in self.blocks)
 
     def lft(self, q: Array | None = None) -> LFT:
@@ -88,8 +89,9 @@ class Uncertain:
         Raises
         ------
         InputError
-            If the point is no fixed point whatever the parameters: springs out of rest, gravity, an
-            orbit, stored momentum; or if an output feels accelerations or masses.
+            If an output depends on accelerations or masses, or the point is not a fixed point for
+            all parameters. The latter happens with gravity, an orbit, stored momentum or a
+            deflected spring.
         """
         robot = self.robot
         lin = linearize(robot, q)
@@ -97,29 +99,30 @@ class Uncertain:
         pulled = [rest[each.parameter.spring] for each in self.ranges if each.parameter.spring >= 0]
         pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
         if any(pulled):
-            pulls = "gravity" if any(robot.gravity) else "a spring out of its rest"
-            pulls = "the field of an orbit" if robot.orbit else pulls
+            pulls = "gravity" if any(robot.gravity) else "a spring that is not at its rest position"
+            pulls = "an orbit" if robot.orbit else pulls
             raise InputError(
-                "the point is no fixed point whatever the parameters: there is "
-                f"{'stored momentum' if robot.stored_momentum else pulls}; take a point at rest "
-                "without, or samples(n), and linearise each"
+                "the point is not a fixed point for all values of the parameters: there is "
+                f"{'stored momentum' if robot.stored_momentum else pulls}; give a robot at rest "
+                "without it, or linearise each robot of samples(n)"
             )
         return _lft(self, lin)
 
     def at(self, values: Mapping[str, float]) -> Robot:
-        """Return the robot of {parameter or pattern: value}; those that are not named stay.
+        """Return the robot with the parameters {parameter or pattern: value}.
 
-        The pattern of tied parameters takes their common value, or the factor of what they are.
+        Parameters that are not named keep their nominal values. The pattern of tied parameters
+        takes their common value, or a common factor on their nominal values.
 
         Raises
         ------
         InputError
-            If a body of these is no rigid body.
+            If the inertia of a body is then not physically realisable.
         """
         return self._variants.robot(self._each(numbers("values", values, "parameter", "value")))
 
     def _each(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return {parameter: value} of what names and patterns stand for."""
+        """Return {parameter: value} with names and patterns expanded."""
         known, found = self._variants.parameters, dict[str, float]()
         blocks = {each.name: each for each in self.blocks if each.name not in known}
         for key, value in values.items():
@@ -130,7 +133,7 @@ class Uncertain:
         return found
 
     def makes(self, delta: Array) -> bool:
-        """Whether there is a robot of deltas (k,)."""
+        """Return whether the deltas (k,) give a physically realisable robot."""
         return not self._refusal(delta)
 
     def _refusal(self, delta: Array) -> str:
@@ -139,7 +142,10 @@ class Uncertain:
         return self._variants.refusal({name: x for of in of_blocks for name, x in of.items()})
 
     def draws(self, n: int, *, seed: int = 0) -> tuple[Array, int]:
-        """Return deltas (n, k) of robots, uniform in their ranges, and how many made none."""
+        """Return deltas (n, k) drawn uniformly from the ranges, and the number of rejected draws.
+
+        A draw is rejected if its robot is not physically realisable.
+        """
         count, draw = whole("n", n, 1), np.random.default_rng(whole("seed", seed, 0))
         found, lost = list[Array](), 0
         while len(found) < count:
@@ -148,15 +154,15 @@ class Uncertain:
                 lost += 1
                 if lost >= _TRIES * (len(found) + 1):
                     raise InputError(
-                        f"of {lost} robots in these ranges {len(found)} were physical: {why}; give "
-                        "narrower ranges"
+                        f"of {lost + len(found)} robots drawn from these ranges, only {len(found)} "
+                        f"are physically realisable: {why}; give narrower ranges"
                     )
                 continue
             found.append(delta)
         return np.array(found), lost
 
     def values(self, delta: Array) -> dict[str, float]:
-        """Return {name: value} of deltas (k,), as `at` takes them."""
+        """Return {name: value} for deltas (k,), in the form that `at` takes."""
         pairs = zip(self.blocks, delta, strict=True)
         return {each.name: float(each.middle + each.half * d) for each, d in pairs}
 
@@ -166,40 +172,43 @@ class Uncertain:
         Parameters
         ----------
         n : int
+            Number of robots.
         seed : int
-            The same seed draws the same.
+            The same seed gives the same robots.
 
         Returns
         -------
         list of Robot
-            What makes no rigid body, its pseudo-inertia not positive, is drawn again.
+            Only physically realisable robots. A draw is repeated if the pseudo-inertia of a body
+            is not positive definite.
 
         Raises
         ------
         InputError
-            If hardly any draw is physical.
+            If almost no draw is physically realisable.
         """
         return [self.at(self.values(delta)) for delta in self.draws(n, seed=seed)[0]]
 
     def worst(
         self, gain: Any, q: Array | None = None, *, samples: int = 200, seed: int = 0
     ) -> Worst:
-        """Search the worst loop u = -K x over the set, and bound how far the set is safe.
+        """Search for the worst closed loop u = -K x over the set, and bound the stable set.
 
-        No corner and no draw that was tried is worse than what is returned, gains to five digits.
-        More samples with the same seed begin with those of fewer, and never find less.
+        No corner or draw that was tried is worse than the result; gains are exact to five digits.
+        A search with more samples and the same seed repeats the smaller search first, so its
+        result is at least as bad.
 
         Parameters
         ----------
         gain : Gain or array_like (nu, nx)
-            K, which makes the loop of the middle of the ranges stable.
+            Gain K. It must stabilise the robot at the middle of the ranges.
         q : array_like (nq,), optional
-            As of `lft`.
+            Configuration, as in `lft`.
         samples : int
-            Draws. Corners are tried before them, and a local search goes on from each that is worse
-            than what was found until then.
+            Number of random draws, tried after the corners of the set. A local search starts from
+            each loop that is worse than all loops before it.
         seed : int
-            The same seed draws the same.
+            The same seed gives the same draws.
 
         Returns
         -------
@@ -208,24 +217,30 @@ class Uncertain:
         Raises
         ------
         InputError
-            If K has a wrong size or the loop in the middle is unstable; else as of `lft`.
+            If K has a wrong size, or the loop at the middle of the ranges is unstable; otherwise
+            as in `lft`.
         """
         return searched(self, self.lft(q), gain, whole("samples", samples, 1), seed)
 
 
 def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
-    """Say which parameters of a robot are uncertain, and how much.
+    """Define the uncertain parameters of a robot and their ranges.
 
     Parameters
     ----------
     robot : Robot
     ranges : mapping
-        {parameter: range}, the parameters those of `sensitivity`, or patterns; ``BODY.mass`` of
-        `monte_carlo` is a ``density`` here. A number is a
-        relative half width, 0.2 for 20 %; a pair the least and the largest value. ``{link:
-        {"mass": .., "inertia.xx": ..}}`` says several of a link. A pattern gives each of its
-        parameters a delta of its own; ``{"range": 0.2, "tied": True}`` gives them one: all of them
-        are multiplied by the same factor or, of a pair, have the same value.
+        {parameter or pattern: range}, with the parameters of `sensitivity`. The ``BODY.mass`` of
+        `monte_carlo` is called ``BODY.density`` here. A range is one of
+
+        - a number: the relative half width, such as 0.2 for 20 %;
+        - a pair: the least and the largest value;
+        - ``{"range": 0.2, "tied": True}``, for a pattern: its parameters are tied.
+
+        Several parameters of a link may be given as ``{link: {"mass": .., "inertia.xx": ..}}``. By
+        default, each parameter of a pattern varies independently, with a separate delta. Tied
+        parameters share one delta. With a relative range they are multiplied by a common factor;
+        with a pair they have a common value.
 
     Returns
     -------
@@ -234,16 +249,20 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     Raises
     ------
     UnknownNameError
-        If there is no such parameter.
+        If a parameter does not exist.
     InputError
-        If a range is empty, is relative to 0, has no physical robot in its middle, or masses,
-        densities or inertias of wheels not above 0, stiffness or damping below it; if a parameter
-        is tied and has another range too.
+        If one of these holds:
+
+        - a range is empty, or relative to a nominal value of 0;
+        - the robot at the middle of the ranges is not physically realisable;
+        - a mass, density or wheel inertia may become 0 or less;
+        - a stiffness or damping may become negative;
+        - a tied parameter has another range too.
 
     References
     ----------
     P. M. Wensing, S. Kim and J.-J. E. Slotine, IEEE Robotics and Automation Letters 3(1), 2018, on
-    when an inertia is that of a body.
+    the physical realisability of an inertia.
 
     Examples
     --------
@@ -274,40 +293,52 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     made = Uncertain(robot, (*alone.values(), *together), variants)
     _refuse_overlap(variants.pieces, made.ranges)
     if why := made._refusal(np.zeros(len(made.blocks))):
-        raise InputError(f"the middle of the ranges is no robot: {why}")
+        raise InputError(
+            f"the robot at the middle of the ranges is not physically realisable: {why}; give "
+            "other ranges"
+        )
     return made
 
 
 def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> None:
     names = [each.parameter.name for each in ranges]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"'{twice[0]}' is tied to others and has another range; give one of them")
+        raise InputError(
+            f"'{twice[0]}' is tied to other parameters and also has another range; give only one "
+            "of the two"
+        )
     asked = {each.parameter.of for each in ranges} & pieces.keys()
     for name, other in permutations(asked, 2):
         if pieces[name].whole and pieces[name].joint == pieces[other].joint:
-            raise InputError(f"'{other}' is a link of the body '{name}'; give one of them")
+            raise InputError(
+                f"'{other}' is a link of the body '{name}'; give ranges for only one of the two"
+            )
 
 
 def _range(one: Parameter, value: Any) -> Range:
     if one.part[:9] == "direction":
-        said = "turns a unit vector, in which the model is no fraction; see sensitivity"
+        said = (
+            "turns a unit vector, on which the model depends in no rational form; use sensitivity"
+        )
         raise InputError(f"'{one.name}' {said}")
     if isinstance(value, tuple | list):
         least, largest = vector(f"range of '{one.name}'", value, 2, "(least, largest)").tolist()
     else:
         share = number(f"range of '{one.name}'", value)
         if not one.value:
-            raise InputError(f"'{one.name}' is 0, of which a share is 0; give (least, largest)")
+            raise InputError(
+                f"'{one.name}' is 0, so a relative range is empty; give (least, largest)"
+            )
         least, largest = sorted((one.value * (1.0 - share), one.value * (1.0 + share)))
-    expected = "" if least < largest else "less and more"
+    expected = "" if least < largest else "least less than largest"
     if least < 0.0 and one.part in ("stiffness", "damping"):
-        expected = "0 or more"
+        expected = "values of 0 or more"
     if least <= 0.0 and one.part in ("mass", "density", "inertia"):  # the last is a wheel's
-        expected = "more than 0"
+        expected = "values above 0"
     if expected:
         raise InputError(
-            f"range of '{one.name}' is from {least:g} to {largest:g}, expected {expected}; 20 % is "
-            "0.2, ends are (least, largest) or LEAST:LARGEST"
+            f"range of '{one.name}' is {least:g} to {largest:g}, expected {expected}; give a "
+            "relative half width, such as 0.2 for 20 %, or (least, largest), or LEAST:LARGEST"
         )
     return Range(one, 0.5 * (least + largest), 0.5 * (largest - least))
 
@@ -323,8 +354,9 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
     if isinstance(value, tuple | list):
         if len(units) > 1:
             raise InputError(
-                f"the tied parameters of '{key}' have units {', '.join(sorted(units))}, of which "
-                "no value is common; give a relative range, 0.2 for 20 %"
+                f"the tied parameters of '{key}' have different units, "
+                f"{', '.join(sorted(units))}, so they cannot have a common value; give a relative "
+                "range, such as 0.2 for 20 %"
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
     share = abs(float(value))
@@ -336,8 +368,8 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
 def _lft(of: Uncertain, lin: Any) -> LFT:
     ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
     if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in of.robot.outputs):
-        feels = "an output feels accelerations or weighs the robot; leave it out"
-        raise InputError(f"{feels} with robot.replace(outputs=)")
+        feels = "an output depends on accelerations or masses, which the LFT cannot represent"
+        raise InputError(f"{feels}; remove it with robot.replace(outputs=)")
     form = fraction(ready.map, ready.actuation, lin.q, of._variants.pieces, of.ranges)
     nv, nw = len(lin.A) // 2, len(form.z[0])
     x, w, u = form.a

@@ -1,4 +1,4 @@
-"""Robots of other parameters, each link still a rigid body."""
+"""Robots with changed parameters, each link physically realisable."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _ROUNDING = 1e-9
 
 
 class Variants:
-    """The robots that one becomes with other parameters."""
+    """Variants of a robot with changed parameters."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self.parameters = robot, Parameters(robot)
         self.pieces = pieces_of(robot)[0]
 
     def refusal(self, values: Mapping[str, float]) -> str:
-        """Say why {parameter: value} make no robot; nothing where they do."""
+        """Return why {parameter: value} are not physically realisable, or an empty string."""
         try:
             changed = self._changed(values)
             if self._robot.wheels:  # which a carrier may be too light for
@@ -59,7 +59,7 @@ class Variants:
                 changed, density = found[name] = _piece(self.pieces[name], own)
                 why = _no_body(self.pieces[name], changed, name)
                 if not density > 0.0:
-                    why = f"the density of '{name}' is {density:.4g} of what it was"
+                    why = f"the density of '{name}' has the factor {density:.4g}, expected above 0"
                 if why:
                     raise InputError(why)
         return found
@@ -109,7 +109,7 @@ def _piece(piece: Piece, parts: Mapping[str, float]) -> tuple[Piece, float]:
 def _no_body(before: Piece, piece: Piece, name: str) -> str:
     """Return why a link is not a rigid body; nothing if it is, or is no less than it was."""
     if not piece.mass > 0.0:
-        return f"the mass of '{name}' is {piece.mass:.4g} kg"
+        return f"the mass of '{name}' is {piece.mass:.4g} kg, expected above 0"
     if (piece.inertia == before.inertia).all():  # a point mass has none
         return ""
     was, least = (

@@ -1,4 +1,4 @@
-"""The worst loop over a set of robots: found by search, and how far the set is surely stable."""
+"""Worst-case search over a set of robots, and a guaranteed bound of the stable set."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Figure: TypeAlias = Callable[[Array], Array]  # how bad loops are, of rows of de
 
 
 class Figures(NamedTuple):
-    """How bad loops are: by a few frequencies, by all, and which are worse than a bound."""
+    """Criterion of a loop: by a few frequencies, by all, and loops worse than a bound."""
 
     quick: Figure
     exact: Figure
@@ -38,7 +38,7 @@ class Figures(NamedTuple):
 
 @dataclass(frozen=True)
 class Found:
-    """The worst of one figure over the set, and the parameters that it is of."""
+    """Worst value of one criterion over the set, and the parameters that attain it."""
 
     value: float
     parameters: Mapping[str, float]
@@ -46,24 +46,25 @@ class Found:
 
 @dataclass(frozen=True)
 class Worst:
-    """The worst loop over a set of robots; prints in words.
+    """Worst-case closed loops over a set of robots; print it for a report.
 
     Attributes
     ----------
     damping : Found
         Least damping ratio of a pole.
     margin : Found
-        Least disk margin at the inputs, see `Gain.margins`; 0 where a loop is unstable.
+        Least disk margin at the inputs, see `Gain.margins`; 0 if a loop is unstable.
     gain : Found
         Largest gain over all frequencies from a disturbance at the inputs to the outputs.
     unstable : int
-        Of the loops tried, how many were unstable.
+        Number of unstable loops among those tried.
     tried, excluded : int
-        Loops tried, and draws and corners left out because they make no rigid bodies.
+        Number of loops tried, and of draws and corners excluded because they are not physically
+        realisable.
     safe : float
-        The loop is stable for all ranges widened about their middles by this factor, by an upper
-        bound of the structured singular value over intervals of frequencies, each held at five of
-        them; 1 or more is all of the set.
+        Factor by which all ranges may be scaled about their middles with the loop still stable. A
+        value of 1 or more covers the whole set. It follows from an upper bound of the structured
+        singular value over intervals of frequency, evaluated at five frequencies in each.
     """
 
     damping: Found
@@ -76,8 +77,8 @@ class Worst:
 
     def __str__(self) -> str:
         lines = [
-            f"of {self.tried} loops tried {self.unstable} were unstable; "
-            f"{self.excluded} draws and corners make no rigid bodies"
+            f"{self.unstable} of {self.tried} loops tried are unstable; "
+            f"{self.excluded} draws and corners excluded as not physically realisable"
         ]
         for what, found in (
             ("least damping ratio", self.damping),
@@ -87,9 +88,11 @@ class Worst:
             at = ", ".join(f"{name} {value:.4g}" for name, value in found.parameters.items())
             lines.append(f"{what} {found.value:.4g} at {at}")
         if self.safe >= 1.0:
-            lines.append(f"stable on all of the set, up to {self.safe:.3g} times as wide (bound)")
+            lines.append(
+                f"guaranteed stable on the whole set, and on ranges {self.safe:.3g} times as wide"
+            )
         else:
-            lines.append(f"stable on {100.0 * self.safe:.3g} % of each range (bound)")
+            lines.append(f"guaranteed stable on {100.0 * self.safe:.3g} % of each range")
         return folded(lines)
 
 
@@ -102,7 +105,9 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     size, loops = len(lft.repeats), Loops(lft, K)
     middle = np.zeros((1, size))
     if loops.undamped(middle)[0] >= 0.0:
-        raise InputError("the loop in the middle of the ranges is unstable; give another gain")
+        raise InputError(
+            "the closed loop at the middle of the ranges is unstable; give a stabilising gain"
+        )
     draws, excluded = of.draws(samples, seed=seed)
     if 2**size <= _CORNERS:
         corners = np.array(list(product((-1.0, 1.0), repeat=size)))
@@ -215,7 +220,7 @@ def _largest(figures: Figures, tried: Array, makes: Callable[[Array], bool]) -> 
 
 
 def _climbed(figures: Figures, start: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
-    """Climb along the slope of a figure and one delta at a time."""
+    """Climb along the gradient of a figure and one delta at a time."""
     quick, exact, _ = figures
     value, delta, unit = float(exact(start[None])[0]), start, np.eye(len(start))
     for _ in range(_STEPS):

@@ -150,7 +150,7 @@ def test_regulators_hold_the_orbits_terms(n):
         A = model.A - model.B @ gain.K
         beyond = np.linalg.eigvals(A)
         assert (np.abs(beyond).max() < 1.0) if model.dt else (beyond.real.max() < 0.0)
-    assert "damping is counted" not in str(fflin.lqr(lin))
+    assert "joint damping is included" not in str(fflin.lqr(lin))
     with pytest.raises(fflin.EquilibriumError):
         fflin.lqr(fflin.linearize(robot))
 

@@ -376,14 +376,14 @@ def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp
         "no input or state named 'tau_x'": {"limits": {"tau_x": 1.0}},
         "limit of 'tau_b' is": {"limits": {"tau_b": (1.0, -1.0)}},
         "horizon is 0": {"horizon": 0},
-        "horizon is 1000000, expected fewer": {"horizon": 1_000_000},
+        "horizon is 1000000 samples": {"horizon": 1_000_000},
         "dt is missing": {"dt": None},
         "dt is -1 s": {"dt": -1.0},
-        "the point is beyond the limits of q_m.joint_1": {"limits": {"q_m.joint_1": (0.1, 0.2)}},
-        "the point is beyond the limits of tau_b.x": {"limits": {"tau_b": (0.1, 0.2)}},
+        "the point exceeds the limits of q_m.joint_1": {"limits": {"q_m.joint_1": (0.1, 0.2)}},
+        "the point exceeds the limits of tau_b.x": {"limits": {"tau_b": (0.1, 0.2)}},
         "Qf is 'nosuch'": {"Qf": "nosuch"},
         "limits is 'nosuch'": {"limits": "nosuch"},
-        "give Q and R, both": {"R": None},
+        "give both Q and R": {"R": None},
     }
     for said, given in wrong.items():
         with pytest.raises(fflin.FflinError, match=said):

@@ -182,7 +182,7 @@ def test_speeds_keep_within_limits_between_knots(one_joint, knots, spin):
     assert missed(robot, motion, goal) < 1e-6
     said = " ".join(str(motion).split())
     assert "integrated motion exceeds" in said
-    if found := re.search(r"exceeds that of qdot_m\.joint_1 by (\S+) %", said):
+    if found := re.search(r"exceeds the limit of qdot_m\.joint_1 by (\S+) %", said):
         assert largest >= (1.0 + 0.009 * float(found[1])) * limit
 
 
@@ -192,7 +192,9 @@ def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monke
     options = {"knots": 6, "hold": "linear", "limits": SPEEDS}
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.1)
     motion = fflin.plan(robot, (goal, None), 10.0, **options)
-    found = re.search(r"exceeds that of qdot_m\.joint_1 by (\S+) %", " ".join(str(motion).split()))
+    found = re.search(
+        r"exceeds the limit of qdot_m\.joint_1 by (\S+) %", " ".join(str(motion).split())
+    )
     fine = [
         motion.flow.end(k, 8, motion.q[k], motion.v[k], (0.0, part / 16))[1][6]
         for k in range(5)

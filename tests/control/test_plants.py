@@ -25,8 +25,8 @@ def nominal():
 
 def told(result):
     (note,) = result.notes
-    start = "the controller is one of 'ets_vii', the robot another: the accelerations that its "
-    assert note.startswith(start + "inputs cause differ by up to ") and note.endswith(" %")
+    start = "the robot differs from 'ets_vii' of the controller's design: accelerations due to "
+    assert note.startswith(start + "inputs differ by up to ") and note.endswith(" %")
     assert note in motion_report(result).replace("\n  ", " ")
     return float(note.split()[-2])
 
@@ -102,7 +102,7 @@ def test_what_is_said_of_a_robot_beside_its_urdf_makes_another(change, what, per
     lin = lin.discretize(dt) if dt else lin
     policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
     (note,) = notes_of(policy, changed_servicer(**change))
-    far = float(re.search(f"that its {what} cause differ by up to (.+?) %", note)[1])
+    far = float(re.search(f"due to {what} differ by up to (.+?) %", note)[1])
     assert far > 1.0
     assert dt or percent is None or far == pytest.approx(percent, rel=0.1)
     assert notes_of(policy, changed_servicer()) == ()
@@ -266,7 +266,7 @@ def test_in_orbit_what_is_next_to_nothing_does_not_count(dt):
 
     def far(robot):
         (note,) = notes_of(policy, robot)
-        return float(re.search("that its states cause differ by up to (.+?) %", note)[1])
+        return float(re.search("due to states differ by up to (.+?) %", note)[1])
 
     assert notes_of(policy, held) == ()
     assert 1.0 < far(heavier) < 9.0 < far(half)

@@ -105,7 +105,7 @@ def test_poles_of_a_sampled_loop_are_shown_as_rates():
     shown = axes.get_lines()[0]
     z = np.exp(0.1 * (shown.get_xdata() + 1j * shown.get_ydata()))
     np.testing.assert_allclose(np.sort_complex(z), np.sort_complex(gain.poles), rtol=1e-12)
-    assert "poles z of A - B K as rates ln(z)/dt" in [text for text, _ in texts(figure)]
+    assert "poles of A - B K as ln(z)/dt" in [text for text, _ in texts(figure)]
 
 
 def test_what_has_no_poles_is_one_line():

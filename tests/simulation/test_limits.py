@@ -350,8 +350,8 @@ def test_limits_that_cannot_hold_the_robot_are_said_before_the_run():
     lin = fflin.linearize(robot, q, u=u)
     gain = fflin.lqr(lin, weights="identity")
     policy = fflin.StateFeedback(lin, gain.K)
-    said = f"the limits do not hold 'canadarm2' at its target: {names[most]} is asked for "
-    said += f"{u[most]:.3g} N m, limit {np.sign(u[most]) * small:g}"
+    said = f"the input limits are too small for 'canadarm2' at its target: {names[most]} requires "
+    said += f"{u[most]:.3g} N m, its limit is {np.sign(u[most]) * small:g}"
     with pytest.warns(fflin.FflinWarning, match=re.escape(said)) as told:
         fflin.simulate(robot, policy, q0=q, duration=0.02, limits="urdf")
     assert len(told) == 1
