@@ -1,4 +1,4 @@
-"""A plan as the arrays that the compiled loop reads."""
+"""Conversion of a plan into the arrays that the compiled loop reads."""
 
 from __future__ import annotations
 
