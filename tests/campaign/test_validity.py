@@ -296,7 +296,7 @@ def test_bad_input(arm):
         with pytest.raises(fflin.InputError, match=words):
             fflin.validity(arm, lin, gain, **options)
     gone = fflin.linearize(arm, v=fflin.velocity(arm, {"omega_b.z": 0.1}))
-    with pytest.raises(fflin.InputError, match="fixed point"):
+    with pytest.raises(fflin.InputError, match="equilibrium at rest"):
         fflin.validity(arm, gone, gain)
 
 
