@@ -1,4 +1,4 @@
-"""Eigenpairs of a linear model: of its symmetric stiffness at rest, or of A without its zeros."""
+"""Eigenpairs of a linear model: from its stiffness at rest, or from A without its zeros."""
 
 from __future__ import annotations
 

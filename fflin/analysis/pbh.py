@@ -1,4 +1,4 @@
-"""What inputs reach and outputs show, pole by pole, as Popov, Belevitch and Hautus test it."""
+"""Controllable and observable subspaces by the Popov-Belevitch-Hautus test, pole by pole."""
 
 from typing import NamedTuple
 

@@ -198,7 +198,7 @@ class Campaign(FrozenArrays):
             if found.shape != (len(self),) or found.dtype != bool:
                 raise InputError(
                     f"condition has shape {found.shape} of {found.dtype}, expected a text such as "
-                    f"'attitude < 1 deg', or an array of {len(self)} booleans"
+                    f"'attitude < 1 deg', or ({len(self)},) booleans"
                 )
             return found
         met = ~self.stopped

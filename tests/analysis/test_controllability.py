@@ -78,7 +78,7 @@ def test_unactuated_base_leaves_the_twelve_of_momentum(robots):
         *(f"angular momentum {axis}" for axis in "xyz"),
         *(f"linear momentum {axis}" for axis in "xyz"),
     )
-    assert found.uncontrollable[6] == "base attitude x with the joints held"
+    assert found.uncontrollable[6] == "base attitude x with the joints fixed"
     assert found.controllable == tuple(
         s for s in lin.state_names if s.startswith(("q_m", "qdot_m"))
     )
