@@ -96,7 +96,7 @@ def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
     """Say where rounding decides whether the slowest motion decays."""
     return tuple(
         f"undecided: whether {shape(lin, at)} decays by itself, at {ratio:.1g} times its "
-        f"rounding error, so the model is {what} or not"
+        f"rounding error; the model is {what} or not {what}"
         for ratio, at, _ in settling.doubts
     )
 

@@ -237,12 +237,12 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
         axes.set(xscale="log", ylim=(max(len(names), 1) - 0.5, -0.5))
         axes.set_xlabel("relative error (dot) and tolerance (bar)")
         held = (
-            f"FAILED: {len(bad)} of {len(check.rows)} errors exceed their tolerance"
+            f"FAILED: {len(bad)} of {len(check.rows)} exceed their tolerance"
             if bad
             else (f"OK: {len(check.rows)} errors within tolerance")
         )
         exact = len(check.rows) - len(rows)
-        axes.set_title(f"{check.title}\n{held}; {exact} are exactly zero and not drawn", loc="left")
+        axes.set_title(f"{check.title}\n{held}; {exact} are zero, not drawn", loc="left")
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)
     return figure
 

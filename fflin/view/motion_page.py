@@ -1,4 +1,4 @@
-"""From a motion to what its page shows: the robots in the scene, and the figures beside them."""
+"""The page of a motion: the robots in the scene, and the panel of figures beside them."""
 
 from __future__ import annotations
 

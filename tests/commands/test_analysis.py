@@ -15,7 +15,7 @@ def test_joints_only_says_what_is_conserved(tmp_path):
     assert says(out, "12 of 24", "not stabilizable")
     assert says(out, "angular momentum x/y/z, linear momentum x/y/z")
     assert says(out, "base attitude x/y/z")
-    assert says(out, "loops")
+    assert says(out, "periodic joint motion")
     assert says(out, "6 momenta") and says(out, "12 states")
     assert max(map(len, out.splitlines())) <= 80
 
