@@ -41,7 +41,7 @@ def checked(lin: LinearModel) -> LinearModel:
 
 
 def warn_of_stiffness(lin: LinearModel) -> None:
-    """Warn where a vibration is so fast that an orbit's field is in the rounding beside it."""
+    """Warn if a vibration is so fast that orbital effects are within its rounding error."""
     nv, size = len(lin.M), np.sqrt(lin.M.diagonal())
     fastest = float((np.abs(slopes(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
     if 0.0 < lin.mean_motion < _SLOWEST * fastest:

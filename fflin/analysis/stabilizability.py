@@ -146,7 +146,7 @@ def _left_null(matrix: Array) -> tuple[Array, Margin]:
 
 
 def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
-    """Say what the conserved momenta W M nu, W (k, nv), are those of; None of another model."""
+    """Name the coordinates of the conserved momenta W M nu, W (k, nv); None for other models."""
     names = lin.state_names[-len(lin.M) :]
     if names[:3] == _BASE_VELOCITIES[:3] and names[3:4] != ("v_b.x",):
         # The position has left, which nothing pushes.

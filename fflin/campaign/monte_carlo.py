@@ -241,7 +241,7 @@ def monte_carlo(
 
 
 def _goals(given: Any, until: Any, shapes: Any, header: dict[str, Any]) -> list[str]:
-    """Return the goals; what is none is refused before anything is done."""
+    """Return the goals; an invalid goal is refused before any run."""
     goals = [given] if isinstance(given, str) else given
     if not isinstance(goals, list | tuple):
         said = f"goals is a {type(given).__name__}"
@@ -333,7 +333,7 @@ def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
 
 
 def _header(job: CampaignJob) -> dict[str, Any]:
-    """Return what a campaign has beside its arrays."""
+    """Return the header of a campaign: all that is not an array."""
     plan, plant = job.plan, job.plant
     wheels = {f"q_m.{name}" for name in plant.robot.wheels}
     steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - wheels}

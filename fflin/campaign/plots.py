@@ -127,7 +127,7 @@ def _goals(draw: Any, campaign: Campaign, *names: str) -> None:
 
 
 def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
-    """Draw how an error is spread, at last and at its worst, of the runs that were not stopped."""
+    """Draw histograms of the final and the worst error of the completed runs."""
     names = {kind: ("final", _INK), f"worst {kind}": ("worst of run", COLORS[1])}
     of = {name: campaign.values(name)[~campaign.stopped] for name in names}
     values = np.append(list(of.values()), 0.0)
@@ -164,7 +164,7 @@ def _inputs(
 
 
 def _whence(axes: Axes, campaign: Campaign) -> None:
-    """Draw what the worst runs go with, beside what is drawn alike by chance."""
+    """Draw rank correlations with the default figure, and the band of chance correlations."""
     found = list(campaign.sensitivity().items())[:_BARS][::-1]
     doubt = min(1.0, 3.0 / math.sqrt(len(campaign)))
     axes.axvspan(-doubt, doubt, color="#999999", alpha=0.18, lw=0)

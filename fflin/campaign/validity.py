@@ -261,7 +261,7 @@ def validity(
 def _displaced(
     loop: Loop, largest: dict[str, float], seed: int, levels: Array | None, runs: Any, *at: int
 ) -> Draws:
-    """Return where some runs begin, beside the point, each by a random stream of its own."""
+    """Return the displaced starts of some runs, each from its own random stream."""
     drawn, runs = [], runs[slice(*at)]
     for run in runs.tolist():
         stream, level = run // len(_LEVELS), _LEVELS[run % len(_LEVELS)]
@@ -303,7 +303,7 @@ def _judged(
 
 
 def _slope(errors: Array) -> float:
-    """Return the order of the error itself, one more than that of the relative error."""
+    """Return the order of the absolute error, one more than the order of the relative error."""
     if not errors[:4].min() > _ROUNDING:
         return np.nan
     return 1.0 + float(np.polyfit(np.log(_LEVELS[:4]), np.log(errors[:4]), 1)[0])

@@ -62,7 +62,7 @@ def _require_met(
 
 
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return rows of another robot as those of this: joints that it lacks stand where they were."""
+    """Return another robot's rows in this robot's coordinates; joints that it lacks stand still."""
     own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
     for name in list(robot.model.names)[ROOT:]:
         if other.model.existJointName(name):
@@ -111,7 +111,7 @@ def _longer(whole: Any, motion: Any, name: str) -> Any:
 
 
 def _inputs(whole: Any, state: StateMap, motion: Any, there: StateMap) -> Array:
-    """Return a motion's inputs (N, nu) as those of the whole: what it lacks is zero."""
+    """Return a motion's inputs (N, nu) in the order of the whole; inputs that it lacks are zero."""
     if more := [name for name in motion.input_names if name not in whole.input_names]:
         raise InputError(
             f"a phase has the input {more[0]}, which the first phase lacks; give the first robot "

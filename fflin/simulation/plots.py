@@ -34,7 +34,7 @@ _GROUPS = {
 
 
 class Signals(NamedTuple):
-    """Histories (N, k) with names GROUP.NAME, limits (2,) by name, and what they go beside."""
+    """Histories (N, k) with names GROUP.NAME, limits (2,), linear prediction and reference."""
 
     values: Array
     names: Sequence[str]
@@ -171,7 +171,7 @@ def _histories(
 def _curve(
     axes: Axes, t: Array, of: Signals, i: int, gaps: Sequence[int] = (), **look: Any
 ) -> None:
-    """Draw a column over its pale reference and below that of the linear model, dashed."""
+    """Draw a column over its pale reference, and the linear prediction dashed on top."""
     dashed = {"ls": "--", "lw": 1.0}
     for x, own in ((of.reference, _PALE), (of.values, look), (of.linear, dashed)):
         if x is not None:

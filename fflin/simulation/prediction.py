@@ -169,7 +169,7 @@ def _states(predictor: Predictor, plan: Any, x: Array, steps: int) -> Array:
 
 
 def _after(dt: float, e: Array, slope: Callable[[int, Array], Array]) -> Array:
-    """Return e a step later, by the classical Runge-Kutta method, of its slope at each stage."""
+    """Return e one step later, by the classical Runge-Kutta method, from its derivative."""
     stages: list[Array] = []
     for stage, share in enumerate(_SHARES):
         stages.append(slope(stage, e + share * dt * stages[-1] if stages else e))

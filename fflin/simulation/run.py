@@ -122,7 +122,7 @@ def _advance(
 
 
 def ending_of(plan: Plan) -> Callable[[float, Array, Array], str]:
-    """Return what says why a run ends where a step has led it; nothing where it goes on."""
+    """Return a function that gives the reason for which a run ends; empty if it continues."""
     chart = plan.chart
     scalar = chart.scalar(plan.q) if chart else 1.0
 

@@ -96,7 +96,7 @@ def times_of(
     sample: float | None,
     delay: float,
 ) -> Times:
-    """Return the times of a simulation, whose arguments are those of `simulate`."""
+    """Return the times of a simulation from arguments of `simulate`."""
     follows = tracking_of(policy)
     if sample is not None:
         sample = _positive("sample", sample)

@@ -160,7 +160,7 @@ class _BrowserError(Exception):
 
 
 class _Browser:
-    """A browser, and one tab of it, told what to do by the DevTools protocol."""
+    """A browser with one tab, controlled by the DevTools protocol."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         assert process.stdin and process.stdout

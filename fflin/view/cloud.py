@@ -20,7 +20,7 @@ _COLORS = {"base": "#a9c4e8", "tool": "#ffb877"}
 
 
 def drawn_robot(robot: Robot, cloud: Any, motion: Any) -> Robot:
-    """Return the robot of a motion beside its cloud, maybe drawn with other bodies."""
+    """Return the robot of a motion shown with a cloud, with the bodies that its run drew."""
     if not isinstance(cloud, Campaign):
         said = f"cloud is a {type(cloud).__name__}, expected a Campaign"
         raise InputError(f"{said}, as fflin.monte_carlo returns it")
