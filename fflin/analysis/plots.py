@@ -133,7 +133,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     )
     if not count:
         with drawing(path, 6.5, 1.0) as figure:
-            figure.suptitle(f"{title}\nno spring or damper acts; give a joint a stiffness")
+            figure.suptitle(f"{title}\nno mode to draw; give a joint a stiffness")
         return figure
     bodies = [body for body in modes.modes[0].energy if max(_energies(modes, body)) >= _LEAST]
     places = {name: place for place, name in enumerate(names)}

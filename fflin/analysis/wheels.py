@@ -94,7 +94,7 @@ def damped_wheels(part: LinearModel) -> str:
     damped = [name for name in names if name in wheel_inputs(part)]
     if not damped:
         return ""
-    return f": damping of {listed(damped)} keeps their speeds in the model; remove that damping"
+    return f": wheel speeds stay in the model due to the damping of {listed(damped)}; remove it"
 
 
 def rigid_forces(body: LinearModel) -> Noisy:

@@ -49,7 +49,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
         if np.isfinite(validity.slope):
             order += f", ~ displacement^{validity.slope - 1.0:.2f}"
         left.loglog(percent * levels, percent * errors, "o-", color=COLORS[0], ms=3, label=order)
-        trust = f"trusted up to {percent * TRUSTED:g} %"
+        trust = f"accepted error: {percent * TRUSTED:g} %"
         left.axhline(percent * TRUSTED, color="#888888", lw=0.8, label=trust)
         left.set_xticks(percent * validity.levels, [f"{percent * x:.3g}" for x in validity.levels])
         left.minorticks_off()
