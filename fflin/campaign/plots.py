@@ -21,7 +21,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Shares of the runs, from the widest band to the narrowest, and how dark each is.
-_BANDS = ((0.0, "all", 0.13), (0.05, "90 %", 0.22), (0.25, "50 %", 0.38))
+_BANDS = (
+    (0.0, "all runs", 0.13),
+    (0.05, "90 % of runs", 0.22),
+    (0.25, "50 % of runs", 0.38),
+)
 _INK, _GOAL = COLORS[0], "#555555"
 _WORST = (COLORS[1], COLORS[3], COLORS[4], COLORS[2], COLORS[7])
 _DECADES, _BARS, _BINS = 6, 10, 48

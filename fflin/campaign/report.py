@@ -34,7 +34,7 @@ def campaign_report(campaign: Any) -> str:
 def ended_of(campaign: Any) -> str:
     """Return how many runs completed, and how the others ended."""
     said = ", ".join(f"{number:,} {word}" for word, number in _stops(campaign).items())
-    return f"{int((campaign.stop == 0.0).sum()):,} runs completed; {said or 'none stopped early'}"
+    return f"{int((campaign.stop == 0.0).sum()):,} completed; {said or 'none stopped early'}"
 
 
 def goal_met(campaign: Any, goal: str) -> str:

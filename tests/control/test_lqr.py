@@ -189,7 +189,7 @@ def test_what_the_inputs_cannot_hold_is_named(robots, name, dt):
     base = [fflin.BaseTorque(), fflin.BaseForce()]
     refused(
         [*base, *joints[1:]],
-        f"hold joint {robot.joint_names[0]}, which no input moves; .*--stiffness.* motor$",
+        f"stabilise joint {robot.joint_names[0]}, which no input moves; .*--stiffness.* motor$",
     )
 
 
