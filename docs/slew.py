@@ -1,4 +1,4 @@
-"""Draw docs/mpc.png, a slew under a saturated regulator and under `mpc`: ``python docs/slew.py``.
+"""Draw docs/mpc.png, a slew under a saturated LQR and under MPC: ``python docs/slew.py``.
 
 The base returns from 90 deg with a strong torque, while the joint torques are weak.
 """
@@ -16,7 +16,7 @@ SHOWN = ("joint_3", "joint_6", "panel_left", "panel_right")
 
 
 def main() -> None:
-    """Simulate both and draw attitude, joints with their limits, and joint torques."""
+    """Simulate both and draw attitude errors, joint positions with limits, and joint torques."""
     robot = fflin.load("servicer_7dof")
     lin = fflin.linearize(robot)
     Q = fflin.bryson(lin, {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1})
@@ -25,7 +25,7 @@ def main() -> None:
     base = pin.SE3(pin.AngleAxis(np.pi / 2.0, np.array([1.0, 0.0, 0.0])).matrix(), np.zeros(3))
     q0, (figure, axes) = fflin.configuration(robot, base=base), pyplot.subplots(3, 2, sharex=True)
     figure.set_size_inches(9.0, 6.5)
-    cases = {"saturated regulator": fflin.StateFeedback(policy.lin, policy.gain.K), "mpc": policy}
+    cases = {"LQR, saturated": fflin.StateFeedback(policy.lin, policy.gain.K), "MPC": policy}
     for column, (title, each) in zip(axes.T, cases.items(), strict=True):
         motion = fflin.simulate(robot, each, q0=q0, duration=80.0, dt=0.05, limits=LIMITS)
         attitude, joints, torques = column
@@ -45,7 +45,7 @@ def main() -> None:
         low, high = np.array([each.get_ylim() for each in row]).T
         for each in row:
             each.set_ylim(low.min(), high.max())
-    axes[1, 1].legend(loc="lower right", fontsize=8, title="dashed: travel of the panels")
+    axes[1, 1].legend(loc="lower right", fontsize=8, title="dashed: joint limits of the panels")
     figure.tight_layout()
     figure.savefig(Path(__file__).with_name("mpc.png"), dpi=110)
 

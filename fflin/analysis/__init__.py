@@ -1,1 +1,1 @@
-"""What a linear model tells: reach, modes, momenta, how far it can be trusted."""
+"""Analysis of linear models: controllability, observability, modes and momenta."""

@@ -1,4 +1,4 @@
-"""Which states the inputs of a linear model can move, and the names of those that they cannot."""
+"""Controllability of a linear model, with the names of its uncontrollable states."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -24,41 +24,42 @@ from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
 _LOOPS = (
-    "closed loops of the joints still turn the base of the nonlinear robot (a loop of amplitude "
-    "e by O(e^2)); a linear model cannot show it"
+    "a periodic joint motion can still rotate the base of the nonlinear robot, by O(e^2) for an "
+    "amplitude e; a linear model does not show this"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Controllability(FrozenArrays):
-    """What the inputs of a linear model can move; prints in words.
+    """Controllability of a linear model; prints in words.
 
     Attributes
     ----------
     dimension : int
-        Of the controllable subspace.
+        Dimension of the controllable subspace.
     controllable : tuple of str
-        ``dimension`` states that can be put anywhere; the others follow by `basis`.
+        ``dimension`` states that the inputs can set independently; `basis` gives the other states.
     uncontrollable : tuple of str
-        Names of the combinations of states that no input acts on.
+        Names of the uncontrollable combinations of states.
     rows : ndarray (nx - dimension, nx)
-        Those combinations: the controllable subspace is ``rows @ x = 0``.
+        Coefficients of these combinations: the controllable subspace is ``rows @ x = 0``.
     basis : ndarray (nx, dimension)
-        Spans the controllable subspace; column i moves state ``controllable[i]`` by 1 and the
-        other controllable ones not.
+        Basis of the controllable subspace. Column i changes ``controllable[i]`` by 1, and no other
+        state in `controllable`.
     fixed_poles : ndarray (nx - dimension,)
-        Poles that no feedback can move [1/s], or of the sampled model.
+        Poles that no feedback can move: [1/s], or poles of the sampled model.
     stabilizable : bool
-        Whether all of these decay.
+        Whether all fixed poles are stable.
     reach : dict
-        {"base attitude", "base position", "joints": directions in which it can be put anywhere
-        while the others follow as they must}.
+        Number of directions of "base attitude", "base position" and "joints" that the inputs can
+        set, if the other states are free to follow.
     method : str
-        "closed form", "modes" or "eigenvalues": how the dimension was found.
+        Method that determined the dimension: "closed form", "modes" or "eigenvalues".
     margin : Margin
-        Distance of the rank decisions from doubt: far above 1, far below 1.
+        Distance of the rank decisions from doubt: singular values relative to their tolerance. A
+        clear decision has values far above 1 and far below 1.
     notes : tuple of str
-        What to know beside it.
+        Remarks on the result, such as undecided ranks.
 
     Examples
     --------
@@ -90,50 +91,51 @@ class Controllability(FrozenArrays):
         if self.uncontrollable:
             lines.append(f"controllable: {with_rates(self.controllable)}")
             lines.append(f"uncontrollable: {', '.join(grouped(self.uncontrollable))}")
-            placed = [f"{what} in {count}" for what, count in self.reach.items()]
-            lines.append(f"directions that the inputs move: {', '.join(placed)}")
+            placed = [f"{what} {count}" for what, count in self.reach.items()]
+            lines.append(f"controllable directions: {', '.join(placed)}")
         lines += [f"note: {note}" for note in self.notes]
         return folded(lines)
 
 
 def controllability(lin: LinearModel) -> Controllability:
-    r"""Find what the inputs can move, from the structure of the model.
+    r"""Determine the controllable subspace from the structure of the model.
 
-    About rest the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved, and with the
-    coordinates :math:`W M N^{-1} x_1` that they drive they are split off exactly. Without
-    springs and dampers that is all: the dimension is 2 rank(B). With them the rest is decided on
-    :math:`M a + D v + K s = S u` itself, by the rank of :math:`[p^2 M + p D + K, S]` at each pole
-    p, where rounding is put to zero and every row is scaled by what stands in it. Off rest, and
-    where springs or dampers are not symmetric, it is decided by singular values of
-    :math:`[A - p E, B]` in units of energy (Popov, Belevitch, Hautus).
+    - At rest, the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved. They, and the
+      coordinates :math:`W M N^{-1} x_1` that they drive, are split off exactly. Without springs and
+      dampers this completes the result: the dimension is 2 rank(B).
+    - With symmetric springs and dampers, the remaining part is decided on the second-order form
+      :math:`M a + D v + K s = S u`, by the rank of :math:`[p^2 M + p D + K, S]` at each pole p.
+      Entries within rounding error are set to zero, and each row is scaled by its entries.
+    - At nonzero velocity, or if springs or dampers are not symmetric, the singular values of
+      :math:`[A - p E, B]` in units of energy decide (Popov, Belevitch, Hautus).
 
-    A sampled model has the structure of the continuous one that it was made of, but for a
-    vibration that is lost where it is sampled at a period of it. Of a file, which holds the
-    samples alone, these are judged as they stand.
+    A sampled model has the structure of its continuous model. The exception is a vibration whose
+    period divides the sample time: sampling makes it uncontrollable. A file contains the sampled
+    matrices alone, which are analysed as they are.
 
-    Every tolerance is a small multiple of the rounding; `margin` says how near the decisions came
-    to them, and `notes` where one is within rounding.
+    Every tolerance is a small multiple of the rounding error. `margin` gives the distance of the
+    decisions from it, and `notes` lists decisions within rounding error.
 
     Parameters
     ----------
     lin : LinearModel
-        Continuous or sampled, fresh, reduced, or loaded from a file.
+        Linear model: continuous or sampled, full or reduced, also loaded from a file.
 
     Returns
     -------
     Controllability
+        Dimension, basis, and named controllable and uncontrollable states.
 
     Raises
     ------
     InputError
-        If `lin` is no linear model of positions and their rates.
+        If `lin` is not a linear model of positions and their rates.
 
     Notes
     -----
-    Inputs act in both directions: that a thruster only pushes is not considered. At a nonzero
-    angular velocity the answer is that of the frozen model, which certifies nothing about the
-    motion. Off rest, where the fastest pole is more
-    than about 1e8 times the slowest that is not zero, the slow ones are taken for rounding.
+    Inputs are assumed to act in both directions, also thrusters, which can only push. At a nonzero
+    angular velocity the result holds for the frozen model and certifies nothing about the motion.
+    At nonzero velocity, poles slower than about 1e-8 times the fastest pole count as zero.
 
     References
     ----------
@@ -251,9 +253,11 @@ def _notes(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
     if turned and any(lin.state_names[i].startswith("q_m.") for i in held.kept):
         notes.append(_LOOPS)
     if len(held.weights):
-        notes.append("conserved momenta are split off by fflin.momentum_reduction")
+        notes.append("fflin.momentum_reduction removes the conserved momenta")
     if not lin.is_equilibrium():
-        notes.append("the point is not a fixed point: this speaks of the frozen A and B")
+        notes.append(
+            "the operating point is not an equilibrium; the result holds for the frozen A and B"
+        )
     return tuple(notes)
 
 

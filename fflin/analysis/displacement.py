@@ -1,4 +1,4 @@
-"""Displacements from a point: attitude [deg], position [m] and joints [rad|m] together."""
+"""Displacements from an operating point: attitude [deg], position [m] and joints [rad|m]."""
 
 from fflin.base.errors import InputError
 from fflin.base.validation import number
@@ -17,19 +17,19 @@ def checked_displacement(
     if not 0.0 <= given["attitude"] < 175.0 or min(given.values()) < 0.0:
         raise InputError(
             f"the displacements are {shown(given)}; expected none negative, and an attitude "
-            "below 175 deg, where the chart ends"
+            "below 175 deg, since the chart ends at 180 deg"
         )
     if max(given.values()) > _FARTHEST:
         raise InputError(
-            f"the displacements are {shown(given)}; expected none beyond {_FARTHEST:g}, where no "
-            "loop settles"
+            f"the displacements are {shown(given)}; expected at most {_FARTHEST:g}; give smaller "
+            "ones"
         )
     groups = {name.partition(".")[0] for name in lin.state_names}
     names = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}
     largest = {key: given[key] if name in groups else 0.0 for key, name in names.items()}
     if not any(largest.values()):
         raise InputError(
-            "the model has none of the coordinates that are displaced; give others than 0"
+            "no state of the model is displaced; give a nonzero displacement of one of its states"
         )
     return largest
 

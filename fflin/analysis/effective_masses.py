@@ -25,23 +25,25 @@ _ROUNDING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class EffectiveMasses(FrozenArrays):
-    """Effective masses of the modes of a robot with its base clamped; prints as a table.
+    """Effective masses of the vibration modes with the base clamped; prints as a table.
 
-    All stand about the base frame's origin and in the base's axes, translation before rotation.
+    All are about the base frame's origin and in the base's axes, translation before rotation.
 
     Attributes
     ----------
     frequencies : ndarray (k,)
-        Of the clamped modes, ascending [rad/s].
+        Natural frequencies [rad/s] of the clamped modes, ascending.
     participation : ndarray (6, k)
-        L of modes with unit modal mass; rows 0 to 2 [kg^1/2], 3 to 5 [kg^1/2 m].
+        Modal participation factors L for unit modal mass; rows 0 to 2 [kg^1/2], rows 3 to 5
+        [kg^1/2 m].
     free : ndarray (6, 6)
-        Part of the inertia that joints without a spring let go.
+        Part of the inertia that joints without a spring do not transmit to the base.
     residual : ndarray (6, 6)
-        Inertia that is left if all joints follow the forces on them: what the base weighs alone.
+        Inertia that the base feels if all joints are free to move.
     total : ndarray (6, 6)
-        Inertia of the rigid robot, of which the others are the parts.
+        Inertia of the rigid robot, the sum of all parts.
     robot : str
+        Name of the robot.
 
     Examples
     --------
@@ -91,41 +93,41 @@ class EffectiveMasses(FrozenArrays):
 
 
 def effective_masses(lin: LinearModel) -> EffectiveMasses:
-    r"""Return the effective masses of a robot's vibrations with its base clamped.
+    r"""Return the effective masses of a robot's vibration modes with its base clamped.
 
-    With the base at rest, the joints' springs K and M in base axes, base before joints, and
-    :math:`\tilde M` the inertia after the joints without a spring, which float, are condensed out
-    of M, the modes are
+    K contains the joint springs, and M is in base axes, base before joints. Joints without a spring
+    are condensed out of M, which gives :math:`\tilde M`. With the base at rest the modes are
 
     .. math::
         K \phi_i = \omega_i^2 \tilde M_{mm} \phi_i, \qquad \phi_i^T \tilde M_{mm} \phi_i = 1,
         \qquad L_i = \tilde M_{bm} \phi_i.
 
-    On a base that is shaken along or about axis d, mode i pulls like a mass on a spring: the
-    effective mass :math:`L_{di}^2` [kg], or the effective inertia [kg m^2]. Over all modes,
-    with the free joints' part and the residual, they are the inertia of the rigid robot,
+    If the base is shaken along or about axis d, mode i reacts like a mass on a spring. This is its
+    effective mass :math:`L_{di}^2` [kg], or its effective inertia [kg m^2]. The sum over all modes,
+    the part of the free joints and the residual is the inertia of the rigid robot,
 
     .. math::
         \textstyle\sum_i L_i L_i^T + M_{free} + M_{res} = M_{bb}, \qquad
         M_{res} = M_{bb} - M_{bm} M_{mm}^{-1} M_{mb}.
 
-    `modes` lists the frequencies of the floating robot, which are higher. Of modes with one
-    frequency only the sum is unique; the first takes as much mass as one can.
+    `modes` lists the frequencies of the floating robot, which are higher. If modes share a
+    frequency, only the sum of their masses is unique; the first takes the largest possible mass.
 
     Parameters
     ----------
     lin : LinearModel
-        Of a whole robot about any point; the configuration alone matters. Gravity, dampers
-        and inputs are left out of K.
+        Full model about any operating point; only its configuration matters. K excludes gravity,
+        dampers and inputs.
 
     Returns
     -------
     EffectiveMasses
+        Frequencies, participation factors and the parts of the inertia.
 
     Raises
     ------
     InputError
-        If the model is reduced or from a file, which do not hold the robot's springs.
+        If the model is reduced or was loaded from a file, and so lacks the robot's springs.
     ModelError
         If the robot's model was changed after the linear model was made.
 
@@ -147,8 +149,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     robot = lin._robot
     if robot is None or len(lin.M) != 6 + robot.n:
         raise InputError(
-            "effective masses need the robot's springs, which a reduced model or a file does not "
-            "hold; give what fflin.linearize returns"
+            "the model is reduced or from a file, and lacks the robot's springs, which effective "
+            "masses need; give the model that fflin.linearize returns"
         )
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     chart = state.chart(lin.q)

@@ -1,4 +1,4 @@
-"""Eigenpairs of a linear model: of its symmetric stiffness at rest, or of A without its zeros."""
+"""Eigenpairs of a linear model: from its stiffness at rest, or from A without its zeros."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NO_STIFFNESS = 1e-13
 
 
 class NaturalModes(NamedTuple):
-    """Eigenpairs of A; the figures are those of `Modes`."""
+    """Eigenpairs of A, with the figures of `Modes`."""
 
     # Poles but zero, one of each pair, their shapes, and the real parts as multiples of rounding.
     triples: list[tuple[complex, Any, float]]
@@ -48,7 +48,7 @@ def natural_modes(lin: LinearModel) -> NaturalModes:
 
 
 def _significant(lin: LinearModel) -> Array:
-    """Return A without slopes that are the rounding of inputs that cancel each other."""
+    """Return A without derivatives that are rounding errors of inputs that cancel each other."""
     nv, A = len(lin.M), lin.A.copy()
     slopes = A[nv:, :nv]
     pushed = np.abs(lin.B[nv:]) @ np.abs(lin.u0)
@@ -95,7 +95,7 @@ def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
 
 
 def _polished(by_s: Array, squares: Array, vectors: Array) -> tuple[Array, Array]:
-    """Return the pairs of -by_s, after one Newton step from those of its symmetric pencil."""
+    """Return the eigenpairs of -by_s, after one Newton step from its symmetric pencil."""
     # The Schur complement rounds by the condition of M, while A is exact to the last digits.
     defect = -np.linalg.solve(vectors, by_s @ vectors) - np.diag(squares)
     gaps = squares - squares[:, None]

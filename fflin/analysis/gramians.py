@@ -1,4 +1,4 @@
-"""Gramians: the energy that it takes to reach a state, and that a state shows."""
+"""Controllability and observability Gramians."""
 
 import math
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ _DECAY = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Gramians(FrozenArrays):
-    """Gramians of a linear model.
+    """Controllability and observability Gramians of a linear model.
 
     Attributes
     ----------
     controllability : ndarray (nx, nx)
-        W; the least input energy that reaches x is ``x^T W^-1 x``.
+        Gramian W_c; the least input energy that reaches x is ``x^T W_c^-1 x``.
     observability : ndarray (nx, nx)
-        The output energy that x leaves behind is ``x^T W x``.
+        Gramian W_o; the output energy of the free response from x is ``x^T W_o x``.
     duration : float
-        The horizon [s]; infinite where the model is asymptotically stable and none was given.
+        Horizon [s]; infinite if none was given, for an asymptotically stable model.
 
     Examples
     --------
@@ -41,33 +41,34 @@ class Gramians(FrozenArrays):
 
 
 def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
-    r"""Compute the Gramians, over all time or over a horizon.
+    r"""Compute the controllability and observability Gramians.
 
     .. math::
         W_c = \int_0^T e^{A t} B B^T e^{A^T t}\,dt, \quad
         W_o = \int_0^T e^{A^T t} C^T C e^{A t}\,dt,
 
-    or the sums over the samples of a sampled model. Over all time they solve Lyapunov's
-    equations. Over a horizon they are polynomials of it at rest, where :math:`A^2 = 0`, and
-    elsewhere built by doubling a short step,
-    :math:`W(2 t) = W(t) + e^{A t} W(t) e^{A^T t}`.
+    or, for a sampled model, the sums over its samples. Over infinite time they solve Lyapunov
+    equations. Over a horizon T, they are polynomials in T at rest, where :math:`A^2 = 0`. Otherwise
+    they are built by doubling a short step, :math:`W(2 t) = W(t) + e^{A t} W(t) e^{A^T t}`.
 
     Parameters
     ----------
     lin : LinearModel
+        Continuous or sampled model.
     duration : float, optional
-        The horizon T [s]; a multiple of dt for a sampled model. Over all time by default, for
-        which the model must be asymptotically stable: a free base never is.
+        Horizon T [s]; a multiple of dt for a sampled model. The default is infinite time, for which
+        the model must be asymptotically stable. A model with a free base never is.
 
     Returns
     -------
     Gramians
+        Both Gramians and their horizon.
 
     Raises
     ------
     InputError
-        If `duration` is not positive, no multiple of dt, or left out for a model that is not
-        asymptotically stable.
+        If `duration` is not positive or not a multiple of dt, or if it is missing and the model is
+        not asymptotically stable.
 
     References
     ----------
@@ -90,7 +91,9 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     with np.errstate(over="ignore", invalid="ignore"):
         found = [_gramian(A, B @ B.T, lin.dt, duration) for A, B in pairs]
     if not all(np.isfinite(W).all() for W in found):
-        raise InputError(f"duration is {duration:g} s, over which the model overflows")
+        raise InputError(
+            f"duration is {duration:g} s, over which the state transition overflows; shorten it"
+        )
     reach, show = (0.5 * (W + W.T) for W in found)
     return Gramians(reach, show, np.inf if duration is None else duration)
 
@@ -102,8 +105,8 @@ def _require_decay(lin: LinearModel) -> None:
     if growth >= -_DECAY * (1.0 if lin.dt else size):
         slow = f"a pole of modulus {1.0 + growth:.6g}" if lin.dt else f"a pole at {growth:.3g} 1/s"
         raise InputError(
-            f"the model is not asymptotically stable ({slow}), so its Gramians grow without end; "
-            "give a duration"
+            f"the model is not asymptotically stable ({slow}), so its Gramians are not finite; "
+            "give duration="
         )
 
 

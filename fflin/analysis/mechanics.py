@@ -1,4 +1,4 @@
-"""A linear model as a mechanical system: its slopes, its forces, the momenta it conserves."""
+"""A linear model as a mechanical system: Jacobians, forces and conserved momenta."""
 
 import warnings
 from dataclasses import dataclass
@@ -41,13 +41,14 @@ def checked(lin: LinearModel) -> LinearModel:
 
 
 def warn_of_stiffness(lin: LinearModel) -> None:
-    """Warn where a vibration is so fast that an orbit's field is in the rounding beside it."""
+    """Warn if a vibration is so fast that orbital effects are within its rounding error."""
     nv, size = len(lin.M), np.sqrt(lin.M.diagonal())
     fastest = float((np.abs(slopes(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
     if 0.0 < lin.mean_motion < _SLOWEST * fastest:
         warnings.warn(
-            f"what the orbit of '{lin.robot}' does at {lin.mean_motion:.3g} rad/s is rounding as "
-            f"joints vibrate at {fastest:.3g} rad/s, and may be missed; lock these joints",
+            f"orbital effects on '{lin.robot}' at {lin.mean_motion:.3g} rad/s are within the "
+            f"rounding error of joint vibrations at {fastest:.3g} rad/s, and the result may miss "
+            "them; lock these joints",
             FflinWarning,
             stacklevel=4,
         )

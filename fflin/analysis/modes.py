@@ -23,22 +23,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Mode(FrozenArrays):
-    r"""One mode: a conjugate pair of poles, or a real pole.
+    r"""Natural mode: a conjugate pair of poles, or a real pole.
 
     Attributes
     ----------
     pole : complex
-        Eigenvalue of A [rad/s]; of a pair, the one with a positive imaginary part.
+        Eigenvalue of A [rad/s]; for a pair, the eigenvalue with positive imaginary part.
     shape : ndarray (nx,) of complex
-        Eigenvector in the units of the state; of the positions the one that moves most is 1.
+        Eigenvector in the units of the state, scaled so that the largest position entry is 1.
     unstable : bool
-        Whether it grows, by more than rounding can explain.
+        Whether the mode grows, by more than the rounding error.
     margin : float
-        The real part of the pole as a multiple of its rounding; infinite where it has none.
+        Real part of the pole as a multiple of its rounding error; infinite if that error is zero.
     energy : mapping of str to float
-        Fraction of the mode's kinetic energy that each body has, the largest first; they are not
-        negative and sum to 1. A body is named by the joint that carries it, the root "base".
-        Empty if the model is from a file, which does not hold the bodies.
+        Fraction of the mode's kinetic energy in each body, the largest first. The fractions are
+        nonnegative and sum to 1. The name of a body is the joint that carries it, or "base" for the
+        root. Empty for a model from a file, which lacks the bodies.
 
     Notes
     -----
@@ -71,22 +71,22 @@ class Mode(FrozenArrays):
 
     @property
     def oscillates(self) -> bool:
-        """Whether it is a pair of poles."""
+        """Whether the mode is a conjugate pair of poles."""
         return self.pole.imag > 0.0
 
     @property
     def frequency(self) -> float:
-        """Natural frequency, the modulus of the pole [rad/s]."""
+        """Natural frequency [rad/s], the modulus of the pole."""
         return abs(self.pole)
 
     @property
     def damping_ratio(self) -> float:
-        """Minus the cosine of the pole: 0 undamped, 1 for a real stable pole, negative unstable."""
+        """Damping ratio -Re(p)/|p|: 0 undamped, 1 for a real stable pole, negative unstable."""
         return 0.0 if self.pole.real == 0.0 else -self.pole.real / abs(self.pole)
 
     @property
     def time_constant(self) -> float:
-        """Time in which it decays to, or where it is unstable grows by, 1/e or e [s]."""
+        """Time constant [s] in which the mode decays to 1/e, or grows by e if it is unstable."""
         return float("inf") if self.pole.real == 0.0 else 1.0 / abs(self.pole.real)
 
 
@@ -97,22 +97,23 @@ class Modes:
     Attributes
     ----------
     modes : tuple of Mode
-        All but those of the eigenvalue zero, by frequency.
+        Modes with nonzero eigenvalues, in ascending order of frequency.
     rigid_body : int
-        Independent displacements that nothing opposes: rigid-body modes.
+        Number of rigid-body modes: independent displacements without a restoring force.
     zero_eigenvalues : int
-        How many eigenvalues are zero; a rigid-body mode without friction has two.
+        Number of zero eigenvalues; a rigid-body mode without friction has two.
     residual : float
         Largest ``|A x - pole x|`` relative to ``|A| |x|``, in states scaled to unit inertias and to
         the time of the fastest motion.
     equilibrium : bool
-        Whether the point is a fixed point or a relative equilibrium; elsewhere the eigenvalues
-        are those of a frozen model and say nothing about stability.
+        Whether the operating point is an equilibrium or a relative equilibrium. Otherwise the
+        eigenvalues belong to a frozen model and do not show stability.
     state_names, state_units : tuple of str
-        Of the shapes.
+        Names and units of the entries of the shapes.
     robot : str
+        Name of the robot.
     lin : LinearModel
-        What they are modes of.
+        Model whose modes these are.
 
     Examples
     --------
@@ -155,20 +156,20 @@ class Modes:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Modes of which rounding decides whether they grow or decay, and what is not known."""
+        """Remarks: modes whose stability is within rounding error, and missing data."""
         undecided = tuple(
             f"undecided: whether the mode at {mode.frequency:.4g} rad/s grows or decays; its real "
-            f"part is {mode.margin:.1g} times its rounding"
+            f"part is {mode.margin:.1g} times its rounding error"
             for mode in self.modes
             if 0.1 < abs(mode.margin) < 10.0
         )
         if not self.modes or self.modes[0].energy:
             return undecided
-        return (*undecided, "the kinetic energy of bodies is not known to a model from a file")
+        return (*undecided, "a model from a file lacks the kinetic energies of the bodies")
 
     @property
     def poles(self) -> NDArray[np.complexfloating[Any]]:
-        """All nx eigenvalues of A, with the zeros and the conjugates."""
+        """All nx eigenvalues of A [rad/s], including zeros and conjugates."""
         listed = [0j] * self.zero_eigenvalues
         for mode in self.modes:
             listed += [mode.pole, mode.pole.conjugate()] if mode.oscillates else [mode.pole]
@@ -184,7 +185,7 @@ class Modes:
         )
         head += f", {counted(others, 'real pole')}" if others else ""
         if not self.equilibrium:
-            head += "; not an equilibrium, where eigenvalues are those of a frozen model"
+            head += "; not an equilibrium: eigenvalues of a frozen model do not show stability"
         said = [head]
         if self.unstable:
             poles = ", ".join(f"{mode.pole:.5g}" for mode in self.unstable)
@@ -211,30 +212,32 @@ class Modes:
 
 
 def modes(lin: LinearModel) -> Modes:
-    r"""Find the natural modes of a linear model.
+    r"""Compute the natural modes of a linear model.
 
-    At rest, with symmetric stiffness and nothing else, those of the free-floating structure:
+    At rest, with a symmetric stiffness alone, these are the modes of the free-floating structure:
 
     .. math::
         K \phi = \omega^2 M^* \phi, \qquad M^* = ((M^{-1})_{EE})^{-1},
 
-    over the coordinates E that the stiffness K acts on; M* is the inertia that they feel while
-    all others float, the Schur complement of M. Elsewhere the eigenvalues of A, of which those at
-    zero, in Jordan blocks of two and more, are split off exactly.
+    over the coordinates E on which the stiffness K acts. M* is the Schur complement of M: the
+    effective inertia while all other coordinates float. In all other cases the modes are the
+    eigenvectors of A. The zero eigenvalues, in Jordan blocks of two and more, are split off
+    exactly.
 
     Parameters
     ----------
     lin : LinearModel
-        In continuous time; fresh, loaded from a file, or reduced.
+        Continuous-time model, full or reduced, also loaded from a file.
 
     Returns
     -------
     Modes
+        Modes, poles and numbers of rigid-body modes and zero eigenvalues.
 
     Raises
     ------
     InputError
-        If the model is sampled, or its states are not positions and then as many velocities.
+        If the model is sampled, or its states are not positions followed by their velocities.
     ModelError
         If the robot's model was changed after the linear model was made.
 
@@ -255,7 +258,7 @@ def modes(lin: LinearModel) -> Modes:
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
     lin.require_unchanged()
     if lin.dt:
-        raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous one")
+        raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous model")
     nx, nv = len(lin.A), len(lin.M)
     if nx != 2 * nv:
         raise InputError(f"the model has {nx} states, expected {nv} positions and their velocities")

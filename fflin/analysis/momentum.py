@@ -1,4 +1,4 @@
-"""The model without the momenta that it conserves, and what the free base makes of the arm."""
+"""Momentum reduction of a linear model, and generalized inertia and Jacobian of an arm."""
 
 from __future__ import annotations
 
@@ -26,25 +26,26 @@ _DRIFT = 1e-9
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ReducedModel(LinearModel):
-    """A linear model in the coordinates that its inputs, springs and dampers act on.
+    """Linear model reduced to the coordinates on which inputs, springs and dampers act.
 
-    With z the reduced state and x that of the whole, ``x - x0 = T (z - z0)`` on the motions with
-    zero conserved momenta, and always ``z = S x``. Files hold the model without these maps.
+    With the reduced state z and the full state x, always ``z = S x``. For motions with zero
+    conserved momenta, ``x - x0 = T (z - z0)``. Files contain the model without these maps.
 
     Attributes
     ----------
     T : ndarray (nx, nz)
-        From the reduced state to the whole.
+        Map from the reduced state to the full state.
     S : ndarray (nz, nx)
-        From the whole state to the reduced: it picks the states of the same names.
+        Map from the full state to the reduced state; it selects the states of the same names.
     momenta : ndarray (k, nx)
-        Rows L1: what is conserved, and zero in the reduced model.
+        Rows L1 of the conserved momenta, which are zero in the reduced model.
     coordinates : ndarray (k, nx)
-        Rows L2: what drifts at the rate of L1, and is held at zero in the reduced model.
+        Rows L2 of the coordinates that drift at the rate of L1; they are zero in the reduced model.
     margin : Margin
-        Distance from doubt of the decision on what is conserved: far above 1, far below 1.
+        Distance from doubt of the rank decision on the conserved momenta: far above 1 and far
+        below 1 is clear.
     notes : tuple of str
-        What is undecided.
+        Undecided ranks.
 
     Examples
     --------
@@ -66,11 +67,11 @@ class ReducedModel(LinearModel):
 
 
 def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) -> ReducedModel:
-    r"""Reduce a model to the part without its conserved momenta, exactly.
+    r"""Remove the conserved momenta from a model, exactly.
 
-    A momentum :math:`W M \nu` that no input, spring or damper changes is zero for all time
-    where it starts at zero; with the coordinate that it drives it is left out. For an
-    unactuated base these are its six, and with :math:`G = -M_{bb}^{-1} M_{bm}`
+    A momentum :math:`W M \nu` that no input, spring or damper changes stays zero if it starts at
+    zero. The reduction removes it, and the coordinate that it drives. For an unactuated base these
+    are all six momenta, and with :math:`G = -M_{bb}^{-1} M_{bm}`
 
     .. math::
         \nu_b = G \dot q_m, \quad M^* \ddot q_m = \tau_m - K q_m - D \dot q_m, \quad
@@ -78,36 +79,39 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
     Equations (9.2) and (9.3) of docs/derivation.md.
 
-    Where attitude or position is actuated as well, its states are kept and the others left out.
-    Without springs the result is minimal; a vibration that no input drives stays in it. From
-    inputs to joint states it has the transfer function of the whole model.
+    If attitude or position is actuated too, its states are kept. Without springs the result is
+    minimal; with springs it may contain vibrations that no input drives. From inputs to joint
+    states it has the transfer function of the full model.
 
-    Reaction wheels leave too, whatever their momentum (9.4), and the attitude that they turn
-    stays. Wheels whose speeds are to be held, (9.5), stay with their angles, as do those whose
-    speeds matter: of a carrier that turns at the point, or with friction.
+    Reaction wheels are removed as well, whatever their momentum (9.4), while the attitude that they
+    control is kept. Three kinds of wheels are kept with their angles:
+
+    - wheels whose speeds are to be controlled, (9.5);
+    - wheels on a carrier that rotates at the operating point;
+    - wheels with friction.
 
     Parameters
     ----------
     lin : LinearModel
-        About rest, continuous or sampled.
+        Model about rest, continuous or sampled.
     wheel_speeds : bool, optional
-        Whether wheels stay whose speeds the inputs can hold; by default where inputs other than
-        wheels turn the base.
+        Whether to keep wheels whose speeds the inputs can control. By default they are kept if
+        inputs other than wheels turn the base.
 
     Returns
     -------
     ReducedModel
-        A `LinearModel` of 2 r states, r being nv less the number of conserved momenta, with
-        the maps ``T`` and ``S``. Its ``M`` is that of the kept coordinates with the others
-        free to follow, and its outputs are those of `lin` but what sees wheels that have left,
-        of which ``T`` has zeros. All states are kept where nothing is conserved.
+        `LinearModel` with the maps ``T`` and ``S``. It has 2 r states, where r is nv minus the
+        number of conserved momenta; all states are kept if no momentum is conserved. Its ``M`` is
+        the inertia of the kept coordinates while the others are free to follow. Its outputs are the
+        outputs of `lin`, except outputs of removed wheels, for which ``T`` has zeros.
 
     Raises
     ------
     InputError
-        If the point drifts in a direction that is left out, or `lin` is no linear model.
+        If the operating point drifts in a removed direction, or `lin` is not a linear model.
     ModelError
-        If the robot's model was changed after it was made.
+        If the robot's model was changed after the linear model was made.
 
     References
     ----------
@@ -130,8 +134,8 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     drift = float(np.abs(lin.f0 - T @ lin.f0[z])[judged].max(initial=0.0))
     if drift > _DRIFT * float(np.abs(lin.f0).max()):
         raise InputError(
-            f"the point is no fixed point: |f0| is {np.abs(lin.f0).max():.3g} and changes what "
-            "the reduction leaves out; linearise at rest"
+            f"the operating point is not an equilibrium: |f0| is {np.abs(lin.f0).max():.3g} and "
+            "drives states that the reduction removes; linearise at rest"
         )
     stays = picked(lin.state_names, whole.state_names)
     reduced = ReducedModel(
@@ -147,7 +151,7 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
 
 def generalized_inertia(lin: LinearModel) -> Array:
-    r"""Return the generalized inertia: that of the joints with the base free to follow (9.3).
+    r"""Return the generalized inertia: the joints' inertia while the base is free (9.3).
 
     .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
 
@@ -156,17 +160,17 @@ def generalized_inertia(lin: LinearModel) -> Array:
     Parameters
     ----------
     lin : LinearModel
-        Of the whole robot, at any velocity.
+        Full model of the robot, at any velocity.
 
     Returns
     -------
     ndarray (n, n)
-        ``(M^-1)_mm = M*^-1``.
+        Generalized inertia M*; its inverse is the joint block of M^-1.
 
     Raises
     ------
     InputError
-        If the base is not among the states.
+        If the model lacks the states of the base.
 
     Examples
     --------
@@ -177,13 +181,17 @@ def generalized_inertia(lin: LinearModel) -> Array:
     lin = checked(lin)
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
     if len(lin.A) != 12 + 2 * joints:
-        raise InputError("the base is not among the states; take the model before its reduction")
+        raise InputError(
+            "the model lacks the states of the base; give the model before its reduction"
+        )
     inertia = floating_inertia(lin.M, range(6, 6 + joints), range(6))
     return (inertia + inertia.T) / 2.0
 
 
 def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") -> Array:
-    r"""Return the generalized Jacobian: a frame's velocity per joint rate at zero momentum (9.3).
+    r"""Return the generalized Jacobian from joint rates to a frame's velocity, free base (9.3).
+
+    The momentum of the robot is zero.
 
     .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
 
@@ -195,20 +203,20 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     q : array_like (nq,), optional
         Configuration; neutral by default.
     frame : str
-        A frame of the model.
+        Name of a frame of the model.
 
     Returns
     -------
     ndarray (6, n)
-        Angular velocity [rad/s], then velocity of the frame's origin [m/s], both in Pinocchio's
-        world axes, over the joint rates.
+        Jacobian from joint rates to angular velocity [rad/s], then velocity of the frame's origin
+        [m/s], both in Pinocchio's world axes.
 
     Raises
     ------
     UnknownNameError
-        If there is no such frame.
+        If the frame is unknown.
     InputError
-        If `q` is no configuration of the robot.
+        If `q` is not a configuration of the robot.
 
     Examples
     --------

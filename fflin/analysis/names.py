@@ -1,4 +1,4 @@
-"""Names of combinations of states: momenta, what they drive, and sums of the largest terms."""
+"""Names of combinations of states: momenta, the coordinates they drive, and largest terms."""
 
 import re
 
@@ -34,7 +34,7 @@ def momentum_names(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
     rest = "the joints" if only_joints and of_base else "the rest"
     return (
         *(combination(row, momenta, size) for row in held.weights),
-        *(f"{combination(row, driven, size)} with {rest} held" for row in held.weights),
+        *(f"{combination(row, driven, size)} with {rest} fixed" for row in held.weights),
     )
 
 
@@ -85,8 +85,9 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
 def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[str, ...]:
     """Say what is decided within rounding, and the two answers: `count` states, or others."""
     return tuple(
-        f"undecided: {shape(lin, at)} {'counts' if change < 0 else 'does not count'} as {what}, by "
-        f"{ratio:.1g} times its rounding; {count} or {count + change} of {len(lin.A)} states"
+        f"undecided: {shape(lin, at)} is taken as {'' if change < 0 else 'not '}{what}, at "
+        f"{ratio:.1g} times its rounding error; {count} or {count + change} of {len(lin.A)} "
+        f"states are {what}"
         for ratio, at, change in margin.doubts
     )
 
@@ -94,8 +95,8 @@ def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[
 def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
     """Say where rounding decides whether the slowest motion decays."""
     return tuple(
-        f"undecided: whether {shape(lin, at)} settles by itself, at {ratio:.1g} times its "
-        f"rounding; {what} or not {what}"
+        f"undecided: whether {shape(lin, at)} decays by itself, at {ratio:.1g} times its "
+        f"rounding error; the model is {what} or not {what}"
         for ratio, at, _ in settling.doubts
     )
 

@@ -1,4 +1,4 @@
-"""Which states the outputs of a linear model show."""
+"""Observability of a linear model, with the names of its unobservable motions."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,28 +18,30 @@ from fflin.linear.model import LinearModel
 
 @dataclass(frozen=True, eq=False)
 class Observability(FrozenArrays):
-    """What the outputs of a linear model show; prints in words.
+    """Observability of a linear model; prints in words.
 
     Attributes
     ----------
     dimension : int
-        nx less the dimension of the unobservable subspace.
+        nx minus the dimension of the unobservable subspace.
     unobservable : tuple of str
-        Names of the motions that leave no trace in the outputs: a state, or several together.
+        Names of the unobservable motions: a state, or a combination of states.
     basis : ndarray (nx, nx - dimension)
-        Those motions, a column each.
+        Unobservable motions, one column each.
     rows : ndarray (dimension, nx)
-        What can be told from the outputs: the unobservable subspace is ``rows @ x = 0``.
+        Observable combinations of states: the unobservable subspace is ``rows @ x = 0``.
     fixed_poles : ndarray (nx - dimension,)
-        Poles of the error that no observer can move [1/s], or of the sampled model.
+        Poles of the estimation error that no observer can move: [1/s], or poles of the sampled
+        model.
     detectable : bool
-        Whether all of these decay.
+        Whether all fixed poles are stable.
     method : str
-        "closed form" or "eigenvalues": how the dimension was found.
+        Method that determined the dimension: "closed form" or "eigenvalues".
     margin : Margin
-        Distance of the rank decisions from doubt: far above 1, far below 1.
+        Distance of the rank decisions from doubt: singular values relative to their tolerance. A
+        clear decision has values far above 1 and far below 1.
     notes : tuple of str
-        What is undecided.
+        Undecided ranks.
 
     Examples
     --------
@@ -71,26 +73,27 @@ class Observability(FrozenArrays):
 
 
 def observability(lin: LinearModel) -> Observability:
-    r"""Find what the outputs show, from C and the structure of A.
+    r"""Determine the observable subspace from C and the structure of A.
 
-    About rest it is decided on :math:`M a + D v + K s = 0`, by the null space of
-    :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p; that of p = 0 is one decision. Elsewhere
-    the unobservable subspace is the orthogonal complement of what the dual pair
-    :math:`(A^T, C^T)` reaches, in units of energy, as in `controllability`.
+    At rest the decision uses the second-order form :math:`M a + D v + K s = 0`: the null space of
+    :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p, with one decision for p = 0. At nonzero
+    velocity the unobservable subspace is the orthogonal complement of the controllable subspace of
+    the dual pair :math:`(A^T, C^T)`, in units of energy, as in `controllability`.
 
     Parameters
     ----------
     lin : LinearModel
-        Continuous or sampled, fresh, reduced, or loaded from a file.
+        Linear model: continuous or sampled, full or reduced, also loaded from a file.
 
     Returns
     -------
     Observability
+        Dimension, basis, and named unobservable motions.
 
     Raises
     ------
     InputError
-        If `lin` is no linear model of positions and their rates.
+        If `lin` is not a linear model of positions and their rates.
 
     Examples
     --------

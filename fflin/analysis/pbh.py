@@ -1,4 +1,4 @@
-"""What inputs reach and outputs show, pole by pole, as Popov, Belevitch and Hautus test it."""
+"""Controllable and observable subspaces by the Popov-Belevitch-Hautus test, pole by pole."""
 
 from typing import NamedTuple
 
@@ -34,7 +34,7 @@ class _Scaled(NamedTuple):
 
 
 def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
-    """Scale slopes to units of energy, and of time so that A is of size about 1."""
+    """Scale Jacobians to units of energy, and of time so that A has a size of about 1."""
     # Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
     # likewise over the time unit. The tolerance is twenty times the rounding of M^-1, or that of
     # the exponential which the slopes of a sampled model are a difference of.

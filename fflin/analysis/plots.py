@@ -1,4 +1,4 @@
-"""Figures of linear models: A and B, modes, and what a check found."""
+"""Figures of linear models: A and B, modes, and the errors of a check."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ _LEAST = 0.005
 
 
 def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
-    """Draw which entries of A and B are more than rounding, and how large they are, by groups.
+    """Draw the entries of A and B above rounding error, and their magnitudes, by groups.
 
     Parameters
     ----------
     lin : LinearModel
+        Model to draw.
     path : str or Path, optional
-        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
 
     Examples
     --------
@@ -73,7 +74,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
         axes[1].set_title(f"B ({nx} x {nu})")
         of = "row" if lin.dt else "row's rate"
         figure.colorbar(image, ax=axes, shrink=0.8).set_label(
-            f"size, each entry in SI units of its {of} per unit of its column"
+            f"magnitude, in SI units of the {of} per unit of the column"
         )
         time = f", sampled every {lin.dt:g} s" if lin.dt else ""
         figure.suptitle(f"{lin.robot}, frame {lin.frame}{time}")
@@ -104,13 +105,14 @@ def _name(
 
 
 def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
-    """Draw each mode's frequency and damping, its shape, and the kinetic energy of the bodies.
+    """Draw the frequency, damping and shape of each mode, and the bodies' kinetic energies.
 
     Parameters
     ----------
     modes : Modes
+        Result of `fflin.modes`.
     path : str or Path, optional
-        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
 
     Examples
     --------
@@ -119,7 +121,9 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     >>> figure = fflin.plot_modes(fflin.modes(fflin.linearize(robot)), "modes.png")
     """
     if not isinstance(modes, Modes):
-        raise InputError(f"modes is a {type(modes).__name__}, expected what fflin.modes returns")
+        raise InputError(
+            f"modes is a {type(modes).__name__}, expected Modes, as fflin.modes returns"
+        )
     count, half = len(modes.modes), len(modes.state_names) // 2
     names, units = modes.state_names[:half], modes.state_units[:half]
     title = (
@@ -129,7 +133,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     )
     if not count:
         with drawing(path, 6.5, 1.0) as figure:
-            figure.suptitle(f"{title}\nnothing opposes a motion; a joint with a stiffness vibrates")
+            figure.suptitle(f"{title}\nno mode to draw; give a joint a stiffness")
         return figure
     bodies = [body for body in modes.modes[0].energy if max(_energies(modes, body)) >= _LEAST]
     places = {name: place for place, name in enumerate(names)}
@@ -151,7 +155,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
             _percentages(beside, modes, bodies)
         figure.legend(
             handles=[Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()],
-            title="what moves most is 1; outline: modulus of what is out of phase",
+            title="largest entry: 1; outline: modulus of an entry out of phase",
             loc="outside lower center",
             ncols=len(colors),
         )
@@ -198,13 +202,14 @@ def _said(mode: Mode) -> str:
 
 
 def plot_check(check: Check, path: str | Path | None = None) -> Figure:
-    """Draw each error that a check found beside what it must not exceed.
+    """Draw each error of a check together with its tolerance.
 
     Parameters
     ----------
     check : Check
+        Result of `fflin.check`.
     path : str or Path, optional
-        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
 
     Examples
     --------
@@ -213,7 +218,9 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     >>> figure = fflin.plot_check(fflin.check(robot, lin), "check.png")
     """
     if not isinstance(check, Check):
-        raise InputError(f"check is a {type(check).__name__}, expected what fflin.check returns")
+        raise InputError(
+            f"check is a {type(check).__name__}, expected a Check, as fflin.check returns"
+        )
     rows = [row for row in check.rows if row.error != 0.0]
     tests = list(dict.fromkeys(row.test for row in rows))
     names = list(dict.fromkeys(_place(row) for row in rows))
@@ -228,16 +235,14 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
         axes.plot([row.error for row in bad], [names.index(_place(row)) for row in bad], "rx")
         axes.set_yticks(range(len(names)), names, fontsize=8)
         axes.set(xscale="log", ylim=(max(len(names), 1) - 0.5, -0.5))
-        axes.set_xlabel("relative error (dot) and what it must not exceed (bar)")
+        axes.set_xlabel("relative error (dot) and tolerance (bar)")
         held = (
-            f"FAILED: {len(bad)} of {len(check.rows)} figures"
+            f"FAILED: {len(bad)} of {len(check.rows)} exceed their tolerance"
             if bad
-            else (f"OK: {len(check.rows)} figures hold")
+            else (f"OK: {len(check.rows)} errors within tolerance")
         )
         exact = len(check.rows) - len(rows)
-        axes.set_title(
-            f"{check.title}\n{held}; {exact} agree to the last bit and are not drawn", loc="left"
-        )
+        axes.set_title(f"{check.title}\n{held}; {exact} are zero, not drawn", loc="left")
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)
     return figure
 

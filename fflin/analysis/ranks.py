@@ -1,4 +1,4 @@
-"""Rank decisions, each with its distance from doubt, and echelon forms."""
+"""Rank decisions with their distance from doubt, and echelon forms."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Decision(NamedTuple):
 
 
 class Margin(NamedTuple):
-    """How far rank decisions are from doubt: the nearest of those that counted, and of others."""
+    """Distance of rank decisions from doubt: smallest counted and largest dropped value."""
 
     counted: Decision = Decision(np.inf)
     left_out: Decision = Decision(0.0)
@@ -44,7 +44,7 @@ class Margin(NamedTuple):
 
     @property
     def dropped(self) -> float:
-        """The largest that did not count, relative to its tolerance."""
+        """The largest singular value that did not count, relative to its tolerance."""
         return self.left_out.ratio
 
     def __and__(self, other: Margin) -> Margin:

@@ -1,4 +1,4 @@
-"""The attitudes in which an orbit's field leaves a rigid body at rest, and whether it stays."""
+"""Relative equilibria of a rigid body in orbit, and their stability."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 @dataclass(frozen=True, eq=False)
 class RelativeEquilibrium(FrozenArrays):
-    """An attitude that the field of an orbit does not turn, the joints held.
+    """Relative equilibrium: an attitude at rest in the orbital frame, with fixed joints.
 
     Attributes
     ----------
     q : ndarray (nq,)
-        Configuration, its centre of mass on the orbit; what holds the joints there is
-        ``equilibrium(robot, q).u``.
+        Configuration with the centre of mass on the orbit. ``equilibrium(robot, q).u`` returns the
+        inputs that hold the joints there.
     moments : ndarray (3,)
-        Moments of inertia about the centre of mass [kg m^2], about the axes away from the body,
-        along the orbit and along its normal.
+        Principal moments of inertia [kg m^2] about the centre of mass: radial axis, along-track
+        axis, orbit normal.
     poles : ndarray (6,)
-        Of the attitude, the joints held [rad/s]: pitch, then roll and yaw.
+        Poles [rad/s] of the attitude with fixed joints: pitch, then roll and yaw.
     stable : bool or None
-        Whether no pole grows; None where rounding decides.
+        Whether no pole has a positive real part; None if rounding decides.
     margin : float
-        The least of what stability asks for, relative to its rounding: below -1 unstable, above 1
-        stable.
+        Smallest of the stability conditions relative to its rounding error: unstable below -1,
+        stable above 1.
 
     Examples
     --------
@@ -63,7 +63,7 @@ class RelativeEquilibrium(FrozenArrays):
 
 
 class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
-    """The 24 attitudes, the most stable ones first; prints as a table of the six kinds.
+    """Tuple of the 24 relative equilibria, most stable first; prints as a table of six kinds.
 
     Examples
     --------
@@ -77,51 +77,51 @@ class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
 
     def __str__(self) -> str:
         """Show one of the four attitudes of each kind."""
-        rows = [["radial", "along", "normal [kg m^2]", "", "grows by [1/s]"]]
+        rows = [["radial", "along", "normal [kg m^2]", "", "growth [1/s]"]]
         for one in self[::4]:
             said = {True: "stable", False: "unstable", None: "undecided"}[one.stable]
             growth = float(one.poles.real.max()) if one.stable is False else 0.0
             sizes = [f"{moment:.5g}" for moment in one.moments]
             rows.append([*sizes, said, f"{growth:.4g}" if growth else "."])
-        return f"principal moments, 4 attitudes each\n{grid(rows, 'rrrlr')}"
+        return f"principal moments of inertia, 4 attitudes per row\n{grid(rows, 'rrrlr')}"
 
 
 def relative_equilibria(
     robot: Robot, q: Array | None = None, *, frame: Frame | None = None
 ) -> RelativeEquilibria:
-    r"""List the attitudes in which a robot with held joints stays at rest in its orbit's frame.
+    r"""List the attitudes in which a robot with fixed joints stays at rest in its orbital frame.
 
-    There the principal axes of its inertia stand along the axes of the frame, in 24 ways. With
-    the moments :math:`I_r, I_a, I_n` about the axes away from the body, along and normal,
+    There the principal axes of inertia are parallel to the axes of the frame, in 24 ways. With the
+    moments :math:`I_r, I_a, I_n` about the radial axis, the along-track axis and the orbit normal,
 
     .. math::
         \lambda^2 = -3 n^2 (I_a - I_r)/I_n, \qquad
         \lambda^4 + (1 + 3 k_a + k_a k_r)\,n^2 \lambda^2 + 4 k_a k_r\,n^4 = 0, \qquad
         k_a = (I_n - I_r)/I_a, \quad k_r = (I_n - I_a)/I_r,
 
-    are the poles of pitch, and of roll and yaw, (14.8) of docs/derivation.md. Where all are
-    imaginary and simple the body librates.
+    give the poles of pitch, and of roll and yaw, (14.8) of docs/derivation.md. If all poles are
+    imaginary and simple, the body librates.
 
     Parameters
     ----------
     robot : Robot
-        In orbit.
+        Robot in orbit.
     q : array_like (nq,), optional
-        Its joints count; neutral by default.
+        Configuration whose joint positions are used; neutral by default.
     frame : {"lvlh", "hill"}, optional
-        What q of the result is relative to; "lvlh" by default.
+        Orbital frame of `q` in the result; "lvlh" by default.
 
     Returns
     -------
     RelativeEquilibria
-        A tuple of 24 `RelativeEquilibrium`.
+        Tuple of 24 `RelativeEquilibrium`, most stable first.
 
     Raises
     ------
     InputError
-        If the robot is in no orbit, its wheels store momentum, or an argument is none.
+        If the robot is not in orbit, its wheels store momentum, or an argument is invalid.
     SingularInertiaError
-        If it has no inertia about an axis.
+        If the robot has no inertia about an axis.
 
     References
     ----------
@@ -140,13 +140,13 @@ def relative_equilibria(
     field = field_of(robot, frame_of(robot, frame))
     if field is None:
         raise InputError(
-            f"'{robot.name}' is in no orbit; give it one: "
+            f"'{robot.name}' is not in orbit; give it an orbit: "
             "robot.replace(orbit=fflin.CircularOrbit(altitude=...)), --orbit on the command line"
         )
     if robot.stored_momentum:
         raise InputError(
-            f"wheels of '{robot.name}' store momentum, which turns it beside the field; take them "
-            "without (momentum=0), or equilibrium at an attitude"
+            f"wheels of '{robot.name}' store momentum, whose gyroscopic torque is not considered "
+            "here; set momentum=0, or use fflin.equilibrium at an attitude"
         )
     q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
     q[:7] = pin.SE3ToXYZQUAT(pin.SE3.Identity())
@@ -156,7 +156,7 @@ def relative_equilibria(
     sizes, axes = np.linalg.eigh(root.rotation.T @ data.Ig.inertia @ root.rotation)
     if sizes[0] <= _ROUNDING * sizes[2]:
         raise SingularInertiaError(
-            f"'{robot.name}' has no inertia about an axis; give it one, as linearize needs too"
+            f"'{robot.name}' has no inertia about an axis; give it one, which linearize needs too"
         )
     n, found = mean_motion(robot), []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):

@@ -1,4 +1,4 @@
-"""M a + D v + K s = S u: a model at rest by its forces, and the motions that stay hidden."""
+"""Second-order form M a + D v + K s = S u of a model at rest, and its unobservable motions."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class SecondOrder:
 
 
 class Hidden(NamedTuple):
-    """What a reading of positions and velocities misses of the free motion."""
+    """Free motions that a measurement of positions and velocities does not observe."""
 
     motions: Array  # (2 nv, k), basis of the unobservable subspace, (s, ds/dt)
     shapes: tuple[tuple[complex, Any], ...]  # (nv, m), of each continuous pole or pair but zero

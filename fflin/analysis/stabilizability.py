@@ -1,4 +1,4 @@
-"""What inputs cannot hold and what outputs cannot see, in words."""
+"""Messages about states that inputs cannot stabilise or outputs cannot observe."""
 
 import warnings
 from collections.abc import Sequence
@@ -31,23 +31,23 @@ _RANK = 1e-7
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names what no input can hold."""
     if len(lin.A) < 2 * len(lin.M):  # with speeds of wheels without their angles
-        missed = f"the inputs cannot hold {{}}{damped_wheels(lin) or '; add inputs'}"
-        _check_reach(lin, lin.A, lin.B, "held by the inputs", missed, StabilizabilityError)
+        missed = f"the inputs cannot stabilise {{}}{damped_wheels(lin) or '; add inputs'}"
+        _check_reach(lin, lin.A, lin.B, "stabilised by the inputs", missed, StabilizabilityError)
         return
     found, words = controllability(lin), ""
     if not found.stabilizable:
         weights = conserved(lin).weights
         forces = _forces_missing(lin, weights) if len(weights) else None
         lost = forces or f"{', '.join(grouped(found.uncontrollable))}; add inputs"
-        words = f"the inputs cannot hold {lost}"
+        words = f"the inputs cannot stabilise {lost}"
     _conclude(StabilizabilityError, words, found.notes, found.margin)
 
 
 def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` that names what no output shows and what does not settle."""
-    missed = "the outputs do not show {}, which do not settle by themselves; add outputs"
+    missed = "the outputs do not observe {}, which do not decay by themselves; add outputs"
     if len(lin.A) < 2 * len(lin.M):
-        _check_reach(lin, lin.A.T, lin.C.T, "shown by the outputs", missed, DetectabilityError)
+        _check_reach(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, DetectabilityError)
         return
     found = observability(lin)
     words = "" if found.detectable else missed.format(with_rates(found.unobservable))
@@ -69,17 +69,17 @@ def _conclude(
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
     """Raise `InputError` that names the modes on the boundary of stability that Q leaves out."""
-    missed = "Q does not weigh {}, which do not settle by themselves; weigh them"
-    _check_reach(lin, A.T, _root(Q), "weighed by Q", missed)
+    missed = "Q has no weight on {}, which do not decay by themselves; give them weights"
+    _check_reach(lin, A.T, _root(Q), "weighted by Q", missed)
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
     """Raise `InputError` that names the modes on the boundary that no disturbance reaches."""
     missed = (
-        "W does not disturb {}, which do not settle by themselves: a steady filter would not "
+        "W does not excite {}, which do not decay by themselves: a steady-state filter would not "
         "correct them; give them an intensity"
     )
-    _check_reach(lin, lin.A, _root(W), "disturbed by W", missed)
+    _check_reach(lin, lin.A, _root(W), "excited by W", missed)
 
 
 def _root(W: Array) -> Array:
@@ -118,9 +118,9 @@ def _check_reach(
         missed += list(vectors)
         margin &= decision
     doubts = tuple(
-        f"undecided: {_dominant(at[None], lin.state_names)} "
-        f"{'counts' if change < 0 else 'does not count'} as {what}, by {ratio:.2g} times its "
-        "rounding; on another machine it may be decided otherwise"
+        f"undecided: {_dominant(at[None], lin.state_names)} is taken as "
+        f"{'' if change < 0 else 'not '}{what}, at {ratio:.2g} times its rounding error; "
+        "another machine may decide otherwise"
         for ratio, at, change in margin.doubts
     )
     words = complaint.format(_dominant(np.array(missed), lin.state_names)) if missed else ""
@@ -146,7 +146,7 @@ def _left_null(matrix: Array) -> tuple[Array, Margin]:
 
 
 def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
-    """Say what the conserved momenta W M nu, W (k, nv), are those of; None of another model."""
+    """Name the coordinates of the conserved momenta W M nu, W (k, nv); None for other models."""
     names = lin.state_names[-len(lin.M) :]
     if names[:3] == _BASE_VELOCITIES[:3] and names[3:4] != ("v_b.x",):
         # The position has left, which nothing pushes.

@@ -1,4 +1,4 @@
-"""Reaction wheels in a linear model: whose angle and speed nothing else depends on."""
+"""Reaction wheels in a linear model, on whose angles no other state depends."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
@@ -81,7 +81,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     angles = {lin.state_names[i] for i in ignorable_wheels(lin)[0]}
     rest = [name for name in part.state_names if name not in angles]
     if len(rest) == len(part.M):
-        raise StabilizabilityError(f"the model is of speeds of wheels alone{damped_wheels(part)}")
+        raise StabilizabilityError(f"the model contains wheel speeds alone{damped_wheels(part)}")
     return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
 
 
@@ -94,7 +94,7 @@ def damped_wheels(part: LinearModel) -> str:
     damped = [name for name in names if name in wheel_inputs(part)]
     if not damped:
         return ""
-    return f": {listed(damped)} have damping, with which speeds stay; leave damping off the wheels"
+    return f": wheel speeds stay in the model due to the damping of {listed(damped)}; remove it"
 
 
 def rigid_forces(body: LinearModel) -> Noisy:

@@ -1,5 +1,5 @@
-"""Campaigns: many runs of a closed loop whose robot, start and sensors are drawn at random.
+"""Monte Carlo campaigns: many runs of a closed loop with random robot, start and sensor errors.
 
-What is drawn, the runs eight at a time in the compiled loop or one by one in Python, what is kept
-of each, and the record of all with its statistics.
+The package has the dispersions, the runs (eight at a time in the compiled loop, or one by one in
+Python), the record of each run, and the campaign with its statistics.
 """

@@ -1,4 +1,4 @@
-"""The record of a campaign: how its runs ended, with statistics that say how sure they are."""
+"""The record of a campaign: the outcomes of its runs, and statistics with their intervals."""
 
 from __future__ import annotations
 
@@ -32,38 +32,46 @@ NOT_RUN = -1.0  # where `stop` is this, a file has no run
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Campaign(FrozenArrays):
-    """The runs of `monte_carlo`, N of them.
+    """Result of a Monte Carlo campaign with N runs, as `monte_carlo` returns it.
 
-    What can be asked about by name: the error at last of each kind, ``attitude`` [deg],
-    ``position`` [m], ``joints``, ``turning`` (omega_b), ``moving`` (v_b), ``rates``; a state or an
-    input, with its sign, at last; ``worst NAME`` for the largest of the whole run, of the error
-    where NAME is a state; ``settle`` [s] or ``settle KIND``, since when the error stays within 2 %
-    of its largest; ``end`` [s]; and ``drawn NAME``. Errors are largest entries, from the target, or
-    from the start where there is none. A run that was stopped early is beyond every bound: its
-    errors, worst values and settling are infinite, and it meets no condition.
+    Statistics and conditions name the figures of a run:
+
+    - ``attitude`` [deg], ``position`` [m], ``joints``, ``turning`` (omega_b), ``moving`` (v_b) and
+      ``rates``: final error of that kind.
+    - The name of a state or input: its final value, with sign.
+    - ``worst NAME``: largest value over the whole run; for a state, its largest error.
+    - ``settle`` [s] or ``settle KIND``: settling time, after which the error stays within 2 % of
+      its largest value.
+    - ``end`` [s]: end of the run.
+    - ``drawn NAME``: dispersed value.
+
+    An error of a kind is its largest entry, relative to the target, or to the start if there is no
+    target. A run that was stopped early violates every bound: its errors, worst values and settling
+    times are infinite, and it meets no condition.
 
     Attributes
     ----------
     drawn : ndarray (N, k)
-        What was drawn, its `names` (k,).
+        Dispersed values, with the names `names` (k,).
     q, v, x, u : ndarray (N, ..)
-        At last; of a run that diverged, the last that was finite.
+        Final values; for a run that diverged, the last finite values.
     largest_x, largest_u : ndarray (N, nx), (N, nu)
-        Largest errors of the states and largest inputs, without sign, as far as each run went.
+        Largest magnitudes of the state errors and the inputs, up to the end of each run.
     errors, largest, settle : ndarray (N, 6)
-        Of each kind, at last, at most, and since when [s], infinite where it is not settled.
+        Final error, largest error and settling time [s] of each kind. The settling time is infinite
+        if the error has not settled.
     times : tuple of float
-        [s], when the histories have their rows; none unless they were asked for.
+        Times [s] of the histories; empty unless `monte_carlo` was called with `histories`.
     error_history, input_history : ndarray (N, M, 6), (N, M, nu)
-        Errors of each kind, and commands, at each of these times; of a run that was stopped
-        infinite, and zero, from then on.
+        Errors of each kind, and commands, at these times. After a run is stopped, its errors are
+        infinite and its commands are zero.
     stop, end : ndarray (N,)
-        0 where a run came to its end, 1 where it diverged, 2 where it left the chart, 3 else; and
-        when [s].
+        Outcome (0 completed, 1 diverged, 2 left the chart, 3 stopped otherwise) and end time [s] of
+        each run.
     asked : int
-        How many runs were asked for; more than there are where `until` was met before.
+        Requested number of runs; it exceeds N if `until` was met earlier.
     goals : tuple of str
-        The conditions that report and figure tell the shares of.
+        Conditions whose success rates appear in the report and the figure.
 
     Examples
     --------
@@ -127,24 +135,25 @@ class Campaign(FrozenArrays):
 
     @property
     def about(self) -> str:
-        """The figure that is asked about by default.
+        """Default figure of `worst` and `sensitivity`.
 
-        What the first goal bounds from above, or the worst error of what is steered first.
+        It is the figure that the first goal bounds from above. Without such a goal, it is the
+        worst error of the first kind that the policy controls.
         """
         bounded = [each.name for each in self.bounds if each.sign[0] == "<"]
         return [*bounded, f"worst {(self.judged or tuple(KINDS))[0]}"][0]
 
     @property
     def bounds(self) -> list[Bound]:
-        """What the goals compare."""
+        """Comparisons in the goals."""
         return [each for goal in self.goals for each in bounds_of(goal, self.figure)]
 
     def values(self, name: str) -> Array:
-        """Return a figure of each run (N,) by its name, in SI units but for angles in deg."""
+        """Return a figure of each run (N,) by its name, in SI units, attitude in deg."""
         return self.figure(name)[0]
 
     def figure(self, name: str) -> tuple[Array, str]:
-        """Return a figure of each run (N,), and its unit."""
+        """Return a figure of each run (N,) by its name, and its unit."""
         if name == "end":
             return self.end, "s"
         if name == "settle":
@@ -181,15 +190,15 @@ class Campaign(FrozenArrays):
         Parameters
         ----------
         condition : str or array_like of bool (N,)
-            ``NAME < NUMBER UNIT``, also <=, > and >=, several joined by ``and``; no unit is the
-            figure's own. A run that was stopped meets no text.
+            Text ``NAME < NUMBER UNIT`` with <, <=, > or >=; ``and`` joins several. Without UNIT
+            the figure's own unit applies. A run that was stopped early meets no such text.
         """
         if not isinstance(condition, str):
             found = np.asarray(condition if isinstance(condition, np.ndarray | list) else None)
             if found.shape != (len(self),) or found.dtype != bool:
                 raise InputError(
                     f"condition has shape {found.shape} of {found.dtype}, expected a text such as "
-                    f"'attitude < 1 deg', or ({len(self)},) True or False"
+                    f"'attitude < 1 deg', or ({len(self)},) booleans"
                 )
             return found
         met = ~self.stopped
@@ -198,15 +207,15 @@ class Campaign(FrozenArrays):
         return met
 
     def fraction(self, condition: Any, *, confidence: float = 0.95) -> Estimate:
-        """Return the share of runs that meet a condition, with Clopper and Pearson's interval."""
+        """Return the fraction of runs that meet a condition, with its Clopper-Pearson interval."""
         met, sure = int(self.met(condition).sum()), share("confidence", confidence)
         return intervals.clopper_pearson(met, len(self), sure)
 
     def quantile(self, name: str, p: float, *, confidence: float = 0.95) -> Estimate:
-        """Return the value below which a figure is in a share p of the runs, with its interval.
+        """Return the p-quantile of a figure over the runs, with its confidence interval.
 
-        The interval is one of order statistics: it holds whatever the distribution is. A final
-        state or input has a sign, and is of the runs that came to their end.
+        The interval uses order statistics and holds for any distribution. A final state or input is
+        signed, and its quantile is taken over the completed runs only.
         """
         values = self.values(name)
         if name in (*self.state_names, *self.input_names):
@@ -214,25 +223,25 @@ class Campaign(FrozenArrays):
         return intervals.quantile(values, share("p", p), share("confidence", confidence))
 
     def mean(self, name: str, *, confidence: float = 0.95) -> Estimate:
-        """Return the mean of a figure over runs that came to their end, with Student's interval.
+        """Return the mean of a figure over the completed runs, with Student's t interval.
 
         Raises
         ------
         InputError
-            If it is infinite in some of these, as is the settling of what did not settle.
+            If the figure is infinite in a completed run, as a settling time can be.
         """
         values = self.values(name)[~self.stopped]
         if endless := int(np.isinf(values).sum()):
             raise InputError(
-                f"{name!r} is infinite in {endless} of {len(values)} runs that came to their end; "
-                "ask for a fraction or a quantile"
+                f"{name!r} is infinite in {endless} of {len(values)} completed runs, so its mean "
+                "is not finite; use a fraction or a quantile"
             )
         return intervals.mean(values, share("confidence", confidence))
 
     def worst(self, k: int = 5, name: str | None = None) -> list[int]:
-        """Return the numbers of the k runs with the largest figure, `about` by default.
+        """Return the indices of the k runs with the largest figure, `about` by default.
 
-        Runs that were stopped go before all others, the earliest first.
+        Runs that were stopped early come first, in the order of their ends.
         """
         order = np.lexsort(
             (-self.values(name or self.about), np.where(self.stopped, self.end, np.inf))
@@ -240,10 +249,12 @@ class Campaign(FrozenArrays):
         return [int(run) for run in order[: whole("k", k, 1)]]
 
     def sensitivity(self, name: str | None = None) -> dict[str, float]:
-        """Return {what is drawn: Spearman's rank correlation with a figure}, the largest first.
+        """Return Spearman's rank correlations {name: value} of the dispersed values with a figure.
 
-        Of what is drawn or, under ``|NAME|``, how far that is from its median, whichever tells
-        more: errors grow to both sides of an attitude. The figure is `about` by default.
+        The correlation with the largest magnitude comes first. If the distance of a value from its
+        median correlates more strongly than the value itself, that correlation is returned, under
+        ``|NAME|``: an attitude error, for example, may grow to both sides. The figure is `about` by
+        default.
         """
         figure = self.values(name or self.about)
         apart = np.abs(self.drawn - np.median(self.drawn, axis=0))
@@ -256,33 +267,33 @@ class Campaign(FrozenArrays):
         return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
 
     def replay(self, run: int) -> Motion:
-        """Return the motion of a run.
+        """Simulate a run of the campaign again, and return its motion.
 
-        Its q, v and u are those of the run bit for bit. Its x is read from q and v by other code:
-        it is that of the run to machine precision, continuous joints but for full turns.
+        q, v and u equal the original run bit for bit. x is computed from q and v by other code; it
+        agrees to machine precision, except for full turns of continuous joints.
 
         Raises
         ------
         InputError
-            If there is no such run, or the campaign is from a file.
+            If the run does not exist, or the campaign was loaded from a file.
         """
         at = whole("run", run, 0, len(self) - 1)
         return self._flown().replay(np.array(self.drawn[at]))
 
     def courses(self, runs: Sequence[int], most: int) -> list[Array]:
-        """Return configurations (at most `most` + 1, nq) on the way of some runs, evenly apart."""
+        """Return at most `most` + 1 evenly spaced configurations (.., nq) of each of some runs."""
         return self._flown().courses(np.array(self.drawn[list(runs)]), most)
 
     def _flown(self) -> CampaignJob:
         if self._job is None:
             raise InputError(
-                "the campaign is from a file, without its robot and policy; make the same call of "
-                "monte_carlo and replay its run: the same seed draws the same"
+                "the campaign was loaded from a file, which lacks its robot and policy; repeat the "
+                "call of monte_carlo and replay its run: the same seed draws the same values"
             )
         return self._job
 
     def save(self, path: str | Path) -> None:
-        """Write it to a .npz or .h5 file, whole or not at all."""
+        """Save the campaign to a .npz or .h5 file, atomically."""
         self._save(as_path(path))
 
     def _save(self, path: Path, **texts: str) -> None:
@@ -294,12 +305,12 @@ class Campaign(FrozenArrays):
 
     @classmethod
     def load(cls, path: str | Path) -> Campaign:
-        """Read what `save` or `monte_carlo` wrote.
+        """Read a campaign from a file that `save` or `monte_carlo` wrote.
 
         Raises
         ------
         FileError
-            If the file cannot be read, is damaged or is another thing.
+            If the file cannot be read, is damaged or does not hold a campaign.
         """
         source = as_path(path)
         with reading(source, "Campaign"):
@@ -311,7 +322,7 @@ class Campaign(FrozenArrays):
 
     @classmethod
     def of(cls, arrays: Mapping[str, Array], header: Any, job: Any = None) -> Campaign:
-        """Put one together of arrays, less the rows that were not run, and the rest."""
+        """Return a campaign from its arrays, without the rows of runs not made, and its header."""
         run = np.asarray(arrays["stop"]) != NOT_RUN
         values: dict[str, Any] = {
             key: arrays[key] if run.all() else arrays[key][run] for key in _ARRAYS

@@ -50,7 +50,7 @@ def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> lis
         factors = [_SIZES.get((unit, each), 0.0) for each in own.split("|")]
         factor = 1.0 if unit in ("", own, *own.split("|")) else max(factors)
         if not factor:
-            raise InputError(f"condition {part!r} is in {unit}, expected {own or 'no unit'}")
+            raise InputError(f"condition {part!r} has the unit {unit}, expected {own or 'no unit'}")
         limit *= factor
         bounds.append(Bound(name, sign, limit, _COMPARE[sign](values, limit)))
     return bounds

@@ -1,4 +1,4 @@
-"""What is drawn at random, from a TOML file."""
+"""Dispersions from a TOML file."""
 
 from __future__ import annotations
 
@@ -45,20 +45,20 @@ def placed(dispersions: Any) -> Iterator[None]:
 
 
 def load_dispersions(path: str | Path) -> dict[str, Any]:
-    """Read what `monte_carlo` draws at random from a TOML file.
+    """Read the dispersions of `monte_carlo` from a TOML file.
 
-    The file is one table ``[dispersions]`` of names, groups or patterns, each with its spread:
+    The file has one table ``[dispersions]`` of names, groups or patterns, each with its spread:
 
     ==========================================  ==================================================
-    ``0.05`` or ``{normal = 0.05}``             standard deviation of a normal one about 0
-    ``{uniform = [-0.1, 0.2]}``                 least and largest
-    ``{values = [0, 10, 20]}``                  each as likely
-    ``{distribution = "triang", c = 0.5}``      one of scipy.stats by its name, with its shapes,
-                                                ``loc`` and ``scale``
-    ``{normal = 0.05, tied = true}``            one draw for all that a pattern or group names
+    ``0.05`` or ``{normal = 0.05}``             normal about 0 with this standard deviation
+    ``{uniform = [-0.1, 0.2]}``                 uniform between least and largest value
+    ``{values = [0, 10, 20]}``                  one of these values, all equally likely
+    ``{distribution = "triang", c = 0.5}``      distribution of scipy.stats by its name, with its
+                                                shape parameters, ``loc`` and ``scale``
+    ``{normal = 0.05, tied = true}``            one draw for all names of a pattern or group
     ==========================================  ==================================================
 
-    Units are those of the state, input or joint, SI, as `monte_carlo` says.
+    Values are in the SI units of the state, input or joint, see `monte_carlo`.
 
     Parameters
     ----------
@@ -67,15 +67,15 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        {name: spread}, as `monte_carlo` takes it; what that finds wrong of a name or spread is
-        said with file and line.
+        {name: spread}, as `monte_carlo` takes it. If `monte_carlo` refuses a name or spread, its
+        message names file and line.
 
     Raises
     ------
     FileError
-        If it is not a regular file that can be read, or too large.
+        If the path is not a regular file, or the file cannot be read or is too large.
     UnknownNameError
-        If there is no such table, kind of spread, distribution or parameter; with file and line.
+        If a table, kind of spread, distribution or parameter is unknown; with file and line.
     InputError
         If the file is not TOML or a value is wrong; with file and line.
 
@@ -94,7 +94,7 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     table = document.record.get(_TABLE)
     for key in (*document.record, _TABLE):
         if key != _TABLE or not isinstance(table, dict) or not table:
-            problem = unknown("table", key, [_TABLE]) if key != _TABLE else "holds no spreads"
+            problem = unknown("table", key, [_TABLE]) if key != _TABLE else "contains no spreads"
             raise document.unknown(f"{problem}; write [{_TABLE}] and below it q_b = 0.05", key)
     found = DispersionFile()
     found.document = document
@@ -128,7 +128,7 @@ def _spread(value: Any) -> Any:
     right = {"normal": given is not entries, "uniform": len(entries) == 2, "values": given}
     if not others and all(map(is_number, entries)) and right.get(form):
         return tuple(entries) if form == "uniform" else given
-    raise InputError(f"{reprlib.repr(value)} is no spread, expected {_EXPECTED}")
+    raise InputError(f"{reprlib.repr(value)} is not a spread, expected {_EXPECTED}")
 
 
 def _distribution(distribution: str, **given: Any) -> Any:
@@ -146,8 +146,10 @@ def _distribution(distribution: str, **given: Any) -> Any:
         frozen = kind(**given)
         if abs(float(frozen.ppf(0.5))) < 1e100:
             return frozen
-        problem = f"is none with {', '.join(f'{key} = {x:g}' for key, x in given.items())}"
+        problem = f"is not defined for {', '.join(f'{key} = {x:g}' for key, x in given.items())}"
     except (TypeError, ValueError) as error:
         problem = str(error).partition("() ")[2] or str(error)
     shapes = f"{kind.shapes}, " if kind.shapes else ""
-    raise InputError(f"distribution {distribution} {problem}; it takes {shapes}loc, scale")
+    raise InputError(
+        f"distribution {distribution} {problem}; its parameters are {shapes}loc, scale"
+    )

@@ -1,4 +1,4 @@
-"""What is drawn at random from run to run: spreads by name, and the runs that come of the draws."""
+"""Dispersions: the spreads by name, and the robots and starts that their draws give."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Draws(NamedTuple):
 
 
 class Dispersions:
-    """What is drawn, see `monte_carlo`, and what draws make of a robot and its start x0 (nx,)."""
+    """Dispersions of `monte_carlo`, and the robots and starts x0 (nx,) that their draws give."""
 
     def __init__(
         self, given: Any, plant: Plant, policy: Any, x0: Array, seed: int, times: Times
@@ -93,8 +93,8 @@ class Dispersions:
             own, tied = untied(str(key), spread)
             if kind == "fails" and isinstance(own, int | float):
                 raise InputError(
-                    f"'{key}' is {own:g}, the deviation about 0 of a time; give (least, "
-                    "largest), a list of times or a distribution"
+                    f"'{key}' is {own:g}, a standard deviation about 0, which does not describe a "
+                    "time of failure; give (least, largest), a list of times or a distribution"
                 )
             inverse = deviation_of if kind == "noise" else inverse_of
             spreads = by_kind.setdefault(kind, {})
@@ -112,19 +112,19 @@ class Dispersions:
         for column, _, at in self._densities():
             if at in heavier:
                 one, other = heavier[at], self.names[column]
-                raise InputError(f"'{one}' and '{other}' both change a mass; give either")
+                raise InputError(f"'{one}' and '{other}' disperse the same mass; give one")
 
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:
             raise InputError(
-                f"'{next(iter(spreads))}.{kind}' is dispersed, and a "
-                f"{type(self._policy).__name__} has no sensors; StateFeedback, OutputFeedback and "
-                "LinearController do"
+                f"'{next(iter(spreads))}.{kind}' is dispersed, but a "
+                f"{type(self._policy).__name__} has no sensors; use a StateFeedback, "
+                "OutputFeedback or LinearController"
             )
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
-                f"{kind} is dispersed, which is of samples, and the policy is asked at every "
-                "stage; give sample=, a multiple of dt (--dt of a command)"
+                f"{kind} is dispersed, which needs a sampled policy, but this policy is "
+                "continuous; give sample=, a multiple of dt (--dt on the command line)"
             )
         try:
             found = by_name(f"{kind} to disperse", spreads, names)
@@ -136,7 +136,10 @@ class Dispersions:
         for at, (inverse, tied) in sorted(found.items()):
             own = names[at] if kind in ("state", "delay") else f"{names[at]}.{kind}"
             if kind in _OF_SPRINGS and not getattr(self._plant.robot.springs, kind)[at]:
-                raise InputError(f"'{own}' is dispersed, and is 0, which stays 0 times a factor")
+                raise InputError(
+                    f"'{own}' is dispersed by a factor, but its nominal value is 0; leave it out "
+                    "or give the robot a value"
+                )
             if kind == "misalignment":
                 require_direction(self._plant.robot, at)
             draws.setdefault(tied or own, (inverse, []))[1].append(at)
@@ -153,7 +156,7 @@ class Dispersions:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of what is drawn."""
+        """Names of the dispersed values."""
         return tuple(column.name for column in self.columns)
 
     def rows(self, start: int, stop: int) -> Draws:
@@ -227,14 +230,14 @@ class Dispersions:
                     run = int(bad.argmax())
                     bound = f" more than {least:g}" if np.isfinite(least) else " a finite number"
                     raise InputError(
-                        f"'{column.name}' is drawn as {values[run]:.4g} in run {start + run}, of "
-                        f"which no robot is made: expected{bound}; take a smaller spread, or a "
-                        "uniform one (least, largest)"
+                        f"'{column.name}' is drawn as {values[run]:.4g} in run {start + run}, "
+                        f"which gives no valid robot; expected{bound}. Take a smaller spread, or "
+                        "a uniform one (least, largest)"
                     )
             try:
                 self.starts(drawn)
             except ChartError as error:
-                said = f"a start is drawn that is no attitude, of runs {start} on"
+                said = f"an invalid initial attitude is drawn in the runs from {start} on"
                 raise InputError(f"{said}: {error}; take a smaller spread") from None
 
     def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:

@@ -1,4 +1,4 @@
-"""The region around a trajectory from which the loop that follows it ends inside a goal."""
+"""Funnel: the region around a trajectory from which the tracking loop reaches its goal."""
 
 from __future__ import annotations
 
@@ -144,52 +144,53 @@ def funnel(
     engine: str | None = None,
     **options: Any,
 ) -> Funnel:
-    r"""Measure from which errors the loop along a trajectory ends inside a goal.
+    r"""Estimate the errors from which the tracking loop along a trajectory reaches a goal.
 
     At each knot errors are drawn from an ellipsoid :math:`e^T P(t)\,e \le \rho` of the schedule's
-    cost to go, uniform in direction and evenly spread over the root of the level, and the nonlinear
-    robot is flown from there to the trajectory's end. The largest level that is tried is where one
-    in about sixteen starts fails, or where the attitude is 170 deg off. What is found is counted,
-    not proved.
+    cost to go: uniformly in direction, and evenly over the square root of the level. The nonlinear
+    robot is simulated from each error to the end of the trajectory. The largest level tried is the
+    level at which about one start in sixteen fails, or the attitude error reaches 170 deg. The
+    result is a statistical estimate, not a proof.
 
     Parameters
     ----------
     robot : Robot
     schedule : GainSchedule or TrajectoryFeedback
-        Of `tvlqr`, continuous or sampled.
+        Schedule designed by `tvlqr`, continuous or sampled.
     goal : mapping or float
         {"attitude" [deg], "position" [m], "joints" [rad|m], "turning" [rad/s], "moving" [m/s],
-        "rates" [rad/s|m/s]: largest error at the end}, each as of `Campaign`; or the level of
-        ``e' P e`` there.
+        "rates" [rad/s|m/s]: largest final error}, with the kinds of `Campaign`; or the largest
+        final value of ``e' P e``.
     within : mapping, optional
-        Largest errors on the way, as of `goal`.
+        Largest errors along the way, with the kinds of `goal`.
     knots : int or sequence of float
-        How many of the trajectory's knots, or times [s], to which the nearest are taken.
+        Number of knots of the trajectory, or times [s]; the knots nearest to them are taken.
     samples : int
         Runs from each knot.
     seed : int
-        The same seed gives the same result whoever does the runs.
+        Random seed. The same seed gives the same result for any executor or number of workers.
     confidence : float
-        Of the intervals.
+        Confidence level of the intervals.
     executor, workers, threads, engine : optional
-        As of `monte_carlo`; each does a knot at a time.
+        As in `monte_carlo`; each task is one knot.
     progress : callable, optional
-        ``progress(done, total)`` is called with the number of knots.
+        Function ``progress(done, total)``, called with numbers of knots.
     **options
-        Of `simulate`: dt, method, project, sample, delay, limits, disturbance.
+        Options of `simulate`: dt, method, project, sample, delay, limits, disturbance.
 
     Returns
     -------
     Funnel
+        Ellipsoids of errors at the knots, with success rates and their intervals.
 
     Raises
     ------
     InputError
-        If a size or value is wrong, or the schedule has no knot of the trajectory.
+        If a size or value is wrong, or no time of the schedule is a knot of the trajectory.
     UnknownNameError
-        If there is no such kind of error or option.
+        If a kind of error or an option is unknown.
     FflinError
-        If a process of the executor died.
+        If a worker process died.
 
     References
     ----------
@@ -279,7 +280,9 @@ def _places(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int,
     both = np.flatnonzero(np.abs(own[at] - t) <= 1e-6 * (by.dt or t[-1]))
     both = both[both < len(t) - 1]
     if not len(both):
-        raise InputError("the schedule is of other times than the trajectory")
+        raise InputError(
+            "no time of the schedule is a knot of the trajectory; design it on this trajectory"
+        )
     if dimension("knots", knots) == 0:
         chosen = both[np.linspace(0, len(both) - 1, whole("knots", knots, 1)).round().astype(int)]
     else:
@@ -287,7 +290,7 @@ def _places(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int,
         times = vector("knots", times, times.size, "times of knots")
         chosen = both[np.abs(motion.t[both] - times[:, None]).argmin(axis=1)]
     if not len(chosen):
-        raise InputError("knots is empty; give how many, or times [s]")
+        raise InputError("knots is empty; give a number of knots, or times [s]")
     return [(k, int(at[k])) for k in sorted({*chosen.tolist()})]
 
 

@@ -1,4 +1,4 @@
-"""Eight runs side by side in the compiled loop, each with a robot and a start of its own."""
+"""Eight parallel runs in the compiled loop, each with its own robot and start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many runs of a closed loop with what is uncertain drawn at random."""
+"""Monte Carlo simulation of a closed loop with random parameters, starts and sensor errors."""
 
 from __future__ import annotations
 
@@ -69,93 +69,102 @@ def monte_carlo(
     engine: str | None = None,
     **options: Any,
 ) -> Campaign:
-    r"""Simulate a robot under a policy many times, with what is uncertain drawn at random.
+    r"""Run a Monte Carlo campaign: simulate a policy many times with dispersed parameters.
 
-    Each run is one of `simulate`. With numba the compiled loop does eight at a time. What is kept
-    of a run does not depend on its duration, and any of them can be flown again.
+    Each run is a call of `simulate`. With numba the compiled loop computes eight runs at a time.
+    The record of a run has a fixed size, and `Campaign.replay` simulates any run again.
 
     Parameters
     ----------
     robot : Robot
     policy : policy, GainSchedule or None
-        As of `simulate`.
+        Policy as in `simulate`.
     dispersions : mapping
-        {name, group or pattern: spread}, or what `load_dispersions` read. A name is one of
+        {name, group or pattern: spread}, or the dispersions that `load_dispersions` read. A spread
+        is one of
 
-        - a state, ``q_b``, ``r_b.x``, ``q_m.*``, ``omega_b``: added to the start;
-        - ``BODY.mass`` and ``BODY.inertia`` of ``base`` or the body of a joint, relative as in
-          `Robot.perturbed`: the mass is multiplied by 1 + d and the inertia with it, each second
-          moment per mass along the axes of its frame by 1 + d. The pseudo-inertia stays positive;
-        - ``BODY.com`` [m]: the centre of mass is moved along each axis of its frame, mass and
-          inertia about it held, as ``LINK.com.x`` of `sensitivity` and `uncertain`;
-        - ``LINK.density``, relative, of a link by its name in the URDF, also of one fixed to
-          another: all of its mass and inertia are multiplied by 1 + d, as in `sensitivity` and
-          `uncertain`, whose ``LINK.mass`` holds the inertia;
-        - ``INPUT.gain``, relative, and ``INPUT.bias`` [N m|N]: (1 + d) u + b acts of a command u;
-          ``INPUT.fails`` [s]: nothing acts of it from that time on. Inputs that are recorded are
-          the commands, also of what has failed;
-        - ``INPUT.misalignment`` [rad]: the direction of a thruster, the axis of a wheel or one of
-          tau_b or F_b is turned about two axes across it, by an angle drawn for each;
-        - ``NAME.sensor``: added to a state that a `StateFeedback` reads, or to an output that an
-          `OutputFeedback`, `LinearController` or `TrajectoryOutputFeedback` measures;
-          ``NAME.noise``: white noise added to it at each sample, a number its standard deviation,
-          and of another spread each run has one of its own;
-        - ``delay`` [s]: added to that of `simulate`, to the next whole step and 0 or more;
+        - a number: the standard deviation of a normal distribution about 0;
+        - a tuple (least, largest): a uniform distribution;
+        - a list of values, all equally likely;
+        - a frozen distribution of scipy.stats.
+
+        Each name in a pattern or group is drawn independently; ``{"range": spread, "tied": True}``
+        makes one draw for all of them. A name is one of
+
+        - a state, ``q_b``, ``r_b.x``, ``q_m.*``, ``omega_b``: added to the initial state.
+        - ``BODY.mass`` and ``BODY.inertia``, relative, of ``base`` or the body of a joint, as in
+          `Robot.perturbed`. ``mass`` multiplies mass and inertia by 1 + d. ``inertia`` multiplies
+          each second moment per mass along the axes of the body's frame by 1 + d. The
+          pseudo-inertia stays positive definite.
+        - ``BODY.com`` [m]: shift of the centre of mass along each axis of the body's frame. Mass
+          and inertia about the centre of mass are unchanged, as for ``LINK.com.x`` in
+          `sensitivity` and `uncertain`.
+        - ``LINK.density``, relative, of a link by its name in the URDF, including links fixed to
+          another link: its mass and inertia are multiplied by 1 + d. `sensitivity` and `uncertain`
+          use the same name; their ``LINK.mass`` leaves the inertia unchanged.
+        - ``INPUT.gain``, relative, and ``INPUT.bias`` [N m|N]: a command u acts as (1 + d) u + b.
+          ``INPUT.fails`` [s]: the input is zero from that time on. The recorded inputs are the
+          commands, even after a failure.
+        - ``INPUT.misalignment`` [rad]: rotates the direction of a thruster, the axis of a wheel, or
+          an axis of tau_b or F_b about two perpendicular axes. Each angle is drawn independently.
+        - ``NAME.sensor``: offset of a state that a `StateFeedback` reads, or of an output that an
+          `OutputFeedback`, `LinearController` or `TrajectoryOutputFeedback` measures.
+          ``NAME.noise``: white noise added at each sample. A number is its standard deviation; any
+          other spread draws one standard deviation for each run.
+        - ``delay`` [s]: added to the `delay` of `simulate`, rounded to whole steps, at least 0.
         - ``JOINT.stiffness`` and ``JOINT.damping``, relative.
-
-        A spread is a number, the standard deviation of a normal distribution about 0; a tuple
-        (least, largest), of a uniform one; a list of values, each as likely; or a frozen
-        distribution of scipy.stats. Each name that a pattern or group stands for is drawn for
-        itself; ``{"range": spread, "tied": True}`` draws once for all of them.
     runs : int
+        Number of runs.
     duration : float, optional
-        [s]; by default that of the trajectory that is followed.
+        Simulated time [s]; by default the duration of the followed trajectory.
     seed : int
-        The same seed draws the same, whatever the number of runs, workers and chunks, and whatever
-        else is dispersed.
+        Random seed. The same seed gives the same draws, independent of the number of runs, workers
+        and chunks, and of other dispersions.
     goals : sequence of str, optional
-        Conditions as `Campaign.fraction` takes them, ``"attitude < 1 deg"``; report and figure
-        show the shares that meet them and their bounds.
+        Conditions such as ``"attitude < 1 deg"``, see `Campaign.fraction`. The report and the
+        figure show the success rate of each goal and its interval.
     until : str, optional
-        One more of these: no more runs are made
-        once the interval of its share is no wider than `width`, which is looked at after 256 runs
-        and each time there are a quarter more.
+        Condition that stops the campaign early: no further runs are made once the confidence
+        interval of its success rate is at most `width` wide. The interval is checked after 256
+        runs, and whenever the number of runs has grown by a quarter.
     width, confidence : float
-        Of that interval; the confidence is that of the report's too.
+        Width and confidence level of that interval. The report uses the same confidence level.
     executor, workers, threads, progress : optional
-        As of `sweep`; an executor's workers import the modules of the policy.
+        As in `sweep`. The workers of an executor must be able to import the policy's modules.
     chunk : int, optional
-        Runs in a chunk, a multiple of 8; with `until` a part of 256.
+        Runs per chunk, a multiple of 8; with `until` also a divisor of 256.
     histories : int, optional
-        At how many times, evenly spread over the duration, errors and inputs of each run are kept,
-        as bands over time need them.
+        Number of evenly spaced times at which the errors and inputs of each run are recorded. The
+        bands of `plot_campaign` need them.
     out : str or Path, optional
-        .h5 or .npz file to write. It grows as NAME.part; the same call made again after a crash
-        goes on from the chunks that are there and intact. A .h5 file that has all of these runs
-        already is read, whatever goals it was made with.
+        File to write, .h5 or .npz. Unfinished results are kept in NAME.part: after a crash, the
+        same call resumes from its intact chunks. If a .h5 file already holds all of these runs, it
+        is read, even if its goals differ.
     overwrite : bool
-        Whether to replace a file `out` of another call or of something else; refused by default.
+        Whether to replace a file `out` that was not written by the same call; refused by default.
     engine : {"python", "compiled"}, optional
-        As of `simulate`.
+        As in `simulate`.
     **options
-        Of `simulate`: x0, q0, v0, dt, method, project, sample, delay, limits, disturbance, target,
-        frame, reference.
+        Options of `simulate`: x0, q0, v0, dt, method, project, sample, delay, limits, disturbance,
+        target, frame, reference.
 
     Returns
     -------
     Campaign
-        In the order of the runs. Where `out` is given, it is read from it as it is used.
+        Runs in their order. If `out` is given, arrays are read from that file on demand.
 
     Raises
     ------
     InputError
-        If a size or value is wrong, or a draw makes no robot, which is named.
+        If a size or value is wrong, or a draw gives no valid robot; the message names the draw.
     UnknownNameError
-        If there is nothing of a name.
+        If a name is unknown.
     SweepError
-        If a run cannot be done or a worker dies again and again; the chunk is named.
-    FileError, MissingPackageError
-        If the file cannot be written, or is there and of another call.
+        If a run fails or a worker dies repeatedly; the message names the chunk.
+    FileError
+        If the file cannot be written, or exists already and belongs to another call.
+    MissingPackageError
+        If a .h5 file is requested and h5py is not installed.
 
     References
     ----------
@@ -232,14 +241,16 @@ def monte_carlo(
 
 
 def _goals(given: Any, until: Any, shapes: Any, header: dict[str, Any]) -> list[str]:
-    """Return the goals; what is none is refused before anything is done."""
+    """Return the goals; an invalid goal is refused before any run."""
     goals = [given] if isinstance(given, str) else given
     if not isinstance(goals, list | tuple):
-        raise InputError(f"goals is a {type(given).__name__}, expected ['attitude < 1 deg']")
+        said = f"goals is a {type(given).__name__}"
+        raise InputError(f"{said}, expected a list such as ['attitude < 1 deg']")
     goals = [*goals, *([] if until is None or until in goals else [until])]
     for goal in goals:
         if not isinstance(goal, str):
-            raise InputError(f"a goal is a {type(goal).__name__}, expected 'attitude < 1 deg'")
+            said = f"a goal is a {type(goal).__name__}"
+            raise InputError(f"{said}, expected a text such as 'attitude < 1 deg'")
         Campaign.of(MemoryStore(1, 1, shapes).arrays, header | {"goals": []}).met(goal)
     return goals
 
@@ -262,9 +273,9 @@ def _require_own(path: Path | None, overwrite: bool, request: str = "") -> None:
         return
     try:
         found = Campaign.load(path)
-        there = f"holds another campaign: {found!r}, seed {found.seed}"
+        there = f"contains another campaign: {found!r}, seed {found.seed}"
     except FflinError:
-        there = "is there already and holds no campaign"
+        there = "exists already and is not a campaign"
     raise FileError(
         f"{path} {there}; name another file, or replace it with overwrite=True (--force)"
     )
@@ -302,8 +313,8 @@ def _require_sendable(job: CampaignJob) -> None:
         pickle.dumps(job)
     except Exception as error:  # what is sent has its own
         raise InputError(
-            f"robot, policy or spreads cannot be sent to workers ({error}); define what they are "
-            "made of at the top of a module, or leave workers and executor out"
+            f"robot, policy or spreads cannot be sent to workers ({error}); define their classes "
+            "and functions at the top level of a module, or leave workers and executor out"
         ) from None
 
 
@@ -317,12 +328,12 @@ def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
         return size
     size = -(-given // LANES) * LANES
     if staged and _STAGE % size:
-        raise InputError(f"chunk is {given}, expected a part of {_STAGE} with until, such as 32")
+        raise InputError(f"chunk is {given}, expected a divisor of {_STAGE} with until, such as 32")
     return size
 
 
 def _header(job: CampaignJob) -> dict[str, Any]:
-    """Return what a campaign has beside its arrays."""
+    """Return the header of a campaign: all that is not an array."""
     plan, plant = job.plan, job.plant
     wheels = {f"q_m.{name}" for name in plant.robot.wheels}
     steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - wheels}

@@ -1,4 +1,4 @@
-"""The figure of a campaign: bands over time with the worst runs on top, histograms, and whence."""
+"""The figure of a campaign: bands over time, worst runs, histograms and rank correlations."""
 
 from __future__ import annotations
 
@@ -21,27 +21,32 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Shares of the runs, from the widest band to the narrowest, and how dark each is.
-_BANDS = ((0.0, "all", 0.13), (0.05, "90 %", 0.22), (0.25, "50 %", 0.38))
+_BANDS = (
+    (0.0, "all runs", 0.13),
+    (0.05, "90 % of runs", 0.22),
+    (0.25, "50 % of runs", 0.38),
+)
 _INK, _GOAL = COLORS[0], "#555555"
 _WORST = (COLORS[1], COLORS[3], COLORS[4], COLORS[2], COLORS[7])
 _DECADES, _BARS, _BINS = 6, 10, 48
 
 
 def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: int = 3) -> Figure:
-    """Draw the errors of a campaign over time and at last, inputs, and what errors go with.
+    """Draw the error histories, final errors, inputs and rank correlations of a campaign.
 
-    Bands hold all runs, 90 and 50 % of them; on top are the worst runs by `Campaign.about`. A run
-    that was stopped is above all others from then on. Dashed lines are the bounds of the goals and
-    the limits of inputs. Without histories there are histograms alone.
+    Bands contain all, 90 % and 50 % of the runs. The worst runs by `Campaign.about` are drawn over
+    them. After a run is stopped early, it counts as worse than all others. Dashed lines mark the
+    bounds of the goals and the limits of the inputs. Without histories, the figure shows only
+    the histograms and the correlations.
 
     Parameters
     ----------
     campaign : Campaign
-        With ``histories`` for what is drawn over time.
+        Campaign to draw; its panels over time need ``histories`` in `monte_carlo`.
     path : str or Path, optional
-        .png, .pdf or .svg to save to.
+        File to save to: .png, .pdf or .svg.
     worst : int
-        How many runs are drawn on top, up to five.
+        Number of worst runs to draw, at most five.
 
     Returns
     -------
@@ -52,7 +57,7 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     MissingPackageError
         If matplotlib is not installed.
     FileError
-        If the ending is another or the file cannot be written.
+        If the file has another ending or cannot be written.
 
     Examples
     --------
@@ -100,7 +105,7 @@ def _bands(
         low, high = np.quantile(shown, (tail, 1.0 - tail), axis=0, method="inverted_cdf")
         axes.fill_between(t, low, high, color=_INK, alpha=dark, lw=0, label=name)
     half = np.quantile(shown, 0.5, axis=0, method="inverted_cdf")
-    axes.plot(t, half, color=_INK, lw=1.8, label="half")
+    axes.plot(t, half, color=_INK, lw=1.8, label="median")
     for color, run in zip(_WORST, runs, strict=False):
         known = np.where(np.isfinite(values[run]), values[run], np.nan)
         axes.plot(t, known, color=color, lw=1.1, label=f"run {run}")
@@ -126,8 +131,8 @@ def _goals(draw: Any, campaign: Campaign, *names: str) -> None:
 
 
 def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
-    """Draw how an error is spread, at last and at its worst, of the runs that were not stopped."""
-    names = {kind: ("at last", _INK), f"worst {kind}": ("at its worst", COLORS[1])}
+    """Draw histograms of the final and the worst error of the completed runs."""
+    names = {kind: ("final", _INK), f"worst {kind}": ("worst of run", COLORS[1])}
     of = {name: campaign.values(name)[~campaign.stopped] for name in names}
     values = np.append(list(of.values()), 0.0)
     most = float(values.max()) or 1.0
@@ -142,7 +147,7 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
         for p, style in ((0.5, "-"), (0.95, "-."), (0.99, ":")):
             at = campaign.quantile(name, p).value
             if math.isfinite(at):
-                axes.axvline(at, color=color, lw=1.2, ls=style, label=f"{100 * p:g} % below")
+                axes.axvline(at, color=color, lw=1.2, ls=style, label=f"{100 * p:g}th percentile")
     _goals(axes.axvline, campaign, *names)
     axes.set(xlabel=f"{kind} error [{KINDS[kind]}]", ylabel="runs", xlim=edges[[0, -1]])
 
@@ -159,18 +164,19 @@ def _inputs(
         axes.axhline(limit, ls="--", lw=1.0, color=_GOAL, label="goal or limit")
         axes.set_ylim(0.0, max(most, 1.08 * limit))
     units = "|".join(dict.fromkeys(campaign.input_units[at] for at in columns))
-    axes.set(title=f"largest of {group}", ylabel=f"[{units}]")
+    axes.set(title=f"largest |{group}|", ylabel=f"[{units}]")
 
 
 def _whence(axes: Axes, campaign: Campaign) -> None:
-    """Draw what the worst runs go with, beside what is drawn alike by chance."""
+    """Draw rank correlations with the default figure, and the band of chance correlations."""
     found = list(campaign.sensitivity().items())[:_BARS][::-1]
     doubt = min(1.0, 3.0 / math.sqrt(len(campaign)))
     axes.axvspan(-doubt, doubt, color="#999999", alpha=0.18, lw=0)
     colors = [_INK if size > 0.0 else COLORS[1] for _, size in found]
     axes.barh([name for name, _ in found], [size for _, size in found], color=colors, height=0.7)
     axes.axvline(0.0, color="#333333", lw=0.8)
-    axes.set(title=f"what the {campaign.about} goes with", xlabel="rank correlation; grey: chance")
+    axes.set(title=f"correlation with {campaign.about}")
+    axes.set(xlabel="rank correlation (grey: not significant)")
     axes.set(xlim=(-1.0, 1.0), xticks=(-1.0, -0.5, 0.0, 0.5, 1.0))
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", labelsize=8)

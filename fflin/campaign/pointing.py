@@ -1,4 +1,4 @@
-"""Inputs that push along other directions than they should: those of a run, and of many."""
+"""Misaligned inputs: the actual directions of thrusters, wheels, torques and forces."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def require_direction(robot: Robot, at: int) -> None:
     for item, names, first in _placed(robot):
         if first <= at < first + len(names) and isinstance(item, JointTorque):
             raise InputError(
-                f"'{names[0]}.misalignment' is dispersed, and a motor turns its joint about the "
-                "joint's axis; thrusters, wheels, tau_b and F_b have directions"
+                f"'{names[0]}.misalignment' is dispersed, but a motor acts along its joint's axis; "
+                "only thrusters, wheels, tau_b and F_b can be misaligned"
             )
 
 

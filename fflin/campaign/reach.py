@@ -1,4 +1,4 @@
-"""A funnel: ellipsoids of errors along a trajectory, with the runs that tell of them."""
+"""A funnel: ellipsoids of errors along a trajectory, with the outcomes of its runs."""
 
 from __future__ import annotations
 
@@ -38,32 +38,34 @@ def spread(P: Array) -> Array:
 class Funnel(Design):
     """Ellipsoids ``e' P(t) e <= rho`` of errors from a trajectory; prints as a table.
 
-    The errors are those of `linearize_trajectory`, P is the schedule's cost to go. A direction that
-    P gives no weight is not tried.
+    Errors are defined as in `linearize_trajectory`; P is the schedule's cost to go. Directions of
+    zero weight in P are not tested.
 
     Attributes
     ----------
     t : ndarray (m,)
-        Knots [s].
+        Times [s] of the knots.
     tried : ndarray (m,)
-        The largest level rho at which runs began, evenly spread over its root.
+        Largest level rho of the starts, which are spread evenly over its square root.
     outcomes : ndarray (m, N)
-        Of each run, by its level: 0 it ended inside the goal, 1 it was lost, 2 it went beyond
-        `within`, 3 it missed the goal.
+        Outcome of each run, in ascending order of level: 0 it reached the goal, 1 it was stopped
+        early, 2 it exceeded `within`, 3 it missed the goal.
     rho, inside, inside_rate : ndarray (m,)
-        The largest level up to which every run succeeded, how many these are, and the share of
-        starts up to there that succeeds at least, with `confidence`.
+        Largest level up to which every run succeeded, the number of these runs, and a lower bound,
+        with `confidence`, of the success rate of starts up to that level.
     rate : ndarray (m, 2)
-        Interval (Clopper and Pearson) of the share of all starts up to `tried` that succeeds.
+        Clopper-Pearson interval of the success rate of all starts up to the level `tried`.
     attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
-        Half axes in the base's attitude [deg] and position [m], and of each joint [rad|m].
+        Half-axes of the ellipsoids in base attitude [deg], base position [m] and each joint
+        [rad|m].
     goal, within : str
-        What a run had to keep to at its end, and on its way.
+        Bounds on the final errors of a run, and on its errors along the way.
     confidence : float
+        Confidence level of the intervals.
     at, P : ndarray (M,), (M, nx, nx)
-        Of the schedule.
+        Times [s] and cost to go of the schedule.
     knots, q, v, u, hold, frame
-        The trajectory, see `trajectory`.
+        The followed trajectory, see `trajectory`.
 
     Examples
     --------
@@ -118,12 +120,12 @@ class Funnel(Design):
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """What is followed."""
+        """The followed trajectory."""
         values: Any = (self.robot, self.knots, self.q, self.v, self.u)
         return Trajectory(*values, hold=self.hold, frame=self.frame)
 
     def level(self, t: float) -> float:
-        """Return rho at a time; between two knots the lesser of theirs."""
+        """Return rho at a time; between two knots, the smaller of their levels."""
         t = number("t", t)
         if not self.t[0] <= t <= self.t[-1]:
             raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
@@ -131,35 +133,35 @@ class Funnel(Design):
         return float(self.rho[near].min())
 
     def cost(self, t: float) -> Array:
-        """Return P (nx, nx) at a time, linear between the schedule's."""
+        """Return P (nx, nx) at a time, interpolated linearly in the schedule."""
         k = int(np.clip(self.at.searchsorted(t, "right") - 1, 0, len(self.at) - 2))
         part = float(np.clip((t - self.at[k]) / (self.at[k + 1] - self.at[k]), 0.0, 1.0))
         P: Array = (1.0 - part) * self.P[k] + part * self.P[k + 1]
         return P
 
     def root(self, t: float, *, smooth: bool = False) -> Array:
-        """Return W (nx, r): the ellipsoid at a time is of all W z with z of length 1 or less.
+        """Return W (nx, r); the ellipsoid at a time consists of all W z with |z| <= 1.
 
-        Smooth ones go over from knot to knot, as they are drawn.
+        With `smooth`, the level is interpolated between knots, as figures show it.
         """
         size = np.interp(t, self.t, np.sqrt(self.rho)) if smooth else np.sqrt(self.level(t))
         return size * spread(self.cost(t))
 
     def contains(self, t: float, x: Any = None, *, q: Any = None, v: Any = None) -> bool:
-        """Whether a state is inside at a time.
+        """Return whether a state is inside the funnel at a time.
 
         Parameters
         ----------
         t : float
-            [s], within the knots `t`.
+            Time [s] between the first and last of the knots `t`.
         x : array_like (nx,), optional
             State of ``StateMap(robot, frame="local")``.
         q, v : array_like (nq,), (nv,), optional
-            Instead of x, in Pinocchio's order; at rest where v is left out.
+            Configuration and velocity in Pinocchio's order, instead of x; at rest without v.
         """
         rho, state = self.level(t), StateMap(self.robot, frame="local")
         if x is None and q is None:
-            raise InputError("give x, or q and v")
+            raise InputError("no state is given; give x, or q and v")
         q, v = point_of(state, x, q, v, lambda: (q, v))
         e = moving_error(state, *self.trajectory.flow.at(float(t))[:2], q, v)
         return bool(e @ self.cost(t) @ e <= rho)
@@ -171,24 +173,25 @@ class Funnel(Design):
     def __str__(self) -> str:
         count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
         head = f"{self.robot.name}: errors from which every run ends with {self.goal}"
-        head += f", {self.within} on its way" * bool(self.within) + f"; {count} runs a knot"
-        tail = (
-            "base, joint: largest half axes; runs: those inside, all of which succeeded (+: of all "
-            "that were tried); sure: at least so many of the starts inside succeed, of all: of "
-            f"those up to the largest level that was tried ({sure} confidence)"
-        )
-        rows = [["t [s]", "rho", "base [deg]", "base [m]", "joint", "runs", "sure", "of all"]]
+        head += f", and on the way {self.within}" * bool(self.within) + f"; {count} runs per knot"
+        tail = [
+            "base, joint: largest half-axes",
+            "runs: number of starts inside, all of which succeeded (+: all starts that were tried)",
+            f"inside: lower bound of the success rate of starts inside ({sure} confidence)",
+            "tried: interval of the success rate of starts up to the largest level that was tried",
+        ]
+        rows = [["t [s]", "rho", "base [deg]", "base [m]", "joint", "runs", "inside", "tried"]]
         wide = (self.attitude, self.position, self.joints)
         for k, (low, high) in enumerate(100.0 * self.rate):
             reach = [f"{each[k].max(initial=0.0):.3g}" for each in wide]
             many = f"{self.inside[k]}{' +' if self.inside[k] == count else ''}"
             shares = [f"{100.0 * self.inside_rate[k]:.1f} %", f"{low:.0f}-{high:.0f} %"]
             rows.append([f"{self.t[k]:.4g}", f"{self.rho[k]:.3g}", *reach, many, *shares])
-        return "\n".join([folded([head]), "", grid(rows, "r"), "", folded([tail])])
+        return "\n".join([folded([head]), "", grid(rows, "r"), "", folded(tail)])
 
     @classmethod
     def load(cls, path: str | Path, robot: Robot) -> Funnel:  # type: ignore[override]
-        """Read what `save` wrote, of a robot; errors as of `Gain.load`."""
+        """Read a funnel of a robot from a file that `save` wrote; errors as in `Gain.load`."""
         return cls._read(as_path(path), robot=robot)
 
 

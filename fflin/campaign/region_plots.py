@@ -1,4 +1,4 @@
-"""Figures of regions: how far a linear model and its loop reach, and a funnel."""
+"""Figures of the validity of a linear model, and of a funnel."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ if TYPE_CHECKING:
 
 
 def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
-    """Draw how far a linear model foresees the nonlinear loop, and which random runs settled.
+    """Draw the prediction error of a linear model, and the numbers of runs that settled.
 
     Parameters
     ----------
     validity : Validity
+        Result of `fflin.validity`.
     path : str or Path, optional
-        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
 
     Examples
     --------
@@ -35,7 +36,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     """
     if not isinstance(validity, Validity):
         raise InputError(
-            f"validity is a {type(validity).__name__}, expected what fflin.validity returns"
+            f"validity is a {type(validity).__name__}, expected a Validity, as fflin.validity "
+            "returns it"
         )
     percent = 100.0
     with drawing(path, 9.0, 4.3) as figure:
@@ -47,7 +49,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
         if np.isfinite(validity.slope):
             order += f", ~ displacement^{validity.slope - 1.0:.2f}"
         left.loglog(percent * levels, percent * errors, "o-", color=COLORS[0], ms=3, label=order)
-        trust = f"trusted up to {percent * TRUSTED:g} %"
+        trust = f"accepted error: {percent * TRUSTED:g} %"
         left.axhline(percent * TRUSTED, color="#888888", lw=0.8, label=trust)
         left.set_xticks(percent * validity.levels, [f"{percent * x:.3g}" for x in validity.levels])
         left.minorticks_off()
@@ -74,7 +76,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
         figure.legend(loc="outside lower center", ncols=4)
         figure.suptitle(
             f"{validity.robot}, up to {shown(validity.largest, validity.joint_unit)}; "
-            f"{percent * low:.1f} to {percent * high:.1f} % settle "
+            f"{percent * low:.1f} to {percent * high:.1f} % of displacements settle "
             f"({percent * validity.confidence:g} % confidence)",
             fontsize=10,
         )
@@ -82,13 +84,14 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
 
 
 def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
-    """Draw how far a funnel reaches at each knot, and the share of starts that succeeds.
+    """Draw the half-axes of a funnel at each knot, and the success rates of its starts.
 
     Parameters
     ----------
     funnel : Funnel
+        Result of `fflin.funnel`.
     path : str or Path, optional
-        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
 
     Examples
     --------
@@ -100,7 +103,8 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
     >>> figure = fflin.plot_funnel(reach, "funnel.png")
     """
     if not isinstance(funnel, Funnel):
-        raise InputError(f"funnel is a {type(funnel).__name__}, expected what fflin.funnel returns")
+        said = f"funnel is a {type(funnel).__name__}, expected a Funnel"
+        raise InputError(f"{said}, as fflin.funnel returns it")
     t, percent = funnel.t, 100.0
     reach = {
         "attitude [deg]": funnel.attitude,
@@ -116,14 +120,14 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
             ax.fill_between(t, half.max(axis=1), color=color, alpha=0.15)
             ax.set(ylabel=name, ylim=(0.0, None))
         low, high = percent * funnel.rate.T
-        axes[-1].fill_between(t, low, high, color="#888888", alpha=0.3, label="of all tried")
+        axes[-1].fill_between(t, low, high, color="#888888", alpha=0.3, label="all starts tried")
         inside = percent * funnel.inside_rate
-        axes[-1].plot(t, inside, "o-", color="#000000", ms=3, label="of those inside, at least")
-        axes[-1].set(xlabel="t [s]", ylabel="succeed [%]", ylim=(0.0, 102.0))
+        axes[-1].plot(t, inside, "o-", color="#000000", ms=3, label="starts inside, lower bound")
+        axes[-1].set(xlabel="t [s]", ylabel="success rate [%]", ylim=(0.0, 102.0))
         figure.legend(loc="outside lower center", ncols=2)
         figure.suptitle(
             f"{funnel.robot.name}: errors from which every run ends with {funnel.goal}\n"
-            f"half axes; {percent * funnel.confidence:g} % confidence",
+            f"half-axes; {percent * funnel.confidence:g} % confidence",
             fontsize=10,
         )
     return figure

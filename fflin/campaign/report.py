@@ -1,4 +1,4 @@
-"""What is said of a campaign: how its runs ended, how large their errors were, and whence."""
+"""Report of a campaign: outcomes, error quantiles, success rates and rank correlations."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _SHARES = (0.5, 0.95, 0.99)
 
 
 def campaign_report(campaign: Any) -> str:
-    """Show the quantiles of the errors, shares of goals, and what the errors go with."""
+    """Return the report: error quantiles, success rates of goals, and rank correlations."""
     count, quantile = len(campaign), campaign.quantile
     by = ", compiled" if campaign.engine == "compiled" else ""
-    few = f" of {campaign.asked:,} asked for" if count < campaign.asked else ""
+    few = f" of {campaign.asked:,} requested" if count < campaign.asked else ""
     title = f"{campaign.robot}: {count:,} runs{few}, {campaign.duration:g} s each"
-    rows = [["error", "unit", "half", "95 %", "99 %", "worst 95 %", "settled after [s]"]]
+    rows = [["error", "unit", "median", "95 %", "99 %", "worst, 95 %", "settling, 95 % [s]"]]
     for name, unit in KINDS.items():
         figures = [quantile(name, p).value for p in _SHARES]
         figures.append(quantile(f"worst {name}", 0.95).value)
@@ -26,19 +26,19 @@ def campaign_report(campaign: Any) -> str:
     told = [goal_met(campaign, goal) for goal in campaign.goals]
     for name, found in whence(campaign).items():
         first = ", ".join(f"{key}\u00a0{value:+.2f}" for key, value in list(found.items())[:4])
-        told.append(f"{name} goes with (rank correlation): {first or 'nothing that is told'}")
+        told.append(f"rank correlations with {name}: {first or 'none significant'}")
     head = folded([f"{title}, seed {campaign.seed}{by}", ended_of(campaign)])
     return "\n".join([head, "", grid(rows, "ll"), "", folded(told)])
 
 
 def ended_of(campaign: Any) -> str:
-    """Say how many runs came to their end, and why others did not."""
+    """Return how many runs completed, and how the others ended."""
     said = ", ".join(f"{number:,} {word}" for word, number in _stops(campaign).items())
-    return f"{int((campaign.stop == 0.0).sum()):,} came to their end; {said or 'none was stopped'}"
+    return f"{int((campaign.stop == 0.0).sum()):,} completed; {said or 'none stopped early'}"
 
 
 def goal_met(campaign: Any, goal: str) -> str:
-    """Say which share of the runs meets a goal."""
+    """Return the success rate of a goal, with its interval."""
     met = campaign.fraction(goal, confidence=campaign.confidence)
     value, low, high = (f"{100.0 * x:.4g}" for x in met)
     return f"{goal}: {value} % ({low} to {high} % at {100.0 * campaign.confidence:g} % confidence)"
@@ -58,7 +58,7 @@ def worst_runs(campaign: Any, k: int) -> list[str]:
     if not k:
         return []
     about, (values, unit) = campaign.about, campaign.figure(campaign.about)
-    rows = [["run", about, "unit", "settled after [s]", "ended at [s]", "drawn, above all"]]
+    rows = [["run", about, "unit", "settling [s]", "end [s]", "most influential draw"]]
     ranks = campaign.drawn.argsort(axis=0).argsort(axis=0)
     weights = {key.strip("|"): abs(x) for key, x in campaign.sensitivity().items()}
     # The seed of a run's noise tells nothing.

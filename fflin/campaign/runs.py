@@ -1,4 +1,4 @@
-"""The runs of a campaign, chunk by chunk: eight at a time compiled, or one by one in Python."""
+"""Computation of the runs in chunks: eight at a time compiled, or one by one in Python."""
 
 from __future__ import annotations
 
@@ -205,6 +205,6 @@ def done_by(
     store = MemoryStore(count, least * min(max(share, 1), 32), job.shapes)
     failed = run_chunks(job, rows, store, executor=executor, threads=threads, progress=progress)
     if failed:
-        died = "a process that did the runs died: " if executor else ""
+        died = "a worker process died: " if executor else ""
         raise FflinError(f"{died}{failed[0].reason}")
     return dict(store.arrays)

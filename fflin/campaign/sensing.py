@@ -1,4 +1,4 @@
-"""Errors of what a policy reads, sample after sample."""
+"""Sensor errors of the states or outputs that a policy reads, sample by sample."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A regulated robot: a norm of its errors, its displacements, and runs that tell if it settles.
+"""Settling of a regulated robot: error norm, random displacements, and runs from them.
 
-The norm is of the linear loop's Lyapunov function that decays as the robot's energy does.
+The norm belongs to the Lyapunov function of the linear loop that decays as the robot's energy does.
 """
 
 from __future__ import annotations
@@ -132,8 +132,8 @@ class Loop:
         state = StateMap(self.robot, reference=self.lin.reference, frame=frame)
         if not np.allclose(state.to_state(self.lin.q, self.lin.v)[:3], 0.0, atol=1e-9):
             raise InputError(
-                "the base of the point is turned against the reference, where frames have "
-                "different models; compare them on a model made without a reference"
+                "the base of the operating point is rotated relative to the reference, so that "
+                "models in other frames differ; compare frames on a model made without reference="
             )
         return replace(self, lin=replace(self.lin, frame=state.frame))
 
@@ -158,7 +158,7 @@ class SettlingJob(CampaignJob):
             raise InputError(
                 f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
                 f"1/s: a run would take {horizon / dt:.3g} steps, expected at most "
-                f"{_MOST_STEPS:,}; give a gain whose poles are less apart, or damp what swings"
+                f"{_MOST_STEPS:,}; give a gain whose poles are closer together, or add damping"
             )
         if not lin.dt:
             self.every = max(1, int(horizon / dt / _LOOKS)) if foresees else 4
@@ -215,7 +215,7 @@ class SettlingJob(CampaignJob):
 
 
 class Judged(NamedTuple):
-    """How runs ended: which of OUTCOMES (N,), and the largest error of the prediction (N,)."""
+    """Results of runs: index into OUTCOMES (N,), and largest prediction error (N,)."""
 
     outcome: Array
     error: Array
@@ -282,7 +282,8 @@ def flown(job: SettlingJob, rows: Any, runs: Any, how: dict[str, Any]) -> dict[s
 def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     """Return the loop of a gain, or raise `InputError` where it cannot settle at the point."""
     if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
-        raise InputError("expected a fflin.Robot, its fflin.LinearModel and a gain")
+        given = f"robot is a {type(robot).__name__}, lin is a {type(lin).__name__}"
+        raise InputError(f"{given}; expected a fflin.Robot and its fflin.LinearModel")
     K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
     kept = getattr(gain, "regulated", ())
     part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
@@ -291,12 +292,15 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     loop = Loop(robot, lin, K)
     require_fit(lin, robot, loop.state)
     if not len(lin.x0):
-        raise InputError(f"the model of '{lin.robot}' has no states; nothing is to settle")
+        raise InputError(f"the model of '{lin.robot}' has no states, so nothing can settle")
     if lin.moving or not lin.is_equilibrium() or lin.v.any():
-        raise InputError("the point is no fixed point at rest; its loop cannot settle there")
+        raise InputError(
+            "the operating point is not an equilibrium at rest, so its loop cannot settle there; "
+            "linearise about an equilibrium"
+        )
     if not loop.decay > 0.0:
         raise InputError(
-            f"the linear loop is not stable: its slowest pole grows with {-loop.decay:.3g} 1/s; "
+            f"the linear loop is not stable: a mode grows at {-loop.decay:.3g} 1/s; "
             "design the gain with fflin.lqr"
         )
     return loop

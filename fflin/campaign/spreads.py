@@ -1,4 +1,4 @@
-"""Spreads: the inverse distribution functions of what is drawn."""
+"""Spreads: inverse distribution functions of the dispersed values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
         except Exception:  # of what may call itself a distribution
             middle = np.nan
         if not np.isfinite(middle):
-            raise InputError(f"the distribution of '{name}' has no median; freeze it first")
+            raise InputError(
+                f"the distribution of '{name}' has no median; give a frozen distribution"
+            )
         return spread.ppf
     if isinstance(spread, tuple):
         if len(spread) != 2:
@@ -34,11 +36,11 @@ def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
     if isinstance(spread, list | np.ndarray):
         values = [number(f"'{name}'", each) for each in np.ravel(spread).tolist()]
         if not values:
-            raise InputError(f"'{name}' has no values to choose from")
+            raise InputError(f"'{name}' is a list without values; give at least one")
         return partial(_choice, np.array(values))
     deviation = number(f"'{name}'", spread)
     if deviation < 0.0:
-        raise InputError(f"'{name}' is {deviation:g}, expected a standard deviation of 0 or more")
+        raise InputError(f"'{name}' is {deviation:g}, expected a standard deviation of at least 0")
     return partial(_normal, deviation)
 
 

@@ -1,4 +1,4 @@
-"""What is kept of a run while it goes on: where it ends, its worst, and since when it is settled.
+"""Run statistics, updated while a run goes on: final and largest errors, and settling time.
 
 Its size does not depend on how long the run is.
 """
@@ -29,7 +29,7 @@ STOPS = ("", "diverged", "left the chart", "stopped")
 
 
 class Outcome(NamedTuple):
-    """How runs ended, a row of each array for each."""
+    """Outcomes of runs, one row of each array per run."""
 
     q: Array  # (N, nq), at last
     v: Array  # (N, nv)

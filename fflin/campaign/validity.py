@@ -1,4 +1,4 @@
-"""How far from its point a linear model can be trusted, and its loop holds."""
+"""Validity of a linear model: its prediction error, and the settling of its loop."""
 
 from __future__ import annotations
 
@@ -37,42 +37,44 @@ TRUSTED = 0.1  # relative prediction error up to which the linear model is calle
 
 @dataclass(frozen=True, eq=False)
 class Validity(FrozenArrays):
-    """How far a linear model and its loop reach; prints in words.
+    """Range of validity of a linear model and its loop; prints in words.
 
-    A level is a share of the largest displacement: base attitude, base position and joints
-    together, in a random direction.
+    A level is a fraction of the largest displacement. Base attitude, base position and joints are
+    displaced together, in a random direction.
 
     Attributes
     ----------
     levels : ndarray (k,)
-        At which the prediction was measured.
+        Levels at which the prediction error was measured.
     prediction_error : ndarray (k,)
         Largest error of the linear closed loop over three of its time constants, relative to the
-        displacement, in the norm of its Lyapunov function; NaN where a run left the chart.
+        displacement, in the norm of its Lyapunov function. NaN if a run left the chart.
     slope : float
-        Order of the error itself in the displacement, over the four smallest levels: 2. NaN where
-        one of these is of the size of the integration's errors, or left the chart.
+        Order of the absolute error in the displacement, over the four smallest levels; 2 is
+        expected. NaN if one of these errors is as small as the integration error, or a run left
+        the chart.
     trusted : dict
-        {"attitude" [deg], "position" [m], "joint" [joint_unit]} where `prediction_error` reaches
-        10 %.
+        Displacement {"attitude" [deg], "position" [m], "joint" [joint_unit]} at which
+        `prediction_error` reaches 10 %.
     sampled : ndarray (N,)
         Levels of the random runs, ascending.
     outcomes : tuple of str
-        Of each: "settled", "slow", "chart" or "diverged".
+        Outcome of each random run: "settled", "slow", "chart" or "diverged".
     holds : dict
-        The displacement like `trusted` below which every run settled.
+        Displacement, with the keys of `trusted`, up to which every run settled.
     inside, inside_rate : int, float
-        Runs up to there; at least this share of displacements up to there settles, with
-        `confidence`.
+        Number of runs up to `holds`, and a lower bound, with `confidence`, of the fraction of
+        displacements up to `holds` that settle.
     rate : tuple of float
-        Interval (Clopper and Pearson) of the share of all displacements that settles.
+        Clopper-Pearson interval of the fraction of all displacements that settle.
     confidence : float
+        Confidence level of the intervals.
     joint_unit : str
-        "rad" or "m" where all joints are of one kind, else "rad|m".
+        "rad" or "m" if all joints are of one kind, else "rad|m".
     frame : str
-        In whose axes rates and inputs of the base are fed back.
+        Frame in whose axes base velocities and inputs are fed back.
     frames : dict
-        {frame: Validity} of the others that were asked for.
+        {frame: Validity} of the other frames that were requested.
 
     Examples
     --------
@@ -113,34 +115,34 @@ class Validity(FrozenArrays):
         low, high = self.rate
         ends = Counter(self.outcomes)
         failures = ", ".join(f"{ends[key]} {words}" for key, words in _ENDS.items() if ends[key])
-        order = "no order of the error can be told"
+        order = "the order of the error cannot be determined"
         if np.isfinite(self.slope):
             order = f"the error grows with the displacement to the power {self.slope:.3f}"
         beyond = " and beyond" if self.trusted == self.largest else ""
         first = shown(scaled(self.largest, float(self.sampled[0])), self.joint_unit)
         lines = [
-            f"{self.robot}: the linear loop foresees the nonlinear one within "
+            f"{self.robot}: the linear loop predicts the nonlinear loop within "
             f"{100.0 * TRUSTED:g} % up to {trusted}{beyond}; {order}",
-            f"every loop settled up to {holds}: {self.inside} of {self.inside} runs, "
-            f"so that at least {100.0 * self.inside_rate:.1f} % do ({sure} confidence)"
+            f"every run settled up to {holds}: {self.inside} of {self.inside} runs, "
+            f"so at least {100.0 * self.inside_rate:.1f} % settle there ({sure} confidence)"
             if self.inside
-            else f"even from the smallest displacement tried, {first}, it did not settle",
-            f"of displacements up to {largest} {self.settled} of {count} runs settled: "
-            f"between {100.0 * low:.1f} and {100.0 * high:.1f} % do ({sure} confidence)"
+            else f"the run from the smallest displacement tried, {first}, did not settle",
+            f"up to {largest}: {self.settled} of {count} runs settled, "
+            f"so {100.0 * low:.1f} to {100.0 * high:.1f} % settle there ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]
         for each in (self, *self.frames.values()) if self.frames else ():
             upto = shown(each.holds, self.joint_unit)
             lines.append(
-                f"fed back in frame {each.frame}: {each.settled} of {count} runs settled, "
-                + (f"every one up to {upto}" if each.inside else "not even the smallest")
+                f"feedback in frame {each.frame}: {each.settled} of {count} runs settled, "
+                + (f"all up to {upto}" if each.inside else "not even the smallest displacement")
             )
         return folded(lines)
 
 
 _ENDS = {
-    "slow": "were still on their way",
-    "chart": "came near a turn of 180 deg",
+    "slow": "were still settling",
+    "chart": "approached a rotation of 180 deg",
     "diverged": "diverged",
 }
 
@@ -164,50 +166,56 @@ def validity(
     progress: Progress | None = None,
     engine: str | None = None,
 ) -> Validity:
-    """Measure how far from its point a linear model can be trusted, and its loop holds.
+    """Measure up to which displacements a linear model predicts, and its loop settles.
 
-    The nonlinear robot under ``u = u0 - K (x - x0)``, held between samples where the model is
-    sampled, is followed from displacements at the point's velocity: from growing ones beside the
-    linear prediction, and from random ones until the error is a thousandth of the first. A run
-    that takes three times as long as the slowest pole needs has not settled. With numba eight runs
-    go at a time.
+    The nonlinear robot is simulated under ``u = u0 - K (x - x0)``, held between samples if the
+    model is sampled. All runs start at displaced configurations with the operating point's
+    velocity. There are two sets of runs:
+
+    - Displacements of growing size, to compare the motion with the linear prediction.
+    - Random displacements. A run has settled when its error falls to a thousandth of its initial
+      value, within three times the time that the slowest pole needs.
+
+    With numba the compiled loop computes eight runs at a time.
 
     Parameters
     ----------
     robot : Robot
-        Of the model, with the same inputs.
+        Robot of the model, with the same inputs.
     lin : LinearModel
-        About a fixed point, whole or reduced, continuous or sampled.
+        Model about an equilibrium, full or reduced, continuous or sampled.
     gain : Gain or array_like (nu, nx)
-        K, which makes the linear loop stable.
+        Gain K, which must stabilise the linear loop.
     attitude, position, joint : float
-        Largest displacement of the base [deg], [m], and of the joint displaced most [rad|m]. What
-        is not among the states of a reduced model, or not regulated, is not displaced, and given
-        as 0.
+        Largest displacement of the base [deg] and [m], and of the most displaced joint [rad|m].
+        States that a reduced model lacks, or that are not regulated, are not displaced, and their
+        displacement is reported as 0.
     samples, seed : int
-        Number of random runs; the same seed gives the same result whoever does them.
+        Number of random runs, and random seed. The same seed gives the same result for any executor
+        or number of workers.
     confidence : float
-        Of the intervals.
+        Confidence level of the intervals.
     frames : sequence of {"hybrid", "local", "world"}
-        In whose axes the same linear loop is to be tried too, from the same displacements; the
-        base of the point must not be turned against the reference.
+        Further frames in whose axes to test the same linear loop, from the same displacements. The
+        base of the operating point must not be rotated relative to the reference.
     limits : optional
-        What cuts the inputs, as of `simulate`, where thrusters never pull; by default the loop is
-        free of any.
+        Limits at which the inputs saturate, as in `simulate`, where thrusters never pull. By
+        default no input saturates.
     executor, workers, threads, engine, progress : optional
-        As of `monte_carlo`; ``progress(done, total)`` counts all runs, random or not.
+        As in `monte_carlo`; ``progress(done, total)`` counts the runs of both sets.
 
     Returns
     -------
     Validity
+        Prediction errors, outcomes of the random runs, and success rates with their intervals.
 
     Raises
     ------
     InputError
-        If the linear loop is unstable, the point is no fixed point, the loop's poles are so far
-        apart that a run takes a million steps, or an argument has a wrong size or value.
+        If the linear loop is unstable, the operating point is not an equilibrium, the poles are so
+        far apart that a run takes a million steps, or an argument has a wrong size or value.
     FflinError
-        If a process of the executor died.
+        If a worker process died.
 
     References
     ----------
@@ -227,7 +235,7 @@ def validity(
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)
     if isinstance(frames, str) or not isinstance(frames, Iterable):
-        raise InputError(f"frames is {frames!r}, expected several, such as ('hybrid', 'local')")
+        raise InputError(f"frames is {frames!r}, expected a sequence such as ('hybrid', 'local')")
     refuse_orbit((frames := tuple(frames)) and robot, "loops in other `frames`")
     loops = {loop.lin.frame: loop} | {each: loop.fed_back_in(each) for each in frames}
     check_workers(executor, workers, threads, None, progress)
@@ -253,7 +261,7 @@ def validity(
 def _displaced(
     loop: Loop, largest: dict[str, float], seed: int, levels: Array | None, runs: Any, *at: int
 ) -> Draws:
-    """Return where some runs begin, beside the point, each by a random stream of its own."""
+    """Return the displaced starts of some runs, each from its own random stream."""
     drawn, runs = [], runs[slice(*at)]
     for run in runs.tolist():
         stream, level = run // len(_LEVELS), _LEVELS[run % len(_LEVELS)]
@@ -295,7 +303,7 @@ def _judged(
 
 
 def _slope(errors: Array) -> float:
-    """Return the order of the error itself, one more than that of the relative error."""
+    """Return the order of the absolute error, one more than the order of the relative error."""
     if not errors[:4].min() > _ROUNDING:
         return np.nan
     return 1.0 + float(np.polyfit(np.log(_LEVELS[:4]), np.log(errors[:4]), 1)[0])

@@ -1,4 +1,4 @@
-"""The nonlinear loop in time, and its `Motion`.
+"""Simulation of the nonlinear closed loop, and its result, a `Motion`.
 
 Imports `base`, `robot`, `dynamics`, `linear` and `control`.
 """

@@ -1,4 +1,4 @@
-"""The loop over a plan by the compiled kernel, where robot, policy and options allow it."""
+"""The compiled simulation loop, for robots, policies and options that it supports."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def engine_of(engine: Any, plan: Plan, plant: Plant, runs: int = 0) -> str:
         return "python"
     reason = _reason(plan, plant)
     if engine == "compiled" and reason:
-        raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
+        raise InputError(f"engine='compiled' cannot run this: {reason}; leave engine out")
     if reason or (engine is None and not (_small(plant) and _pays(plan, runs))):
         return "python"
     return "compiled"
@@ -56,13 +56,13 @@ def _reason(plan: Plan, plant: Plant) -> str:
         policy = policy.policy
     known = type(policy) in _KNOWN or isinstance(policy, Gridded)
     if policy is not None and not known:
-        return f"a {type(policy).__name__} decides in Python"
+        return f"a {type(policy).__name__} is computed in Python"
     if reason := _unmeasured(plan, plant, policy):
         return reason
     for robot in robots:
         at_home = robot.model.jointPlacements[ROOT].isIdentity(0.0)
         if batch_tree(robot) is None or not at_home:
-            return f"a joint of '{robot.name}' is no screw about a fixed axis"
+            return f"a joint of '{robot.name}' does not move along a screw with a fixed axis"
     return ""
 
 
@@ -72,9 +72,9 @@ def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
         return ""
     dt = policy.dt if isinstance(policy, LinearController) else policy.filter.dt
     if abs(plan.times.sample * plan.times.dt - dt) > 1e-6 * dt and dt:
-        return "it is sampled otherwise than the compensator"
+        return "its sample time differs from the compensator's"
     if policy.noise is not None and not plan.times.sample:
-        return "noise is asked for at every stage"
+        return "noise is evaluated at every stage of every step"
     try:
         measured_at(plant.state)
     except InputError as error:

@@ -1,6 +1,7 @@
-"""What a motion conserves: energy, momentum and the line of the centre of mass, and how it is kept.
+"""Conserved quantities of a motion: energy, momentum and the path of the centre of mass.
 
-Without force from outside, the momentum about a fixed point and r_c(t) = r_c(0) + p t / m stay.
+Without external forces the momentum about a fixed point is constant, and the centre of mass moves
+along r_c(t) = r_c(0) + p t / m.
 """
 
 from typing import NamedTuple

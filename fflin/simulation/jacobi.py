@@ -1,4 +1,4 @@
-"""What a motion in orbit conserves: the Jacobi integral, its energy in the orbit's frame (14.3)."""
+"""The Jacobi integral, the energy that a motion in orbit conserves in the orbit's frame (14.3)."""
 
 import numpy as np
 import pinocchio as pin

@@ -1,4 +1,4 @@
-"""A simulated motion: what was done, where it led, and the figures that prove it."""
+"""A simulated motion: states, inputs, and the drift of its conserved quantities."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Motion(Design):
-    """A motion of a robot, row by row.
+    """Simulated or recorded motion of a robot, one row per time.
 
     Attributes
     ----------
@@ -42,51 +42,59 @@ class Motion(Design):
     v : ndarray (N, nv)
         Configuration and velocity in Pinocchio's order.
     x : ndarray (N, nx)
-        The state in the chart of `reference` and `frame`; continuous joints go on counting turns.
+        State in the chart of `reference` and `frame`. The angles of continuous joints grow beyond
+        a full turn.
     u : ndarray (N, nu)
-        What acted from t on, in the frame's axes; the last row repeats what acted to the end.
+        Inputs that act from t on, in the frame's axes. The last row repeats the row before it.
     target : ndarray (nx,) or (N, nx)
-        The state that is steered to, of a motion that is followed the one at each time; empty
-        where none is known.
+        Target state. If the policy follows a trajectory, the trajectory's state at each time.
+        Empty if no target is known.
     prediction : ndarray (N, nx)
-        The state as the linear model has it under the same law; no rows where there is none.
+        State that the linear model predicts under the same control law. No rows without such a
+        prediction.
     energy : ndarray (N,)
-        Kinetic, of gravity and of springs [J]; in orbit the Jacobi integral, which is kinetic
-        relative to the frame, of tide and turning of the frame, and of springs.
+        Kinetic energy, plus the potential energy of gravity and springs [J]. In orbit the Jacobi
+        integral: kinetic energy relative to the frame, plus the potentials of the gravity
+        gradient, the frame's rotation and the springs.
     momentum : ndarray (N, 6)
-        Angular about the centre of mass [N m s], then linear [N s], in world axes; in orbit that
-        of the motion relative to the frame.
+        Angular momentum about the centre of mass [N m s], then linear momentum [N s], in world
+        axes. In orbit the momentum of the motion relative to the frame.
     momentum_drift : ndarray (N,)
-        How far the momentum is from its initial value and the impulse since. The linear part is
-        relative to the mass times the rms speed of its elements at the fastest row. The angular
-        part is relative to that speed times mass and radius of gyration about the base's first
-        position, plus what wheels store: the most that momenta of that energy can be, (11.5) of
-        docs/derivation.md. In orbit, where momentum is not kept, how far `energy` is from its
-        initial value and the work since, relative to its largest terms.
+        Deviation of the momentum from its initial value plus the impulse since, relative to the
+        largest momentum that the kinetic energy allows, (11.5) of docs/derivation.md:
+
+        - The scale of the linear part is the mass times the rms speed of its elements at the
+          fastest row.
+        - The scale of the angular part is that speed times the mass and the radius of gyration
+          about the base's first position, plus the momentum stored in wheels.
+
+        Momentum is not conserved in orbit. There the drift is the deviation of `energy` from its
+        initial value plus the work since, relative to the largest terms of the energy.
     com_drift : ndarray (N,)
-        How far the centre of mass is from where its initial velocity and the impulse since take
-        it [m]; no rows in orbit, and where a file does not tell.
+        Distance [m] of the centre of mass from the position that follows from its initial
+        velocity and the impulse since. No rows in orbit, or if the file lacks it.
     state_names, input_names, state_units, input_units : tuple of str
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
     robot, urdf_sha256 : str
     stopped : str
-        Why it ended before its time; empty where it did not.
+        Reason for which the run ended early; empty if it did not.
     wheels : tuple of str
-        The joints that are reaction wheels, whose angle is no error.
+        Joints that are reaction wheels. Their angles do not count as errors.
     wheel_inertias : ndarray (k,)
-        Of those, about their axes [kg m^2]; none where a file does not tell.
+        Inertias of the wheels about their axes [kg m^2]; empty if the file lacks them.
     steered : tuple of str
-        The states that the policy is known to feed back; empty where that is not known.
+        States that the policy feeds back; empty if they are not known.
     notes : tuple of str
-        What is to be known of the run.
+        Remarks on the run, as the report shows them.
     limit_names : tuple of str
-        The states and inputs that have limits.
+        States and inputs that have limits.
     engine : str
-        What ran the loop, "compiled" or "python"; empty where a file does not tell.
+        Engine that ran the loop, "compiled" or "python"; empty if the file lacks it.
     limits : ndarray (k, 2)
-        Their least and largest values, infinite where there is none, kept within or not.
+        Lower and upper limits of `limit_names`, infinite on a side without one. They are listed
+        whether or not the simulation enforces them.
     phases, starts : tuple of str, ndarray (k,)
-        Of a motion that was carried on (`then`), how each phase began and when [s].
+        Names and start times [s] of the phases of a motion that `then` joined.
 
     Examples
     --------
@@ -141,7 +149,7 @@ class Motion(Design):
         may_lack = (self.prediction, self.com_drift)
         count = len(self.t)
         if any(len(x) != count for x in rows) or any(len(x) not in (0, count) for x in may_lack):
-            raise InputError("the rows of the motion are not as many as its times")
+            raise InputError(f"a motion has {count} times; every history needs as many rows")
         if self.target.size in (0, self.x.shape[1]):  # of .mat, which knows no vectors
             object.__setattr__(self, "target", self.target.ravel())
         if not len(self.prediction):  # of json, which knows no empty matrices
@@ -163,29 +171,30 @@ class Motion(Design):
 
     @property
     def reference(self) -> pin.SE3:
-        """Placement that attitude and position are relative to."""
+        """Placement to which attitude and position are relative."""
         return pin.XYZQUATToSE3(self.placement)
 
     @property
     def orbit(self) -> CircularOrbit | None:
-        """What it circles, if anything; the world is then the frame of it that `frame` says."""
+        """The circular orbit, or None. In orbit the world is the orbital frame named by `frame`."""
         return CircularOrbit.from_json(self.circles) if self.circles else None
 
     @property
     def kept(self) -> str:
-        """What it conserves but for what acts on it, whose drift is `momentum_drift`."""
+        """Name of the conserved quantity whose drift is `momentum_drift`."""
         return "Jacobi integral" if self.circles else "momentum"
 
     @property
     def linear(self) -> Array | None:
-        """The linear model's states (N, nx), where it was asked for."""
+        """States (N, nx) that the linear model predicts; None without a prediction."""
         return self.prediction if len(self.prediction) else None
 
     @property
     def error(self) -> Array | None:
-        """The states less the target (N, nx); None where there is no target.
+        """Errors (N, nx), the states minus the target; None without a target.
 
-        Of a target that moves, in its own axes, as `linearize_trajectory` has it.
+        Relative to a moving target, the errors are in the target's axes, as in
+        `linearize_trajectory`.
         """
         if self.tracked:
             return moving_errors(self.frame, self.x, self.target)
@@ -193,43 +202,45 @@ class Motion(Design):
 
     @property
     def tracked(self) -> bool:
-        """Whether the target moves, one a row."""
+        """Whether the target moves: `target` then has one state per row."""
         return self.target.ndim == 2 and self.target.size > 0
 
     @property
     def attitude_error(self) -> Array | None:
-        """Angle (N,) [deg] between the base's attitude and the target's; None without target."""
+        """Angle (N,) [deg] between the attitudes of base and target; None without a target."""
         return attitude_errors(self.x, self.target) if self.target.size else None
 
     def then(self, *later: Impact | Motion) -> Motion:
-        """Return one motion of this and what came after: ``approach.then(caught, held)``.
+        """Join this motion and its later phases: ``approach.then(caught, held)``.
 
         Parameters
         ----------
         *later : Impact or Motion
-            Of `capture` or `jam` at the last row before it, and of `simulate` from there on.
+            Later phases in order: an impact, from `capture` or `jam`, at the last row of the phase
+            before it, then the motion that `simulate` computes from there on.
 
         Returns
         -------
         Motion
-            Of this one's robot and in its chart, on one time axis; a joint that jammed stands
-            still. Energy and momentum are those of the robot as it is at the time.
+            Joined motion on one time axis, for the robot and in the chart of this motion. A jammed
+            joint stands still. Energy and momentum refer to the robot of each phase.
 
         Raises
         ------
         InputError
-            If one does not begin where the one before ended, has another frame or more inputs, or
-            is from a file.
+            If a phase does not begin where the phase before it ended, has another frame or more
+            inputs, or was read from a file.
         """
         from fflin.simulation.phases import carried_on
 
         return carried_on(self, later)
 
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
-        """Return the motion by knots, with inputs that are held or linear: what it holds to better.
+        """Return the motion as a trajectory whose inputs are held or interpolated linearly.
 
-        Of inputs that change all the time the last, which no row has, is extrapolated. A motion
-        that was read from a file needs the `robot`.
+        Of the two, the hold that fits the dynamics better is chosen. If inputs change continuously,
+        the last input, which no row contains, is extrapolated. A motion that was read from a file
+        needs the `robot`.
         """
         from fflin.linear.trajectory import along
 
@@ -237,24 +248,24 @@ class Motion(Design):
 
     @property
     def passed(self) -> tuple[Passed, ...]:
-        """What went beyond its limit, the farthest first, with value, time and limit."""
+        """Limit violations with value, time and limit; the largest relative violation first."""
         return passed(self.t, limited(self))
 
     @property
     def saturated(self) -> tuple[Saturated, ...]:
-        """Inputs at their limit and wheels at their speed, the longest share of the run first."""
+        """Saturated inputs and wheel speeds; the one saturated for the longest time first."""
         names = {*self.input_names, *(f"qdot_m.{name}" for name in self.wheels)}
         return saturated(self.t, (each for each in limited(self) if each[0] in names))
 
     def save(self, path: str | Path) -> None:
-        """Write it to a .npz, .mat, .json or .csv file, whole or not at all.
+        """Save the motion to a .npz, .mat, .json or .csv file, atomically.
 
-        A csv has the times, states and inputs alone, and cannot be loaded.
+        A .csv file contains only the times, states and inputs, and cannot be loaded.
 
         Raises
         ------
         FileError
-            If the ending is another or the file cannot be written.
+            If the file has another ending or cannot be written.
         """
         target = as_path(path)
         check_ending(target, FORMATS)
@@ -266,12 +277,12 @@ class Motion(Design):
         write_table(target, names, np.column_stack((self.t, self.x, self.u)))
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
-        """Draw the motion, see `plot_motion`; into a file where a path is given."""
+        """Draw the motion as `plot_motion` does, and save the figure if a path is given."""
         return plot_motion(self, path, **options)
 
 
 def require_motion(motion: Any) -> Motion:
-    """Return the motion, or raise `InputError` where it is none."""
+    """Return the motion, or raise `InputError` if it is not a Motion."""
     found: Motion = instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
     return found
 
@@ -279,20 +290,20 @@ def require_motion(motion: Any) -> Motion:
 def plot_motion(
     motion: Motion, path: str | Path | None = None, *, show: Sequence[str] | None = None
 ) -> Figure:
-    """Draw the errors, inputs and momentum drift of a motion, linear beside nonlinear.
+    """Draw the errors, inputs and momentum drift of a motion, with the linear prediction.
 
     Parameters
     ----------
     motion : Motion
-        With a prediction, each group of states shows the nonlinear robot in full lines and the
-        linear model dashed, and below it their difference. Along a trajectory it shows the robot
-        over the pale reference, and below it the error, that of the linear model dashed; a dotted
-        line is where the reference comes to rest.
+        With a prediction, each group of states shows the nonlinear robot as solid lines and the
+        linear model as dashed lines; the panel below shows their difference. Along a trajectory,
+        each group shows the robot over the pale reference; the panel below shows the error, dashed
+        for the linear model. A dotted line marks the time at which the reference comes to rest.
     path : str or Path, optional
-        .png, .pdf or .svg to save to.
+        File to save to: .png, .pdf or .svg.
     show : sequence of str, optional
-        What is drawn of states and inputs: names, groups or patterns such as ``q_m``, ``thrust``,
-        ``*.hinge_*``; all by default.
+        States and inputs to draw: names, groups or patterns such as ``q_m``, ``thrust``,
+        ``*.hinge_*``. All by default.
 
     Returns
     -------
@@ -303,9 +314,9 @@ def plot_motion(
     MissingPackageError
         If matplotlib is not installed.
     FileError
-        If the ending is another or the file cannot be written.
+        If the file has another ending or cannot be written.
     UnknownNameError
-        If there is nothing of a name in `show`.
+        If a name in `show` matches no state or input.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The figure of a motion: what is drawn of it, and what beside it."""
+"""The figure of a motion: states, inputs, errors and drifts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None
     inertias = motion.wheel_inertias.tolist()
     title = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
     if motion.linear is not None:
-        title += "; full: nonlinear, dashed: linear"
+        title += "; solid: nonlinear, dashed: linear"
     for name, start in zip(motion.phases[1:], motion.starts[1:], strict=True):
         title += f"; {name} at {start:g} s"
     rest = None if motion.phases else resting_from(motion)

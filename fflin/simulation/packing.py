@@ -1,4 +1,4 @@
-"""A plan as the arrays that the compiled loop reads."""
+"""Conversion of a plan into the arrays that the compiled loop reads."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def _filtered(law: laws.Law, plan: Plan, policy: Any, asking: Plant, tree: Tree)
 
 
 def _sharing(plant: Plant, asking: Plant, giving: forward.Mechanics) -> sharing.Sharing:
-    """Return how what the inputs of one ask for is shared out to those of the other."""
+    """Return how the commands of one robot's inputs are allocated to the other robot's inputs."""
     none, names, tree = np.zeros(0), plant.actuation.names, batch_tree(asking.robot)
     assert tree is not None
     k, size, asks = len(names), plant.state.nx // 2, _mechanics(asking, tree)

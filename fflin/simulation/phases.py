@@ -1,4 +1,4 @@
-"""A motion that is carried on: after an impact, with another robot, or under another policy."""
+"""Motions joined from phases: after an impact, with another robot, or under another policy."""
 
 from __future__ import annotations
 
@@ -23,10 +23,14 @@ _MET = 1e-6
 def carried_on(first: Any, later: tuple[Any, ...]) -> Any:
     """Return one motion of several, see `Motion.then`."""
     if not later or isinstance(later[-1], Impact):
-        raise InputError("the last phase is a motion: simulate the robot after the impact")
+        raise InputError(
+            "the last phase is an impact, expected a Motion; simulate the robot after the impact"
+        )
     parts = (*(first._phases or (first,)), *later)
     if not all(getattr(part, "_robot", part) for part in parts):
-        raise InputError("a motion from a file is without its robot; go on from that of simulate")
+        raise InputError(
+            "a motion that was read from a file lacks its robot; join motions returned by simulate"
+        )
     whole = replace(parts[0], phases=(parts[0].robot,), starts=parts[0].t[:1], _phases=parts)
     robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
     for part in parts[1:]:
@@ -53,12 +57,12 @@ def _require_met(
         at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())
         raise InputError(
             f"'{what}' does not begin where the motion before it ended: '{robot.model.names[at]}' "
-            f"is {apart.max():.2g} away in place or rate; give it q and v of the last row"
+            f"differs by {apart.max():.2g} in position or rate; start from q and v of the last row"
         )
 
 
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return rows of another robot as those of this: joints that it lacks stand where they were."""
+    """Return another robot's rows in this robot's coordinates; joints that it lacks stand still."""
     own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
     for name in list(robot.model.names)[ROOT:]:
         if other.model.existJointName(name):
@@ -72,7 +76,10 @@ def _longer(whole: Any, motion: Any, name: str) -> Any:
     """Return the motion with another's rows at its end, in its own chart, joints and inputs."""
     if (motion.frame, motion.circles) != (whole.frame, whole.circles):
         where, before = (f"'{m.frame}'{' in orbit' * bool(m.circles)}" for m in (motion, whole))
-        raise InputError(f"'{name}' is in the frame {where}, the first phase in {before}; take one")
+        raise InputError(
+            f"'{name}' is in the frame {where}, the first phase in {before}; simulate both in one "
+            "frame"
+        )
     frame: Any = whole.frame
     state, there = (StateMap(m._robot, reference=m.reference, frame=frame) for m in (whole, motion))
     last, near, t = whole.q[-1], whole.x[-1], motion.t - motion.t[0] + whole.t[-1]
@@ -104,9 +111,12 @@ def _longer(whole: Any, motion: Any, name: str) -> Any:
 
 
 def _inputs(whole: Any, state: StateMap, motion: Any, there: StateMap) -> Array:
-    """Return a motion's inputs (N, nu) as those of the whole: what it lacks is zero."""
+    """Return a motion's inputs (N, nu) in the order of the whole; inputs that it lacks are zero."""
     if more := [name for name in motion.input_names if name not in whole.input_names]:
-        raise InputError(f"a phase has the input {more[0]}, which the first has not; give it that")
+        raise InputError(
+            f"a phase has the input {more[0]}, which the first phase lacks; give the first robot "
+            "that input"
+        )
     u = np.zeros((len(motion.t), len(whole.input_names)))
     u[:, [whole.input_names.index(name) for name in motion.input_names]] = motion.u
     turn = there.reference.rotation.T @ state.reference.rotation

@@ -1,4 +1,4 @@
-"""What a simulation is to do: its start, times, limits, method and events, checked."""
+"""The checked plan of a simulation: start, times, limits, method and events."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -114,12 +114,12 @@ def target_of(state: StateMap, target: Any) -> Array | None:
     theirs = set(target.state_names) <= set(state.names) and len(target.q) == state.robot.nq
     if target.moving or not theirs:
         raise InputError(
-            f"target is a model of '{target.robot}', expected a state of '{state.robot.name}' or a "
-            "model of it about a point that stays"
+            f"target is a model of '{target.robot}', expected a state of '{state.robot.name}' "
+            "or a model of that robot about a fixed point"
         )
     if state.robot.orbit and target.frame != state.frame:
         said = f"target is a model in frame '{target.frame}', expected '{state.frame}'"
-        raise InputError(f"{said}, in which the motion is, as q of the two is not the same")
+        raise InputError(f"{said}, the frame of the motion; q differs between orbital frames")
     goal = state.read(target.q, target.v)
     # Where the model has another reference or frame, its state of the base is another.
     same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)
@@ -168,19 +168,21 @@ def planned(
     follows, along = reference_of(policy), tracking_of(policy)
     own_frame, own_reference = axes_of(policy)
     if lin is not None and (frame is not None or reference is not None):
-        raise InputError("frame and reference are those of the policy's model; leave out")
+        raise InputError(
+            "frame or reference is given, but the policy's model fixes both; leave them out"
+        )
     if along and frame not in (None, own_frame):
         raise InputError(
             f"frame is {frame!r}, expected '{own_frame}' along a trajectory, whose inputs are in "
-            "base axes; leave it out"
+            "base axes; leave frame= out"
         )
     if along:
         refuse_orbit(robot, "trajectories to follow")
     if own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
-        made, flown = ("in orbit", "no") if own_frame in ORBITAL else ("without an orbit", "an")
+        made, flown = ("in orbit", "not ") if own_frame in ORBITAL else ("without an orbit", "")
         raise InputError(
-            f"the policy was made {made}, frame '{own_frame}', and '{robot.name}' is in {flown} "
-            "orbit; make it for the robot as it flies"
+            f"the policy was designed {made}, frame '{own_frame}', but '{robot.name}' is {flown}in "
+            "orbit; design it for the robot that is simulated"
         )
     axes = {"reference": own_reference if reference is None else reference}
     state = StateMap(robot, **axes, frame=own_frame if frame is None else frame)
@@ -212,12 +214,14 @@ def planned(
         raise InputError(
             f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
             f"{times.fastest:.4g} 1/s; take at most {integrates.reach / times.fastest:.2g} s, or "
-            "`sample`"
+            "give `sample`"
         )
     called = tuple(instance("events", events, Sequence, "a list of functions event(t, q, v)"))
     for each in called if callback is None else (*called, callback):
         if not callable(each):
-            raise InputError(f"{each!r} is no function of (t, q, v), as an event would be")
+            raise InputError(
+                f"{each!r} is not a function; events take (t, q, v), callbacks (t, q, v, u)"
+            )
     # A rotor may spin as fast as it will: nothing depends on its angle.
     rotors = rotor_names(robot)
     joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]

@@ -1,4 +1,4 @@
-"""The accelerations of a robot in simulation, and what pushes it from outside."""
+"""Accelerations of a simulated robot under its inputs and external forces."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
@@ -25,7 +25,7 @@ _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
 
 class Drives(NamedTuple):
-    """What inputs (nu,) give of a command u: gain u + bias, and nothing from `until` [s] on."""
+    """Actuator faults: a command u gives the input gain u + bias, and zero from `until` [s] on."""
 
     gain: Array
     bias: Array

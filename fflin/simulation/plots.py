@@ -29,12 +29,12 @@ _GROUPS = {
     "q_m": "joints q_m",
     "omega_b": "angular velocity omega_b",
     "v_b": "velocity v_b",
-    "qdot_m": "joint rates",
+    "qdot_m": "joint rates qdot_m",
 }
 
 
 class Signals(NamedTuple):
-    """Histories (N, k) with names GROUP.NAME, limits (2,) by name, and what they go beside."""
+    """Histories (N, k) with names GROUP.NAME, limits (2,), linear prediction and reference."""
 
     values: Array
     names: Sequence[str]
@@ -171,7 +171,7 @@ def _histories(
 def _curve(
     axes: Axes, t: Array, of: Signals, i: int, gaps: Sequence[int] = (), **look: Any
 ) -> None:
-    """Draw a column over its pale reference and below that of the linear model, dashed."""
+    """Draw a column over its pale reference, and the linear prediction dashed on top."""
     dashed = {"ls": "--", "lw": 1.0}
     for x, own in ((of.reference, _PALE), (of.values, look), (of.linear, dashed)):
         if x is not None:
@@ -248,7 +248,7 @@ def _drifts(axes: Axes, t: Array, drifts: Mapping[str, Array]) -> None:
     shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}
     for color, (label, drift) in zip(COLORS, shown.items(), strict=False):
         axes.semilogy(t, drift, color=color, label=label)
-    axes.set(title=f"{next(iter(shown))} drift, relative", xlabel="t [s]")
+    axes.set(title=f"relative {next(iter(shown))} drift", xlabel="t [s]")
     axes.set_ylim(1e-17, max(1e-13, *(10.0 * float(drift.max()) for drift in shown.values())))
     axes.legend(handlelength=1.2)
 

@@ -1,4 +1,4 @@
-"""The motion that the linear model predicts under the law that the robot is under."""
+"""Motion predicted by the linear model under the control law of the simulated robot."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from fflin.simulation.plant import Plant
 LinearLaw: TypeAlias = Callable[[Array], Array]
 
 _SHARES = (0.0, 0.5, 0.5, 1.0)  # of a step, at which its stages are
-_WHY_NOT = {Allocation: "an Allocation has thrusters that cannot pull, so that it is not linear"}
+_WHY_NOT = {Allocation: "an Allocation is not linear, as its thrusters cannot pull"}
 
 
 class Predictor(NamedTuple):
@@ -44,8 +44,8 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryF
         if linear is None or linear is True:
             return policy
         raise InputError(
-            "a TrajectoryFeedback is linear along a trajectory, not about one point; leave linear "
-            "out"
+            "linear= is given with a TrajectoryFeedback, which is linear along a trajectory, not "
+            "about one point; leave linear= out"
         )
     own: Any = getattr(policy, "lin", None)
     if not (linear is None or linear is True):
@@ -58,10 +58,10 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryF
         return None
     why = _WHY_NOT.get(type(policy), f"a {type(policy).__name__} is not known to be linear")
     if law is not None:
-        why = "this one's model is reduced: give linear= the whole model"
+        why = "this policy's model is reduced: give the full model as linear="
     raise InputError(
-        "linear predicts under a StateFeedback, an OutputFeedback, a LinearController or no "
-        f"policy; {why}; leave it out"
+        "linear= needs a StateFeedback, an OutputFeedback, a LinearController or no policy; "
+        f"{why}; leave linear= out"
     )
 
 
@@ -75,8 +75,8 @@ def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
         same = same and linear.output_names == policy.lin.output_names
     if not same or not linear.reference.isApprox(state.reference, 1e-9):
         raise InputError(
-            f"linear is a model of '{linear.robot}' that has not the states, inputs, frame and "
-            f"reference of the run of '{plant.robot.name}'; linearise that robot in the policy's "
+            f"linear is a model of '{linear.robot}' with other states, inputs, frame or reference "
+            f"than the simulation of '{plant.robot.name}'; linearise that robot in the policy's "
             "frame and reference"
         )
     return linear
@@ -169,7 +169,7 @@ def _states(predictor: Predictor, plan: Any, x: Array, steps: int) -> Array:
 
 
 def _after(dt: float, e: Array, slope: Callable[[int, Array], Array]) -> Array:
-    """Return e a step later, by the classical Runge-Kutta method, of its slope at each stage."""
+    """Return e one step later, by the classical Runge-Kutta method, from its derivative."""
     stages: list[Array] = []
     for stage, share in enumerate(_SHARES):
         stages.append(slope(stage, e + share * dt * stages[-1] if stages else e))

@@ -1,4 +1,4 @@
-"""What is said of a motion: whether it arrived, what it took, what it passed, what proves it."""
+"""Report of a motion: settling, inputs, limit violations, and conserved quantities."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -33,14 +33,17 @@ _MOST = 8  # lines of a report
 # What has limits: its name, history (N,), unit, and least and largest value (2,).
 Limited: TypeAlias = "tuple[str, Array, str, Array]"
 
-_OF_PHASES = "|p|, |h|: momentum, |h| about the centre of mass; before: of all that meets"
+_OF_PHASES = (
+    "|p|: linear momentum; |h|: angular momentum about the centre of mass;\n"
+    "before: total of all bodies in the impact"
+)
 
 _TITLES = {"r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
 _PLACES = ("attitude", "position", "joints")
 
 
 class Passed(NamedTuple):
-    """A limit that was passed: the farthest value [unit], when [s], and the limit."""
+    """Limit violation: the value [unit] farthest beyond the limit, its time [s], and the limit."""
 
     name: str
     value: float
@@ -56,7 +59,7 @@ class Passed(NamedTuple):
 
 
 class Saturated(NamedTuple):
-    """An input, or a wheel's speed, that was at its limit [unit] for a share of the run."""
+    """Saturation of an input or wheel speed: its limit [unit] and the fraction of the run."""
 
     name: str
     limit: float
@@ -120,7 +123,7 @@ def _shown(value: float) -> str:
 
 
 class Course(NamedTuple):
-    """How large (N,) an error of one kind was, and whether the policy feeds it back."""
+    """History (N,) of the size of one kind of error, and whether the policy feeds it back."""
 
     title: str
     unit: str
@@ -154,7 +157,7 @@ class Course(NamedTuple):
 
 
 def motion_report(motion: Any) -> str:
-    """Show whether a motion arrived, what it took, and the figures that prove it."""
+    """Return the report of a motion: settling, inputs, violations, and conserved quantities."""
     kinds = courses(motion)
     head = [verdict(motion, kinds)] if kinds or motion.stopped else []
     by = ", compiled" if motion.engine == "compiled" else ""
@@ -162,17 +165,17 @@ def motion_report(motion: Any) -> str:
     circling = [str(motion.orbit)] if motion.orbit else []
     parts = [folded([*head, f"{motion.robot}: {run}", *circling, *motion.notes])]
     if not (kinds or motion.target.size):
-        rows = [["change from the start", "unit", "largest", "last"]]
+        rows = [["change from the start", "unit", "largest", "final"]]
         gone = [each.row(motion.t) for each in courses(replace(motion, target=motion.x[0]))]
         rows += [[*each[:2], *each[3:5]] for each in gone if each[0] in _PLACES]
         parts.append(f"\n{grid(rows, 'll')}\n")
     if kinds:
-        settled = f"within {100.0 * SETTLED:g} % after [s]"
-        rows = [["error", "unit", "first", "largest", "last", settled]]
+        settled = f"settles to {100.0 * SETTLED:g} % at [s]"
+        rows = [["error", "unit", "initial", "largest", "final", settled]]
         parts.append(f"\n{grid([*rows, *(kind.row(motion.t) for kind in kinds)], 'll')}\n")
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
-    said = [*(f"beyond its limit: {each}" for each in motion.passed), *map(str, motion.saturated)]
+    said = [*(f"limit exceeded: {each}" for each in motion.passed), *map(str, motion.saturated)]
     if said:
         more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
         parts.append(folded(said[:_MOST] + more))
@@ -181,10 +184,10 @@ def motion_report(motion: Any) -> str:
     first, last = (f"{energy:.6g} J" for energy in motion.energy[[0, -1]])
     drift = f"{motion.momentum_drift.max():.1e}"
     kept = f"{motion.kept} drift {drift}".replace(" ", "\u00a0")
-    parts.append(folded([f"energy {first} at first, {last} at last; {kept}"]))
+    parts.append(folded([f"energy: initial {first}, final {last}; {kept}"]))
     if len(motion.com_drift):
         far = f"{motion.com_drift.max():.1e} m"
-        parts.append(f"largest distance of the centre of mass from its line: {far}")
+        parts.append(f"largest deviation of the centre of mass from its predicted path: {far}")
     if motion.linear is not None:
         apart = np.abs(motion.x - motion.linear).max(axis=0)
         # Nothing depends on the angle of a wheel, which outgrows all else.
@@ -250,32 +253,32 @@ def pushed(of: Any) -> bool:
 
 
 def verdict(motion: Any, kinds: list[Course]) -> str:
-    """Say in a line whether a motion arrived at its target and what hindered it."""
+    """Return one line: whether a motion settled at its target, and what prevented it."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
     judged = [kind for kind in places if kind.steered] or [k for k in kinds if k.steered]
     moved = [kind for kind in judged if kind.size.max() > THERE]
     if motion.tracked and not motion.phases:
-        said = f"beside its trajectory at the end: {_and([kind.last for kind in judged])}"
+        said = f"tracking error at the end: {_and([kind.last for kind in judged])}"
     elif failed := [kind.last for kind in moved if kind.late]:
         said = f"not settled: {_and(failed)} at the end"
     elif moved:
         when = motion.t[max(kind.settled for kind in moved)]
         said = f"settled: {_and([kind.last for kind in moved])} after {when:.3g}\u00a0s"
     else:
-        said = "settled: at the target from first to last"
+        said = "settled: at the target throughout the run"
     aside = {k.title: k.last for k in places if k.late and not k.steered}
     loose = not pushed(motion) and aside.pop("position", "")
     if aside:
-        said += f"; not steered: {_and([*aside.values()])}"
+        said += f"; not controlled: {_and([*aside.values()])}"
     if loose:
         said += "; position is not controlled"
     shares: dict[str, float] = {}  # at either limit
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share
     if full := [name for name, share in shares.items() if share > _ALL_ALONG]:
-        said += f"; at the limit all along: {', '.join(full)}"
+        said += f"; at the limit throughout: {', '.join(full)}"
     return said
 
 

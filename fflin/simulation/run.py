@@ -1,4 +1,4 @@
-"""The loop over a plan: step after step, recorded until it ends."""
+"""The simulation loop over a plan, with the recording of its rows."""
 
 import math
 from collections.abc import Callable
@@ -23,7 +23,7 @@ _LOOK = 16  # steps between looks at the clock
 
 
 class Recording(NamedTuple):
-    """What a run went through: rows of time (N,), motion, inputs and what is conserved."""
+    """Recorded rows of a run: times (N,), motion, inputs and conserved quantities."""
 
     t: Array
     q: Array
@@ -122,7 +122,7 @@ def _advance(
 
 
 def ending_of(plan: Plan) -> Callable[[float, Array, Array], str]:
-    """Return what says why a run ends where a step has led it; nothing where it goes on."""
+    """Return a function that gives the reason for which a run ends; empty if it continues."""
     chart = plan.chart
     scalar = chart.scalar(plan.q) if chart else 1.0
 
@@ -133,7 +133,7 @@ def ending_of(plan: Plan) -> Callable[[float, Array, Array], str]:
         if not np.abs(v).max() < LARGEST_SPEED or turn > 1e3:
             return diverged
         if not turn < LARGEST_TURN:
-            return f"{diverged}: a joint or the base turns by {turn:.2g} rad a step"
+            return f"{diverged}: a joint or the base turns by {turn:.2g} rad per step"
         if chart:
             before, scalar = scalar, chart.scalar(q)
             if before * scalar < 0.0:

@@ -60,102 +60,111 @@ def simulate(
     progress: bool | None = None,
     engine: str | None = None,
 ) -> Motion:
-    r"""Simulate a robot under a policy.
+    r"""Simulate the nonlinear robot under a policy.
 
-    Steps of fixed size on the manifold, by default of the commutator-free method CF4 of order 4.
-    After each step the base is shifted so that the centre of mass is where momentum and impulse
-    take it, and its velocity is set so that the momentum is what the impulse from outside makes
-    it, :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`, where H is integrated with the weights of
-    the method. Thrusters never pull: a negative thrust is cut to zero.
+    The integrator takes steps of fixed size on the manifold, by default with the commutator-free
+    method CF4 of order 4. After each step a projection restores two conserved quantities:
 
-    In orbit q and v are relative to the orbit's frame, here and in what a policy is given; nothing
-    keeps the momentum, and no base is shifted.
+    - The base is shifted so that the centre of mass lies where momentum and impulse take it.
+    - The base velocity is set to :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`. The momentum H
+      is integrated from the external impulse with the weights of the method.
+
+    Thrusters never pull: a negative thrust is saturated at zero.
+
+    In orbit q and v are relative to the orbital frame, for policies too. Momentum is not conserved
+    there, and the projection is off.
 
     Parameters
     ----------
     robot : Robot
     policy : callable, optional
-        policy(t, q, v) -> u (nu,) over the robot's inputs, such as
-        ``StateFeedback(lin, gain.K)``; of a `GainSchedule` the feedback along its trajectory. None
-        acts by default.
+        Function policy(t, q, v) -> u (nu,) over the robot's inputs, such as
+        ``StateFeedback(lin, gain.K)``. A `GainSchedule` acts as the feedback along its trajectory.
+        By default all inputs are zero.
     x0 : array_like (nx,), optional
         Initial state in the chart of the policy's model, or of `frame` and `reference`.
     q0 : array_like (nq,), optional
     v0 : array_like (nv,), optional
-        Initial configuration and velocity in Pinocchio's order, instead of `x0`; neutral and at
-        rest by default, or where nothing of these is given the start of the trajectory that is
-        followed, or the robot's `start`.
+        Initial configuration and velocity in Pinocchio's order, instead of `x0`. If only one is
+        given, the other is neutral or at rest. If none of the three is given, the motion starts at
+        the start of the followed trajectory, or else at the robot's `start`.
     duration : float, optional
-        [s]; by default that of the trajectory that is followed.
+        Simulated time [s]; by default the duration of the followed trajectory.
     dt : float, optional
-        Step [s]; by default 0.01, or less if the loop's fastest pole or the samples ask for it. If
-        the motion diverges in steps of that size, it is flown again in steps of a quarter, up to
-        three times, and `Motion.notes` say so. A motion with an event, a callback, a disturbance or
-        a policy of your own in Python is flown once, as these may remember their calls. Where the
-        input is neither sampled nor late, the step is made to divide the duration.
+        Step [s]; by default 0.01, or less if the loop's fastest pole or the samples require it. If
+        the default step diverges, the simulation is repeated with a quarter of it, up to three
+        times, and `Motion.notes` report this. A simulation with an event, a callback, a disturbance
+        or a custom Python policy is not repeated, because these may store their calls. If the input
+        is neither sampled nor delayed, the step is adjusted to divide the duration.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
-        Whether momentum and centre of mass are kept as above.
+        Whether the projection above restores momentum and centre of mass.
     sample : float, optional
-        Time [s] between the samples of the policy, a multiple of dt, between which u is held; by
-        default that of the policy's model where it is sampled, else the policy is asked at every
-        stage of every step.
+        Sample time [s] of the policy, a multiple of dt; u is held between samples. By default the
+        sample time of the policy's model. If that model is continuous, the policy is evaluated at
+        every stage of every step.
     delay : float
-        Time [s] from a sample to its effect, a multiple of dt; until then u0 of the policy's
-        model acts, or nothing. Where there is a delay and no `sample`, samples are dt apart.
+        Time [s] from a sample to its effect, a multiple of dt. Before the first command arrives,
+        u0 of the policy's model acts, or zero. A delay without `sample` samples every dt.
     limits : "urdf", float, mapping or list of them, optional
-        What cuts the inputs: "urdf" for all limits of the robot (efforts of the URDF, `min` and
-        `max` of the inputs, the largest speeds of wheels, `Robot.limits`), the largest magnitude
-        of all inputs, or {input, group or pattern: magnitude, or (least, largest)}; in a list such
-        as ``["urdf", {"tau_m": 5.0}]`` what is given goes first. Nothing is cut by default. On-off
-        thrusters fire in pulses in any case, and `Motion.passed` tells which limits were passed.
+        Limits at which the inputs saturate; by default none:
+
+        - "urdf": all limits of the robot (efforts of the URDF, `min` and `max` of the inputs, the
+          largest wheel speeds, `Robot.limits`).
+        - A number: the largest magnitude of every input.
+        - {input, group or pattern: magnitude, or (lower, upper)}.
+        - A list such as ``["urdf", {"tau_m": 5.0}]``: explicit limits take precedence over "urdf".
+
+        On-off thrusters always fire in pulses. `Motion.passed` lists the violated limits.
     disturbance : callable, optional
-        disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order.
+        Function disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order.
     events : sequence of callable
-        event(t, q, v) -> float; the run ends after the step in which one is no longer positive.
+        Functions event(t, q, v) -> float. The run ends after the step in which a value becomes
+        zero or negative.
     callback : callable, optional
-        callback(t, q, v, u), called at every recorded row.
+        Function callback(t, q, v, u), called at every recorded row.
     linear : LinearModel or bool, optional
-        Predicts the motion under the same law, of a StateFeedback, a feedback along a trajectory,
-        an OutputFeedback or LinearController without its noise, or none; by default the policy's
-        own model, False for none. Sampled, it does so where every row is at a sample.
+        Model that predicts the motion under the same control law; by default the policy's own
+        model, False for no prediction. The law is a StateFeedback, a feedback along a trajectory,
+        an OutputFeedback or LinearController (without its noise), or no policy. A sampled law
+        is predicted only if every row falls on a sample.
     target : LinearModel or array_like (nx,), optional
-        State, or model whose point it is, that errors are counted from; by default the point of
-        the policy's own model, or along a trajectory the state that it has at each time, and none
-        under a policy without one.
+        Target state from which errors are measured, or a model whose operating point is the
+        target. By default the operating point of the policy's own model, or the followed
+        trajectory's state at each time. A policy without either has no target.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
     reference : pin.SE3, optional
-        Chart of x and axes of u; the policy's by default, else hybrid, in orbit lvlh, and the
-        identity.
+        Chart of x and axes of u. By default the policy's; without a policy, frame "hybrid" ("lvlh"
+        in orbit) and the identity.
     every : int, optional
-        Steps from one recorded row to the next; by default 1, or where that would be more than
-        100,000 rows, as many as leave 10,000, which the motion's `notes` say.
+        Steps from one recorded row to the next; by default 1. If that exceeds 100,000 rows, the
+        default is chosen to record about 10,000, and the motion's `notes` report this.
     progress : bool, optional
-        Whether a bar is shown on stderr; by default on a terminal, for runs that take long.
+        Whether to show a progress bar on stderr; by default on a terminal, for long runs.
     engine : {"python", "compiled"}, optional
-        What runs the loop; by default the compiled one where it can and is the quicker. It needs
-        numba, no orbit, and no policy, event, callback or disturbance in Python. Both give the
-        same to rounding.
+        Engine that runs the loop; by default the compiled one if it is supported and faster. It
+        needs numba, no orbit, and no policy, event, callback or disturbance in Python. Both
+        engines agree to machine precision.
 
     Returns
     -------
     Motion
-        Ended early, ``stopped`` says why: an event, an interrupt (Ctrl-C), or a loop that left
-        the chart or diverged, and in steps of which size.
+        Simulated motion. If it ended early, ``stopped`` gives the reason: an event, an interrupt
+        (Ctrl-C), or a loop that left the chart or diverged, with the step size.
 
     Raises
     ------
     InputError
-        If an argument has a wrong size or value, a policy or disturbance returns what is no
-        input or force, or dt is too large for the loop.
+        If an argument has a wrong size or value, a policy or disturbance returns an invalid input
+        or force, or dt is too large for the loop.
     UnknownNameError
-        If there is no such method or input.
+        If a method or input is unknown.
 
     Warns
     -----
     FflinWarning
-        If the loop's fastest pole, which is named, asks for more than 50,000 steps, or springs
-        and gravity at the target for more than the limits.
+        If the loop's fastest pole requires more than 50,000 steps, or springs and gravity at the
+        target require inputs beyond the limits. The warning names the pole or the inputs.
 
     References
     ----------
@@ -198,15 +207,15 @@ def simulate(
         motion = motion_of(plan, plant, run.engine, run)
     except MemoryError:
         raise InputError(
-            f"{plan.times.rows} rows of '{robot.name}' do not fit into the memory; take a larger "
+            f"{plan.times.rows} rows of '{robot.name}' exceed the available memory; take a larger "
             "dt or `every`"
         ) from None
     if not coarse:
         return motion
-    note = f"the motion diverges in steps of {', '.join(coarse)} s"
+    note = f"the simulation diverges in steps of {', '.join(coarse)} s"
     if not motion.stopped:
-        taken = f"flown in steps of {plan.times.dt:g} s"
-        note = f"{taken}, as {note}; a smaller dt (--step) shows how accurate that is"
+        note += f" and was repeated in steps of {plan.times.dt:g} s; check its accuracy with a "
+        note += "smaller dt (--step)"
     return replace(motion, notes=(*motion.notes, note))
 
 

@@ -1,4 +1,4 @@
-"""The step of a simulation, how many there are between what happens, and how long it runs."""
+"""Step, sample time, delay, recorded rows and duration of a simulation."""
 
 import math
 import warnings
@@ -27,7 +27,7 @@ _FOREVER = 1e100  # [s]; the square of its inverse is still a number
 
 
 class Times(NamedTuple):
-    """The step `dt` [s], and how many steps there are in all and between what happens."""
+    """The step `dt` [s], the number of steps, and sample time, delay and rows in steps."""
 
     dt: float
     steps: int
@@ -45,12 +45,14 @@ class Times(NamedTuple):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is to be said of the rows."""
+        """Remarks on the recorded rows, for the report."""
         said = f"one in {self.every} of {self.steps:,} steps is recorded; every=1 (--every 1) "
         notes: tuple[str, ...] = (f"{said}records all",) if self.thinned else ()
         if self.sample and self.every % self.sample and self.sample % self.every:
-            aside = f"rows every {self.every} steps miss samples every {self.sample}, where inputs "
-            notes += (f"{aside}change: they are no trajectory",)
+            aside = (
+                f"rows every {self.every} steps miss some samples every {self.sample} steps; the "
+            )
+            notes += (f"{aside}rows are not a valid trajectory",)
         return notes
 
     @property
@@ -63,17 +65,19 @@ class Times(NamedTuple):
         forced = chosen and self.fastest * _STEP > 1.0
         most = _ENDLESS if self.thinned else _MOST_STEPS
         if self.rows * width > _MOST_ENTRIES or self.steps > most:
-            asked = f", which the loop's fastest pole at {self.fastest:.3g} 1/s asks for,"
+            asked = f" (required by the loop's fastest pole at {self.fastest:.3g} 1/s)"
             raise InputError(
                 f"{self.steps * self.dt:g} s in steps of {self.dt:g} s"
                 f"{asked if forced else ''} are "
-                f"{self.steps:.3g} steps and {self.rows:.3g} rows; take a larger dt or `every`"
+                f"{self.steps:.3g} steps and {self.rows:.3g} rows, too many; take a larger dt or "
+                f"`every`"
                 f"{self._moving if forced else ''}"
             )
         if forced and self.steps > _MANY_STEPS:
             warnings.warn(
-                f"the loop's fastest pole at {self.fastest:.3g} 1/s asks for steps of "
-                f"{self.dt:.3g} s, {self.steps:,} in all; give dt= or sample=, or a slower gain"
+                f"the loop's fastest pole at {self.fastest:.3g} 1/s requires steps of "
+                f"{self.dt:.3g} s, {self.steps:,} in all, which take long; give dt=, sample= or a "
+                f"slower gain"
                 f"{self._moving}",
                 FflinWarning,
                 stacklevel=3,
@@ -81,7 +85,7 @@ class Times(NamedTuple):
 
     @property
     def _moving(self) -> str:
-        return f": {self.mode} moves most there" if self.mode else ""
+        return f"; the state {self.mode} moves most at this pole" if self.mode else ""
 
 
 def times_of(
@@ -92,7 +96,7 @@ def times_of(
     sample: float | None,
     delay: float,
 ) -> Times:
-    """Return the times of a simulation, whose arguments are those of `simulate`."""
+    """Return the times of a simulation from arguments of `simulate`."""
     follows = tracking_of(policy)
     if sample is not None:
         sample = _positive("sample", sample)
@@ -102,13 +106,13 @@ def times_of(
         sample = getattr(follows.schedule if follows else made, "dt", None) or None
     fastest, mode = (0.0, "") if sample else _fastest_pole(policy, follows)
     if duration is None and follows is None:
-        raise InputError("duration is missing; give it [s]")
+        raise InputError("duration is missing; give duration= in seconds")
     duration = _positive("duration", follows.duration if follows and duration is None else duration)
     delay = number("delay", delay)
     if not 0.0 <= delay < duration:
         raise InputError(
-            f"delay is {delay:g} s, expected 0 or more and less than the duration, {duration:g} s, "
-            "within which a command is to act"
+            f"delay is {delay:g} s, expected at least 0 and less than the duration of "
+            f"{duration:g} s, so that a command takes effect"
         )
     if every is not None:
         every = whole("every", every, 1)
@@ -123,8 +127,8 @@ def times_of(
     if abs(steps * dt - duration) > 1e-6 * duration:
         if sample or delay:
             raise InputError(
-                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s where "
-                "the input is sampled or late; choose the step so"
+                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s, as "
+                "the input is sampled or delayed; choose dt accordingly"
             )
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
@@ -169,7 +173,7 @@ def _whole(dt: float, **times: float) -> list[int]:
         if abs(round(time / dt) * dt - time) > 1e-6 * dt:
             raise InputError(
                 f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
-                "choose the step so"
+                "choose dt accordingly"
             )
     return [round(time / dt) for time in times.values()]
 

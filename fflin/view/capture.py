@@ -1,4 +1,4 @@
-"""Pictures of a page, taken by a Chromium that is there."""
+"""Pictures of a page, taken by an installed Chromium."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def find_chromium() -> str:
     found = next(filter(None, map(shutil.which, _NAMES)), None)
     if found is None:
         raise MissingPackageError(
-            "pictures are taken by Chromium, which is not found; install it (Debian: apt install "
+            "Chromium, which takes the pictures, is not found; install it (Debian: apt install "
             "chromium), or open the HTML file and take them by hand"
         )
     return found
@@ -94,7 +94,7 @@ def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) 
         with _browser(program, _PATIENCE + 3.0 * len(times)) as browser:
             return list(_shots(browser, page, times, size, keys))
     except (OSError, _BrowserError) as error:
-        raise FileError(f"{program} takes no picture of {page}: {error}") from None
+        raise FileError(f"{program} cannot take a picture of {page}: {error}") from None
 
 
 def _shots(
@@ -156,11 +156,11 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 class _BrowserError(Exception):
-    """What the browser answers where it does not do as it is told."""
+    """Error that the browser reports for a command."""
 
 
 class _Browser:
-    """A browser, and one tab of it, told what to do by the DevTools protocol."""
+    """A browser with one tab, controlled by the DevTools protocol."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         assert process.stdin and process.stdout
@@ -187,7 +187,7 @@ class _Browser:
         while b"\0" not in pieces[-1]:
             pieces.append(self._answers.read(2**20))
             if not pieces[-1]:
-                raise _BrowserError("it does not answer")
+                raise _BrowserError("the browser does not respond")
         text, _, self._rest = b"".join(pieces).partition(b"\0")
         message: dict[str, Any] = json.loads(text)
         return message

@@ -1,4 +1,4 @@
-"""The paths of many runs of a campaign, as thin lines about the motion that a page shows."""
+"""Paths of the runs of a campaign, drawn as thin lines around the motion of a page."""
 
 from __future__ import annotations
 
@@ -20,12 +20,15 @@ _COLORS = {"base": "#a9c4e8", "tool": "#ffb877"}
 
 
 def drawn_robot(robot: Robot, cloud: Any, motion: Any) -> Robot:
-    """Return the robot of a motion beside its cloud, maybe drawn with other bodies."""
+    """Return the robot of a motion shown with a cloud, with the bodies that its run drew."""
     if not isinstance(cloud, Campaign):
         said = f"cloud is a {type(cloud).__name__}, expected a Campaign"
         raise InputError(f"{said}, as fflin.monte_carlo returns it")
     if cloud.urdf_sha256 != robot.urdf_sha256:
-        raise InputError(f"the cloud is of '{cloud.robot}', not of '{robot.name}' as it is given")
+        raise InputError(
+            f"cloud is a campaign of '{cloud.robot}', which differs from the robot '{robot.name}'; "
+            "give the robot of the campaign"
+        )
     drawn: Robot = getattr(motion, "_robot", None) or robot
     same = list(drawn.model.names) == list(robot.model.names) and drawn.name == robot.name
     return drawn if same else robot

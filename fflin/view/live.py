@@ -1,4 +1,4 @@
-"""The live viewer: a page on this machine's loopback, served by a thread of this process."""
+"""The live viewer: a page on the loopback address, served by a thread of this process."""
 
 from __future__ import annotations
 
@@ -24,22 +24,24 @@ from fflin.view.server import Server
 
 
 class Live:
-    """A robot in a browser, that moves as it is told; made by `visualize(robot)`.
+    """Live view of a robot in a browser; made by `visualize(robot)`.
 
-    It is served by a thread of this process, to this machine only, and ends with it. Given to
-    `simulate` as its callback, it shows the simulation as it runs; `follow` shows the trajectory's
-    ghost with it.
+    A thread of this process serves the page, to this machine only, until the process ends. Given to
+    `simulate` as its callback, the viewer shows the running simulation; `follow` adds a ghost at
+    the trajectory.
 
     Attributes
     ----------
     url : str
+        Address of the page.
     port : int
+        Port of the page.
     q : ndarray (nq,)
-        Where the robot stands; sliders move it.
+        Current configuration of the robot; the sliders change it.
     meshcat : meshcat.Visualizer
-        For what else is to be drawn.
+        Viewer for additional objects.
     notes : tuple of str
-        What could not be drawn.
+        Remarks on visual elements that could not be drawn.
     """
 
     def __init__(
@@ -77,7 +79,9 @@ class Live:
             "bodies": [["meshcat", "robot", path] for path in body_paths(robot)],
             "triads": triads(robot, tool, info["size"]),
         }
-        info["names"][:6] = [f"base {kind} {axis}" for kind in ("turn", "shift") for axis in "xyz"]
+        info["names"][:6] = [
+            f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"
+        ]
         page = build_page(info, connect="'self' ws:")
         self._reference: Reference | None = None
         self._server = Server(page, self._recorder.commands, self._asked, port)
@@ -86,26 +90,26 @@ class Live:
         self.show(q)
 
     def follow(self, policy: Any) -> Live:
-        """Show as a ghost what a policy or schedule follows, from now on; return itself.
+        """Show the trajectory that a policy or schedule follows as a ghost; return the viewer.
 
-        ``simulate(robot, schedule, callback=live.follow(schedule))``.
+        Use it as ``simulate(robot, schedule, callback=live.follow(schedule))``.
 
         Raises
         ------
         InputError
-            If it follows no trajectory.
+            If the policy does not follow a trajectory.
         """
         self._reference = reference_of(followed(policy, self.robot))
         if self._reference is None:
             raise InputError(
-                f"policy is a {type(policy).__name__}, which follows no trajectory; give a "
+                f"policy is a {type(policy).__name__}, which does not follow a trajectory; give a "
                 "GainSchedule or a TrajectoryFeedback"
             )
         Drawing(self.robot, self.meshcat["target"], "ghost")
         return self
 
     def show(self, q: Array, t: float | None = None) -> None:
-        """Put the robot at a valid configuration (nq,); t [s] is the time that is shown."""
+        """Show the robot at a valid configuration (nq,), and the time t [s]."""
         q = self.robot.checked_configuration(q).copy()
         q.setflags(write=False)
         with self._lock:
@@ -125,7 +129,7 @@ class Live:
         self._server.update(json.dumps(state))
 
     def __call__(self, t: float, q: Array, *_: Any) -> None:
-        """Show a step of a running simulation, no sooner than it is due."""
+        """Show a step of a running simulation, delayed to the playback speed."""
         now = monotonic()
         if self._began is None or t <= self._began[1]:
             self._began = now, t
@@ -133,17 +137,17 @@ class Live:
         self.show(q, t)
 
     def open(self) -> None:
-        """Open a browser on it."""
+        """Open the page in a browser."""
         import webbrowser
 
         webbrowser.open(self.url)
 
     def wait(self) -> None:
-        """Wait until it is closed, or until Ctrl-C."""
+        """Wait until the viewer is closed, or until Ctrl-C."""
         self._server.wait()
 
     def close(self) -> None:
-        """End it; the page says that the connection is lost."""
+        """Close the viewer; the page then reports the lost connection."""
         self._server.close()
 
     def __enter__(self) -> Live:

@@ -1,4 +1,4 @@
-"""Mesh files as triangles light enough to be sent: welded, one array of faces for each colour."""
+"""Mesh files as compact triangles: welded vertices, and one array of faces per colour."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
         resolution *= 1.5
     seen = tuple(mesh for mesh in welded if len(mesh.faces))
     if not seen:
-        raise ValueError(f"{path}: has no triangle large enough to be seen")
+        raise ValueError(f"{path}: has no triangle large enough to be visible")
     return seen
 
 

@@ -1,4 +1,4 @@
-"""From natural modes to the page that plays them: the robot swings in one of them at a time."""
+"""The page that animates the natural modes of a robot, one at a time."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def mode_page(
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
         raise InputError(
-            f"the modes are of a model of '{lin.robot}' with {len(lin.state_names)} states, "
-            f"expected the {state.nx} of '{robot.name}'; give the robot that was linearised, whole"
+            f"the modes belong to a model of '{lin.robot}' with {len(lin.state_names)} states, "
+            f"expected the {state.nx} states of '{robot.name}'; give its robot, unreduced"
         )
     if not found.vibrations:
         raise InputError(
-            f"'{robot.name}' has no vibration to show: no mode oscillates; give the joints that "
-            "bend a stiffness"
+            f"'{robot.name}' has no vibration to show: no mode oscillates; give its flexible "
+            "joints a stiffness"
         )
     window, sent = Recorder(), set[str]()
     scenery = Visualizer(window=window)

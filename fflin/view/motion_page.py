@@ -1,4 +1,4 @@
-"""From a motion to what its page shows: the robots in the scene, and the figures beside them."""
+"""The page of a motion: the robots in the scene, and the panel of figures beside them."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
 def marks(
     robot: Robot, film: Playback, tool: str | None, size: float, goals: Array
 ) -> dict[str, Any]:
-    """Return trails, those of goals (N, njoints - 1, 7) that move too, wrenches and plumes."""
+    """Return trails, also of moving goals (N, njoints - 1, 7), wrenches and plumes."""
     trails, followed = [("centre of mass", COM_COLOR, film.com)], {}
     if len(goals) > 1:
         trails, followed = [("base", COM_COLOR, film.poses[:, 0, :3])], {"base": goals[:, 0, :3]}

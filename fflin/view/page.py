@@ -1,4 +1,4 @@
-"""The page that shows a scene: one HTML file that asks for nothing outside of it."""
+"""The page that shows a scene: one self-contained HTML file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The figures beside a motion: where it is, what drives it and its limits, over time."""
+"""The panel beside a motion: errors, states, inputs and limits over time."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ _CHARTS: tuple[dict[tuple[str, str], str], ...] = (
     {("F_b", "N"): "base force"},
     {
         ("q_m", "rad"): "joints",
-        ("q_m", "m"): "slides",
+        ("q_m", "m"): "prismatic joints",
         ("qdot_m", "rad/s"): "joint rates",
-        ("qdot_m", "m/s"): "slide rates",
+        ("qdot_m", "m/s"): "prismatic joint rates",
         ("tau_m", "N m"): "joint torques",
         ("tau_m", "N"): "joint forces",
     },
@@ -86,7 +86,7 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
     if any(turns):
         found["largest joint"] = ("°", np.degrees(np.abs(joints[:, turns]).max(axis=1)))
     if any(slides):
-        found["largest slide"] = ("m", np.abs(joints[:, slides]).max(axis=1))
+        found["largest prismatic joint"] = ("m", np.abs(joints[:, slides]).max(axis=1))
     return {k: (unit, np.where(x < _NOTHING, 0.0, x)) for k, (unit, x) in found.items()}
 
 

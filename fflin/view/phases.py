@@ -1,4 +1,4 @@
-"""What a motion of several phases shows beside its robot: what it grasps, before and after."""
+"""Payloads in the page of a motion with several phases, before and after their capture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A motion as it is shown: poses, trails, forces and errors at the frames of an animation."""
+"""Data of an animation: poses, trails, forces and errors of a motion at its frames."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MOST_FRAMES = 3000
 
 @dataclass(frozen=True)
 class Playback:
-    """What is shown of a motion at N frames."""
+    """Poses, trails and forces of a motion at N frames."""
 
     t: Array  # (N,) [s]; each is one of the motion's own, so that no pose is interpolated
     poses: Array  # (N, njoints - 1, 7), x, y, z and quaternion of every joint's frame in the world

@@ -1,4 +1,4 @@
-"""What was drawn, kept in the process: no server, no sockets, the last value of each property."""
+"""Recorder of drawing commands in this process, without a server: last value per property."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A robot as nodes of a meshcat scene: one for each body, and below it its pieces."""
+"""A robot as nodes of a meshcat scene: one node per body, with its visual elements below."""
 
 from __future__ import annotations
 

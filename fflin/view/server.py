@@ -1,4 +1,4 @@
-"""A page served to this machine alone, by a thread of this process, and what it is told."""
+"""A server of one page to this machine alone, in a thread of this process."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _listen(port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         raise InputError(
-            f"port {port} cannot be had: {error.strerror}; name another, or none for a free one"
+            f"port {port} is not available: {error.strerror}; give another one, or 0 for a free one"
         ) from None
     listener.setblocking(False)
     return listener

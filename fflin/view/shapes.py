@@ -1,4 +1,4 @@
-"""What a robot looks like: the visual elements of its URDF, or boxes of its inertias."""
+"""Shapes of a robot: the visual elements of its URDF, or boxes of its inertias."""
 
 from __future__ import annotations
 
@@ -106,8 +106,8 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
     if missing:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
         notes.append(
-            f"{robot.name}: {named('mesh file', missing)} not found below {where}; the rest is "
-            "drawn (package_dirs of fflin.load names other folders)"
+            f"{robot.name}: {named('mesh file', missing)} not found below {where} and not "
+            "drawn; name further folders in package_dirs of fflin.load"
         )
     if unreadable:
         notes.append(f"{robot.name}: {named('mesh file', unreadable)} cannot be read; not drawn")

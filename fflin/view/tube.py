@@ -1,4 +1,4 @@
-"""The tube of a funnel in the page: where base and tool may be, ellipsoid by ellipsoid."""
+"""The tube of a funnel in the page: ellipsoids of the positions of base and tool."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ def tubes(
     from fflin.campaign.reach import Funnel
 
     if not isinstance(funnel, Funnel):
-        raise InputError(f"funnel is a {type(funnel).__name__}, expected what fflin.funnel returns")
+        said = f"funnel is a {type(funnel).__name__}, expected a Funnel"
+        raise InputError(f"{said}, as fflin.funnel returns it")
     if funnel.robot.joint_names != robot.joint_names or funnel.q.shape[1] != robot.nq:
-        raise InputError(f"the funnel is one of '{funnel.robot.name}', not of '{robot.name}'")
+        raise InputError(f"the funnel belongs to '{funnel.robot.name}', expected '{robot.name}'")
     state, model, data = StateMap(robot, frame="local"), robot.model, robot.model.createData()
     frames = {"base": None} | ({"tool": frame_index(model, tool)} if tool else {})
     found: dict[str, list[Any]] = {name: [] for name in frames}

@@ -1,4 +1,4 @@
-"""Robots and motions in meshcat: one file to send, pictures of it, or a live page."""
+"""Robots and motions in meshcat: a self-contained file, pictures, or a live page."""
 
 from __future__ import annotations
 
@@ -57,82 +57,89 @@ def visualize(
     port: int = 0,
     frame: str | None = None,
 ) -> Live | Path | None:
-    """Show a robot live, or a motion of it as one HTML file that needs no network.
+    """Show a robot live, or write a motion of it to one HTML file that needs no network.
 
-    The page has the robot in its colours, triads at base and tool, the trails of the tool and of
-    the centre of mass, arrows of force and torque on the base and plumes of thrusters as long as
-    u(t), a translucent robot at the target and, where the motion has a linear prediction, another
-    that follows it; a slider, and a panel with errors and inputs over time. Along a trajectory the
-    reference moves beside the robot, with its paths of base and tool in dashes beside those that
-    were flown, and pale under the joints' curves; a dotted line is where it comes to rest. Every
-    body is a node ``meshcat/robot/JOINT`` of meshcat's scene whose pose is that of the joint's
-    frame.
+    The page of a motion shows:
+
+    - the robot in its colours, with triads at base and tool;
+    - the trails of the tool and of the centre of mass;
+    - arrows of force and torque on the base, and plumes of thrusters, as long as u(t);
+    - a translucent robot at the target, and another at the linear prediction, if there is one;
+    - a time slider, and a panel with errors and inputs over time.
+
+    Along a trajectory, a translucent robot moves with the reference. The reference paths of base
+    and tool are dashed, and its joint curves are pale. A dotted line marks the time at which the
+    reference comes to rest. Every body is a node ``meshcat/robot/JOINT`` of meshcat's scene, at the
+    pose of the joint's frame.
 
     Parameters
     ----------
     robot : Robot
+        Robot to show.
     motion : Motion or Modes, optional
-        Of `simulate`; or of `modes`, which the page plays one at a time, by their names and
-        frequencies. Without it the robot is shown live, with a slider for each joint.
+        Motion from `simulate`; or modes from `modes`, which the page animates one at a time, listed
+        by name and frequency. Without it, a live page shows the robot with a slider per joint.
     html : path, optional
         File to write; a temporary one by default.
     png, gif : path, optional
-        Pictures to write; Chromium takes them.
+        Pictures to write; they need Chromium.
     times : sequence of float, optional
-        When [s] pictures are taken: one is a picture with its panel, several are a strip. Four
-        by default.
+        Times [s] of the pictures, four by default. One time gives a picture with its panel, several
+        give a strip.
     open : bool, optional
-        Whether to open a browser; by default where no file is named.
+        Whether to open a browser; by default only if no file is named.
     scene : {"space", "lab"}, optional
-        Sky and planet, or a floor with a grid; the latter by default where there is gravity. In
-        orbit the planet is the body that it circles, in its true size and below, where it turns
-        with the stars as the orbit goes on; the sun stays.
+        "space" shows sky and planet; "lab" shows a floor with a grid, the default under gravity. In
+        orbit the planet is the central body, below and in its true size. Planet and stars rotate
+        with the orbital motion; the sun is fixed.
     fps : float
-        Frames per second of watching.
+        Frames per second of playback.
     speed : float, optional
-        Seconds of motion per second of watching; 1, or more for motions of over a minute. A
-        simulation that is shown live waits for it.
+        Seconds of motion per second of playback; by default 1, or more for motions longer than a
+        minute. A simulation that is shown live is slowed down to this speed.
     follow : bool, optional
-        Whether the camera follows the base; by default where a motion goes so far that the robot
-        would be a dot on its way.
+        Whether the camera follows the base; by default only if the path is so long that the robot
+        would be a dot.
     target : array_like (nq,), optional
-        Configuration that errors are counted from; by default the one that the motion was steered
-        to. Where there is none the change from the start is shown instead, and no ghost.
+        Configuration from which errors are measured; by default the motion's target. Without a
+        target, the page shows the change from the start, and no translucent robot.
     tool : str, optional
-        Frame whose trail is drawn; "tool" or the last link of the longest chain by default.
+        Frame whose trail is drawn; by default "tool", or the last link of the longest chain.
     cloud : Campaign, optional
-        Of `monte_carlo`: the paths of base and tool in up to 240 of its runs, as thin lines. The
-        motion may be a run of it, `Campaign.replay`, which is shown with the bodies that it drew.
+        Campaign from `monte_carlo`: the paths of base and tool in up to 240 runs, as thin lines.
+        The motion may be one of its runs, from `Campaign.replay`; it is shown with its drawn
+        bodies.
     funnel : Funnel, optional
-        Of the trajectory that the motion follows: where base and tool may be is drawn as a tube.
+        Funnel along the trajectory that the motion follows. A tube shows the positions of base and
+        tool inside it.
     q : array_like (nq,), optional
-        Where a live robot stands first; by default at its `start`, or neutral.
+        Initial configuration of a live robot; by default its `start`, or neutral.
     port : int
-        Of the live page; a free one by default.
+        Port of the live page; a free port by default.
     frame : {"lvlh", "hill"}, optional
-        Of a live robot in orbit, which of the orbit's frames its world is; lvlh by default.
+        Orbital frame that is the world of a live robot in orbit; "lvlh" by default.
 
     Returns
     -------
     Live, Path or None
-        The live page; or the HTML file, None where only pictures were asked for.
+        Live page, or path of the HTML file; None if only pictures were requested.
 
     Raises
     ------
     InputError
-        If the motion or modes are another robot's or of a reduced model, or a value is none; if
-        no mode oscillates, or pictures of modes are asked for; if the port is taken.
+        If the motion or modes belong to another robot or a reduced model; if no mode oscillates, or
+        pictures of modes are requested; if a value is invalid or the port is in use.
     FileError
-        If a file cannot be written. No file is left half written.
+        If a file cannot be written. Files are written atomically.
     UnknownNameError
-        If there is no such frame.
+        If the frame `tool` is unknown.
     MissingPackageError
-        If a picture is asked for and there is no Chromium.
+        If a picture is requested and Chromium is not installed.
 
     Warns
     -----
     FflinWarning
-        Of what could not be drawn: missing meshes; boxes where there is no visual geometry.
+        If meshes are missing, or boxes replace missing visual geometry.
 
     Examples
     --------
@@ -141,7 +148,7 @@ def visualize(
     >>> fflin.visualize(robot, motion, html="motion.html").name
     'motion.html'
     """
-    instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
+    instance("robot", robot, Robot, "a fflin.Robot, as fflin.load returns it")
     if scene is None:
         scene = "lab" if any(robot.gravity) else "space"
     if not isinstance(scene, str) or scene not in SCENES:
@@ -153,7 +160,9 @@ def visualize(
     tool = tool or default_tool(robot)
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
-            raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
+            raise InputError(
+                "a file is named but no motion is given; give one, as fflin.simulate returns it"
+            )
         port = whole("port", port, 0, 2**16 - 1)
         start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
@@ -171,7 +180,7 @@ def visualize(
     contents: dict[Path, bytes] = {}
     if isinstance(motion, Modes):
         if {*outputs} - {".html"}:
-            raise InputError("pictures are taken of a motion; modes are shown by a page, html")
+            raise InputError("png or gif is given with modes, which have no pictures; give html=")
         from fflin.view.mode_page import mode_page
 
         page, notes = mode_page(robot, motion, scene=scene, tool=tool)
@@ -257,8 +266,8 @@ def _check_motion(robot: Robot, motion: Motion, cloud: Any) -> Robot:
     expected = robot.nq, len(Actuation(StateMap(robot)).names)
     if sizes != expected or motion.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
-            f"the motion is one of '{motion.robot}', not of '{robot.name}' as it is given; give "
-            "the robot that it was simulated with"
+            f"the motion of '{motion.robot}' was simulated with another robot than the given "
+            f"'{robot.name}'; give the robot that it was simulated with"
         )
     return robot
 
@@ -267,14 +276,14 @@ def _configuration(robot: Robot, name: str, value: Array) -> Array:
     try:
         return robot.checked_configuration(value)
     except InputError as error:
-        raise InputError(f"{name} is no configuration: {error}") from None
+        raise InputError(f"{name} is not a configuration: {error}") from None
 
 
 def check_times(times: Sequence[float], start: float, end: float) -> list[float]:
     """Return the times [s] of pictures, or raise where one is not in the motion."""
     times = [number("a time", time) for time in times]
     if not times or not all(start <= time <= end for time in times):
-        raise InputError(f"times are {times}, expected some from {start:g} to {end:g} s")
+        raise InputError(f"times are {times}, expected times from {start:g} to {end:g} s")
     return times
 
 

@@ -538,7 +538,7 @@ BAD = [
     ({"given": {"q_b": -1.0}}, "standard deviation"),
     ({"given": {"q_b": (1.0, 0.0)}}, "least, largest"),
     ({"given": {"q_b": []}}, "values"),
-    ({"given": {"q_b": stats.gamma}}, "freeze"),
+    ({"given": {"q_b": stats.gamma}}, "frozen"),
     ({"given": {"q_b": 0.6}}, "attitude"),
     ({"given": {"base.mass": 0.5}}, "'base.mass'"),
     ({"given": {"base.inertia": (-2.0, 0.0)}}, "robot"),
@@ -668,7 +668,7 @@ def test_a_file_of_anything_else_is_replaced_only_on_request(ending, robots, tmp
     foreign = b"notes", (tmp_path / "other.npz").read_bytes()
     for content in foreign:
         path.write_bytes(content)
-        with pytest.raises(fflin.FileError, match="holds no campaign"), monkeypatch.context() as no:
+        with pytest.raises(fflin.FileError, match="is not a campaign"), monkeypatch.context() as no:
             no.setattr("fflin.campaign.monte_carlo.CampaignJob", None)  # the work
             fly()
         assert path.read_bytes() == content and len(list(tmp_path.iterdir())) == 2

@@ -61,14 +61,14 @@ def test_goals_limits_and_histograms(campaign):
     goal = "goal or limit"
     bounds = [x for x in of(figure, "attitude error").get_lines() if x.get_label() == goal]
     assert [x.get_ydata()[0] for x in bounds] == [3.0]
-    limits = [x for x in of(figure, "largest of F_b").get_lines() if x.get_label() == goal]
+    limits = [x for x in of(figure, "largest |F_b|").get_lines() if x.get_label() == goal]
     assert [x.get_ydata()[0] for x in limits] == [0.5]
-    assert not [x for x in of(figure, "largest of tau_b").get_lines() if x.get_label() == goal]
+    assert not [x for x in of(figure, "largest |tau_b|").get_lines() if x.get_label() == goal]
     [position] = [x for x in figure.axes if x.get_xlabel() == "position error [m]"]
     assert [x.get_xdata()[0] for x in position.get_lines() if x.get_label() == goal] == [1.0]
     counts = [int(sum(bar.get_height() for bar in bars)) for bars in position.containers]
     assert counts == [int((~campaign.stopped).sum())] * 2
-    bars = of(figure, "what the attitude goes with").containers[0]
+    bars = of(figure, "correlation with attitude").containers[0]
     sizes = sorted(campaign.sensitivity().values(), key=abs)
     assert [bar.get_width() for bar in bars] == sizes[-10:]
     assert "% confidence" in figure.get_suptitle() and "left the chart" in figure.get_suptitle()

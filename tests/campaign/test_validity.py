@@ -296,7 +296,7 @@ def test_bad_input(arm):
         with pytest.raises(fflin.InputError, match=words):
             fflin.validity(arm, lin, gain, **options)
     gone = fflin.linearize(arm, v=fflin.velocity(arm, {"omega_b.z": 0.1}))
-    with pytest.raises(fflin.InputError, match="fixed point"):
+    with pytest.raises(fflin.InputError, match="equilibrium at rest"):
         fflin.validity(arm, gone, gain)
 
 
@@ -422,7 +422,7 @@ def test_frames_are_compared_in_the_same_linear_loop():
 def test_command_compares_frames():
     options = ("validity", "cubesat", "--samples", "2")
     code, out, _ = run(*options, "--frames", "local", "hybrid")
-    assert code == 0 and out.count("of 2 runs settled, every one up to") == 2
+    assert code == 0 and out.count("of 2 runs settled, all up to") == 2
     assert "'hybrid', 'local', 'world'" in refused(*options, "--frames", "base")
 
 

@@ -172,18 +172,24 @@ def test_what_the_inputs_cannot_hold_is_named(robots, name, dt):
             fflin.lqr(point.discretize(dt) if dt else point, 1, 1)
 
     joints = [fflin.JointTorque(joint) for joint in robot.joint_names]
-    refused(joints, r"cannot hold base attitude and position \(momentum is conserved\).*_reduction")
-    refused([fflin.BaseTorque(), *joints], r"hold base position \(linear momentum is conserved\)")
-    refused([fflin.BaseForce(), *joints], r"hold base attitude \(angular momentum is conserved\)")
+    refused(joints, r"stabilise base attitude and position \(momentum is conserved\).*_reduction")
+    refused(
+        [fflin.BaseTorque(), *joints], r"stabilise base position \(linear momentum is conserved\)"
+    )
+    refused(
+        [fflin.BaseForce(), *joints], r"stabilise base attitude \(angular momentum is conserved\)"
+    )
     plane = [
         fflin.Thruster(robot.model.frames[2].name, position=(0.1, y, 0.0), direction=direction)
         for y, direction in ((0.1, (1, 0, 0)), (-0.1, (-1, 0, 0)), (0.1, (0, 1, 0)))
     ]
-    refused([*plane, *joints], r"hold base attitude x/y and position z \(momentum is conserved\)")
+    refused(
+        [*plane, *joints], r"stabilise base attitude x/y and position z \(momentum is conserved\)"
+    )
     base = [fflin.BaseTorque(), fflin.BaseForce()]
     refused(
         [*base, *joints[1:]],
-        f"hold joint {robot.joint_names[0]}, which no input moves; .*--stiffness.* motor$",
+        f"stabilise joint {robot.joint_names[0]}, which no input moves; .*--stiffness.* motor$",
     )
 
 

@@ -237,7 +237,7 @@ def test_the_drift_is_saved_loaded_and_shown(tmp_path, suffix):
     motion.save(path)
     loaded = fflin.Motion.load(path)
     np.testing.assert_array_equal(loaded.com_drift, motion.com_drift)
-    shown = f"centre of mass from its line: {motion.com_drift.max():.1e} m"
+    shown = f"centre of mass from its predicted path: {motion.com_drift.max():.1e} m"
     assert shown in motion_text(loaded)
     assert f"com drift {motion.com_drift.max():.1e} m" in repr(loaded)
 

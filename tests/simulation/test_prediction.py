@@ -66,7 +66,7 @@ def test_where_nothing_can_be_foreseen_the_reason_is_said():
     feedback = fflin.StateFeedback(lin, gain.K)
     batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [0.0, 1.0]}))
     policies = {
-        "an Allocation has thrusters that cannot pull": fflin.Allocation(feedback, robot),
+        "an Allocation is not linear": fflin.Allocation(feedback, robot),
         "a ScheduledFeedback is not known to be linear": fflin.ScheduledFeedback(
             lin, fflin.lqr_batch(batch, 1.0, 1.0)
         ),

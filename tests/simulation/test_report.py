@@ -205,7 +205,7 @@ def test_an_input_that_goes_from_limit_to_limit_is_at_its_limit_all_along():
 @pytest.mark.parametrize(
     ("options", "code", "begins"),
     [
-        ((), 0, "settled: at the target from first to last"),
+        ((), 0, "settled: at the target throughout the run"),
         (("--rpy", 20, 0, 0), 0, "not settled: attitude "),
         (("--free",), 0, "planar_detumble: 2 s"),
         (("--free", "--velocity", "joint_1=400000"), 1, "stopped: diverged at t = "),

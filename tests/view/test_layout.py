@@ -210,7 +210,7 @@ def test_what_was_passed_leads_to_its_time(watch, tmp_path):
     fflin.visualize(robot, replace(motion, u=u, limit_names=names, limits=limits), html=path)
     watched = watch(path.as_uri() + "#pause", size=(800, 600))
     line = watched.page.locator(".passed")
-    expected = "beyond its limit, the farthest of 2:\ntau_m.joint_2 -9 N m at 3.01 s, limit -4"
+    expected = "limit exceeded, worst of 2:\ntau_m.joint_2 -9 N m at 3.01 s, limit -4"
     assert line.text_content() == expected
     assert "tau_m.joint_1 5 N m at 12.5 s, limit 4" in line.get_attribute("title")
     line.click()

@@ -57,7 +57,7 @@ def test_errors_are_those_of_the_pose(robots):
     np.testing.assert_allclose(found["attitude"][1], [0, 37.0], atol=1e-6)
     np.testing.assert_allclose(found["position"][1], [0, np.linalg.norm(step[:3])], atol=1e-12)
     np.testing.assert_allclose(found["largest joint"][1], np.degrees([0, 1.1]), atol=1e-7)
-    assert "largest slide" not in found
+    assert "largest prismatic joint" not in found
 
 
 def test_errors_from_a_target_that_moves_are_those_of_the_same_moment(robots):
@@ -83,7 +83,7 @@ def test_metres_are_not_taken_for_degrees_nor_wheels_for_joints():
     robot.joint("wheel_1").place(q, 2.0)
     found = errors(robot, np.array([q]), target[None])
     assert found["largest joint"][1] == pytest.approx(np.degrees(0.1))
-    assert found["largest slide"][1] == pytest.approx(0.03)
+    assert found["largest prismatic joint"][1] == pytest.approx(0.03)
     motion = settling(robot, 1.0)
     shown = panel(robot, motion, every(motion), target[None])
     labels = {each["label"]: each["unit"] for each in shown["readouts"]}
@@ -110,13 +110,20 @@ def test_plots_have_the_units_of_the_model():
     robot = robot.replace(inputs=[*robot.inputs, *more])
     motion = settling(robot, 1.0)
     shown = panel(robot, motion, every(motion), robot.neutral()[None])["plots"]
-    expected = {("base torque", "N m"), ("base force", "N"), ("joints", "rad"), ("slides", "m")}
+    expected = {
+        ("base torque", "N m"),
+        ("base force", "N"),
+        ("joints", "rad"),
+        ("prismatic joints", "m"),
+    }
     expected |= {("joint torques", "N m"), ("joint forces", "N")}
     expected |= {("thrusters", "N"), ("wheel torque", "N m")}
     assert {(plot["title"], plot["unit"]) for plot in shown[2:]} == expected
     drawn = charts({"plots": shown})
     for joint in robot.joints:
-        of, by = ("slides", "joint forces") if joint.prismatic else ("joints", "joint torques")
+        of, by = (
+            ("prismatic joints", "joint forces") if joint.prismatic else ("joints", "joint torques")
+        )
         x = motion.x[every(motion), motion.state_names.index(f"q_m.{joint.name}")]
         u = motion.u[every(motion), motion.input_names.index(f"tau_m.{joint.name}")]
         np.testing.assert_allclose(drawn[of][joint.name], x, rtol=1e-6)

@@ -108,7 +108,7 @@ function makeLive({ viewer, aim, keepFramed, turn }, info) {
         console.warn("a piece cannot be drawn:", error);
       }
     };
-    socket.onclose = () => { problem("No connection to fflin; it will be taken up again."); setTimeout(connect, 1000); };
+    socket.onclose = () => { problem("The connection to fflin is lost; reconnecting."); setTimeout(connect, 1000); };
   };
   keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y + gone.y, z + gone.z]), info.direction]);
   connect();

@@ -70,7 +70,7 @@ function main() {
   try {
     stage = makeStage(info);
   } catch (error) {
-    problem("This browser shows no WebGL, which the picture needs.");
+    problem("This browser does not support WebGL, which this page needs.");
     console.warn(error);
     return;
   }
@@ -144,7 +144,7 @@ function main() {
   const button = document.createElement("button");
   const press = () => button.setAttribute("aria-pressed", follow);
   button.textContent = "follow";
-  button.title = "whether the camera follows the base";
+  button.title = "follow the base with the camera";
   button.addEventListener("click", () => { follow = !follow; press(); });
   press();
   document.getElementById("bar").append(button);

@@ -22,7 +22,7 @@ function makeModes({ viewer, aim, keepFramed }, info) {
   head.className = "figures";
   const cells = (parent, texts) => texts.forEach((text) => parent.append(Object.assign(document.createElement("span"), { textContent: text })));
   cells(head, ["rad/s", "Hz", "damping"]);
-  head.title = "modes by the bodies with most of the kinetic energy";
+  head.title = "modes, named by the bodies with most of the kinetic energy";
   shape.className = "readouts shape";
   const rows = info.modes.map((mode, k) => {
     const row = document.createElement("button"), name = document.createElement("b"), figures = document.createElement("div");

@@ -33,7 +33,7 @@ function makePassed(parent, passed, seek) {
   if (!passed.length) return;
   const line = document.createElement("button");
   line.className = "passed";
-  line.textContent = `beyond its limit${passed.length > 1 ? `, the farthest of ${passed.length}` : ""}:\n${passed[0][0]}`;
+  line.textContent = `limit exceeded${passed.length > 1 ? `, worst of ${passed.length}` : ""}:\n${passed[0][0]}`;
   line.title = passed.map(([text]) => text).join("\n");
   line.addEventListener("click", () => seek(passed[0][1]));
   parent.append(line);
@@ -110,7 +110,7 @@ function makeKeys(named, lines) {
     keys.append(key);
     grey.delete(label);
   }
-  if (grey.size) keys.append(`and ${grey.size} in grey`);
+  if (grey.size) keys.append(`and ${grey.size} more in grey`);
   return keys;
 }
 
