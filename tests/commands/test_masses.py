@@ -71,8 +71,8 @@ def test_the_fraction_is_saved(tmp_path):
 def test_what_is_wrong_is_one_line(tmp_path):
     vary = ("uncertain", "cubesat", "--vary")
     assert "'bas.mass'" in refused(*vary, "bas.mass=0.1")
-    assert "NAME=SHARE" in refused(*vary, "base.mass")
-    assert "NAME=SHARE" in refused(*vary, "base.mass=1:2:3")
+    assert "NAME=FRACTION" in refused(*vary, "base.mass")
+    assert "NAME=FRACTION" in refused(*vary, "base.mass=1:2:3")
     assert "least less than largest" in refused(*vary, "base.mass=3:2")
     assert "twice" in refused(*vary, "base.mass=0.1", "--vary", "base.mass=0.2")
     assert "--vary" in refused("uncertain", "cubesat")
