@@ -72,7 +72,7 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 
 
 def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
-    """Return the name and the value of an array, None where it is of a kind that is not read."""
+    """Return the name and value of an array; the value is None if its class is not supported."""
     if depth > _DEEPEST:
         raise ValueError("its cells are nested too deeply")
     if not data:
@@ -122,7 +122,7 @@ def _cells(parts: Iterator[tuple[int, bytes]], count: int, order: str, depth: in
 
 
 def _rows(text: str, shape: tuple[int, ...]) -> str | list[str]:
-    """Return the text of a char array, or of each of its rows where it has several."""
+    """Return the text of a char array, or a list of texts if it has several rows."""
     if shape[0] <= 1:
         return text
     if len(text) != math.prod(shape):
