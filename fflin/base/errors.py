@@ -133,7 +133,7 @@ class ChartError(FflinError, ValueError):
 
 
 class EquilibriumError(FflinError, ValueError):
-    """Error for a point that must be a fixed point and is not, or that no input makes one.
+    """Error for a point that is not the required fixed point, or that no input can hold.
 
     Examples
     --------

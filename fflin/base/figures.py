@@ -68,7 +68,7 @@ def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float)
 
 @contextmanager
 def drawing(path: str | Path | None, width: float, height: float, **options: Any) -> Iterator[Any]:
-    """Give a figure of a size [in] in the style, without a window; saved where there is a path."""
+    """Yield a figure of a size [in] in the style, without a window; save it if a path is given."""
     target = None if path is None else as_path(path)
     if target is not None:
         check_ending(target, FORMATS)

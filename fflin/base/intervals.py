@@ -31,7 +31,7 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
 
 
 def quantile(values: Array, p: float, confidence: float) -> Estimate:
-    """Return the p-quantile between two order statistics; infinite ones where there are too few."""
+    """Return the p-quantile between two order statistics; infinite if there are too few draws."""
     from scipy.special import bdtr
 
     count = len(values)

@@ -13,7 +13,7 @@ _OF_UNIT = {"N": "thrust", "N m": "wheel"}
 
 
 def group_of(name: str) -> str:
-    """Return GROUP of GROUP.ENTRY; nothing where a name has no group."""
+    """Return GROUP of GROUP.ENTRY; empty if the name has no group."""
     return name.partition(".")[0] if "." in name else ""
 
 
@@ -49,7 +49,7 @@ def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str
 
 
 def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
-    """Return where the names are that a key stands for: ``tau_m.x``, ``tau_m``, ``x`` or ``*x``."""
+    """Return the indices of the names that match a key: ``tau_m.x``, ``tau_m``, ``x`` or ``*x``."""
     if key in names:
         return [names.index(key)]
     # Of a name or of its entry; brackets stand in names of joints: * and ? alone are wild.
@@ -96,7 +96,7 @@ def rates_by_name(joints: Sequence[str], values: Mapping[str, float]) -> dict[st
 
 
 def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return where the names are that any of the keys stands for, in the order of the names."""
+    """Return the indices of the names that match any of the keys, in the order of the names."""
     return sorted({index for key in keys for index in matching(kind, key, names)})
 
 

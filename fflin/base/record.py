@@ -54,7 +54,7 @@ class NoRoomError(FileError):
 
 
 def write_record(path: Path, record: Mapping[str, Any], *, sealed: bool) -> None:
-    """Write a record, in the format that the ending says; with its digest where `sealed`."""
+    """Write a record in the format of the ending, with its digest if `sealed`."""
     check_ending(path, FORMATS)
     require_finite(record)
     write_whole({path: _CODECS[path.suffix][0](record, sealed)})
@@ -85,7 +85,7 @@ def reading(path: Path, what: str) -> Iterator[None]:
 
 
 def require_finite(record: Mapping[str, Any]) -> None:
-    """Raise `InputError` where a figure is not finite."""
+    """Raise `InputError` if a value is not finite."""
     for key, value in record.items():
         if isinstance(value, np.ndarray | float) and not np.isfinite(value).all():
             raise InputError(

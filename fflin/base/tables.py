@@ -17,7 +17,7 @@ _EPS = sys.float_info.epsilon
 
 
 def width() -> int:
-    """Columns to fill: the terminal's, or 80 where the output goes elsewhere."""
+    """Return the number of columns: the terminal's, or 80 if the output is not a terminal."""
     return shutil.get_terminal_size((80, 24)).columns if _on_terminal() else 80
 
 

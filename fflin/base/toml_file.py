@@ -78,7 +78,7 @@ class TomlFile:
         return self._lines.get(way, 1)
 
     def error(self, message: str, *place: str | int) -> InputError:
-        """Build an error that says where a place stands."""
+        """Build an error that names the file and the line of a key."""
         return InputError(f"{self.path}:{self.line(*place)}: {message}")
 
     def unknown(self, problem: FflinError | str, *place: str | int) -> UnknownNameError:

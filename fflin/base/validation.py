@@ -1,4 +1,4 @@
-"""Checks of arguments, made once where a public call begins."""
+"""Checks of arguments, made once at the beginning of a public call."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DOUBLE = np.dtype(np.float64)
 
 
 def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
-    """Return a vector (size,) of finite native floats: the caller's own array where it is one."""
+    """Return a vector (size,) of finite native floats; the same array if it is valid already."""
     if type(value) is np.ndarray and value.dtype is DOUBLE:
         array: Array = value
     else:
@@ -65,7 +65,7 @@ def share(name: str, value: Any) -> float:
 
 
 def refuse_masked(name: str, value: Any) -> None:
-    """Raise `InputError` where an entry is masked, which NumPy makes NaN or takes as it is."""
+    """Raise `InputError` if an entry is masked, which NumPy makes NaN or takes as it is."""
     ma: Any = sys.modules.get("numpy.ma")  # what is masked has loaded it
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; fill them in first")
@@ -79,7 +79,7 @@ def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
 
 
 def truth(name: str, value: Any) -> bool:
-    """Return whether a switch is on, or raise `InputError` where it is no True or False."""
+    """Return whether a switch is on, or raise `InputError` if it is not True or False."""
     return bool(instance(name, value, bool | np.bool_ | int, "True or False"))
 
 
@@ -120,7 +120,7 @@ def dimension(name: str, value: Any) -> int:
 
 
 def placement(name: str, value: Any) -> pin.SE3:
-    """Return a copy of a rigid placement, its rotation normalised where it is one within 1e-6."""
+    """Return a copy of a placement, its rotation normalised if it is valid within 1e-6."""
     import pinocchio as pin
 
     instance(name, value, pin.SE3, "a pin.SE3 (placement)")

@@ -105,7 +105,7 @@ def _same_file(path: str | Path, other: Path) -> bool:
 
 
 def write_whole(contents: Mapping[Path, bytes]) -> None:
-    """Write files so that each is whole or, where anything fails, as it was before."""
+    """Write files atomically: each is complete or, if anything fails, unchanged."""
     with replacing(*contents) as files:
         for file, content in zip(files, contents.values(), strict=True):
             file.write_bytes(content)
@@ -113,7 +113,7 @@ def write_whole(contents: Mapping[Path, bytes]) -> None:
 
 @contextmanager
 def replacing(*targets: Path) -> Iterator[list[Path]]:
-    """Yield a new file for each target, which takes its place where all ends well."""
+    """Yield a new file for each target; it replaces the target if all goes well."""
     written: dict[Path, Path] = {}
     target = Path()
     try:
@@ -145,7 +145,7 @@ def install(temporary: Path, target: Path) -> None:
 
 
 def place(target: Path) -> Path:
-    """Return the file that is meant, a link followed; `FileError` where none may be written."""
+    """Return the target file with links followed; raise `FileError` if it may not be written."""
     real = Path(os.path.realpath(target))
     try:
         found = os.stat(real)
@@ -165,7 +165,7 @@ def place(target: Path) -> Path:
 
 
 def check_place(target: Path, endings: tuple[str, ...] = ()) -> None:
-    """Raise `FileError` where no file can be written there, before work is done for it."""
+    """Raise `FileError` if no file can be written there, before any work is done."""
     from tempfile import TemporaryFile
 
     if endings:
@@ -180,7 +180,7 @@ def check_place(target: Path, endings: tuple[str, ...] = ()) -> None:
 
 
 def check_distinct(*targets: Path | None) -> None:
-    """Raise `FileError` where two outputs are one file, links followed; None is no output."""
+    """Raise `FileError` if two outputs are the same file, links followed; None is skipped."""
     seen: list[Path] = []
     for target in filter(None, targets):
         for first in seen:

@@ -136,7 +136,7 @@ def jam(
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> tuple[dict[str, Any], Array]:
-    """Return what `Impact` says where robots at q with v become one by (13.1), and the impulses."""
+    """Return the fields of `Impact` for robots at q, v that become one (13.1), and the impulses."""
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))

@@ -149,7 +149,7 @@ _BOUNDS: WeakKeyDictionary[Robot, Array | None] = WeakKeyDictionary()
 
 
 def bounds_of(robot: Robot) -> Array | None:
-    """Return `inertia_bounds` of a robot; None too where joints mimic others."""
+    """Return `inertia_bounds` of a robot; None also if it has mimic joints."""
     if robot not in _BOUNDS:
         _BOUNDS[robot] = None if robot.followers else inertia_bounds(robot.model)
     return _BOUNDS[robot]

@@ -63,7 +63,7 @@ class OrbitField:
         return base.rotation, base.translation
 
     def require_near(self, q: Array) -> None:
-        """Warn or refuse where the robot, its joints anyhow, is far from the orbit's point."""
+        """Warn or raise if the robot, at any joint positions, is far from the orbit's origin."""
         distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
         error = 1.5 * distance / (self.robot.orbit.radius if self.robot.orbit else math.inf)
         said = (
@@ -84,14 +84,14 @@ class OrbitField:
         return found
 
     def relative(self, v: Array, absolute: Array, rate: Array) -> Array:
-        """Return dv/dt (nv,) where the absolute velocity changes by `rate`: (14.2)."""
+        """Return dv/dt (nv,) from the rate of the absolute velocity (14.2)."""
         frame, own, found = absolute - v, skew(v[PIN_ANGULAR]), rate.copy()
         found[PIN_LINEAR] += own @ frame[PIN_LINEAR] - skew(frame[PIN_ANGULAR]) @ v[PIN_LINEAR]
         found[PIN_ANGULAR] += own @ frame[PIN_ANGULAR]
         return found
 
     def wrenches(self, data: pin.Data) -> list[pin.Force]:
-        """Return what pulls on each body, in its joint's frame; `data` says where joints are."""
+        """Return the gravity-gradient wrench on each body, in its joint's frame."""
         R, center = self._places(data)
         back = R.swapaxes(1, 2)
         force = self._mass * (back @ (self.tide @ center))[..., 0]

@@ -45,7 +45,7 @@ class Point(NamedTuple):
     spin: Array  # (3,) rate at which an orbit turns the world, in base axes
 
     def placement(self, frame: Carried) -> pin.SE3:
-        """Return where a frame is on the robot."""
+        """Return the placement of a frame on the robot."""
         return self.data.oMi[frame.joint] * frame.placement
 
 
@@ -60,7 +60,7 @@ class World(NamedTuple):
     spin: Array  # in its own axes
 
     def placement(self, frame: Carried) -> pin.SE3:
-        """Return where a frame is in the world."""
+        """Return the placement of a frame in the world."""
         return self.data.oMi[frame.joint] * frame.placement
 
     def velocity(self, frame: Carried) -> pin.Motion:

@@ -288,11 +288,11 @@ class StateMap:
         return tau.take(self._order, axis=0) if self.S is None else self.S.T @ tau
 
     def columns(self, matrix: Array) -> Array:
-        """Return the product matrix S: columns (..., nv) over Pinocchio's v, in state order."""
+        """Return ``matrix S``, which puts columns (..., nv) over Pinocchio's v in state order."""
         return matrix.take(self._order, axis=1) if self.S is None else matrix @ self.S
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
-        """Return S^T matrix S (7.3): a matrix (nv, nv) over Pinocchio's v, in state order."""
+        """Return ``S^T matrix S`` (7.3), which puts a matrix (nv, nv) over v in state order."""
         if self.S is not None:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.

@@ -128,7 +128,7 @@ def moving_errors(frame: str, x: Array, target: Array) -> Array:
 
 
 def moved_by(frame: str, target: Array, e: Array) -> Array:
-    """Return the states (N, nx) whose `moving_errors` are e; not finite where |q_b| is above 1."""
+    """Return the states (N, nx) whose `moving_errors` are e; not finite if |q_b| exceeds 1."""
     x, (turn_target, R_target), (turn, R) = target + e, _turned(target), _turned(e)
     q_e, q_target = e[:, :3], target[:, :3]
     x[:, :3] = turn_target * q_e + turn * q_target + np.cross(q_target, q_e)
@@ -149,7 +149,7 @@ def _turned(x: Array) -> tuple[Array, Array]:
 
 
 def _in_reference(frame: str, nx: int) -> list[Any]:
-    """Return where states have velocities of the base in reference axes."""
+    """Return the rows of the base velocities in reference axes."""
     velocities = np.arange(nx)[nx // 2 :]
     return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
 

@@ -187,7 +187,7 @@ def equilibrium(
 
 
 class _Held:
-    """The inputs of least norm at a point, in base axes, and what they leave."""
+    """Minimum-norm inputs at a point, in base axes, and the residual forces."""
 
     def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
         robot, actuation = linearizer.robot, linearizer.prepared.actuation
@@ -225,7 +225,7 @@ class _Held:
 
 
 def _require_steady(lin: LinearModel, drift: Array) -> None:
-    """Refuse a motion in which something moves that the forces depend on."""
+    """Refuse a motion of coordinates on which the forces depend."""
     moving = [
         f"{name} at {rate:.3g} {unit}/s"
         for name, unit, rate in zip(lin.state_names, lin.state_units, drift.tolist(), strict=True)
@@ -251,7 +251,7 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
 
 
 def _rounding(robot: Robot, lin: LinearModel, M: Array) -> Array:
-    """Return how much of the forces (6 + n,) may be the rounding of terms that cancel."""
+    """Return the rounding errors of the forces (6 + n,) from terms that cancel."""
     state = StateMap(robot)
     field = field_of(robot, lin.frame)
     speed = np.abs(state.velocities(field.absolute(lin.q, lin.v) if field else lin.v))
@@ -265,7 +265,7 @@ def _rounding(robot: Robot, lin: LinearModel, M: Array) -> Array:
 def _unbalanced(
     robot: Robot, residual: Array, sizes: Array, pushes: dict[str, str]
 ) -> EquilibriumError:
-    """Name the forces that are left, those first that move the most."""
+    """Return the error that names the residual forces, largest effect first."""
     named = list(pushes.items())
     left = [
         f"{named[i][0]} {residual[i]:.3g} {named[i][1]}"

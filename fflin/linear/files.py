@@ -60,7 +60,7 @@ def record_of(lin: Any) -> Record:
 
 
 def write_model(path: Path, entries: Record, *, sealed: bool) -> None:
-    """Write what `record_of` returns, with its digest where `sealed`; see `LinearModel.save`."""
+    """Write the record of a model, with its digest if `sealed`; see `LinearModel.save`."""
     check_ending(path, FORMATS)
     if path.suffix != ".csv":
         record.write_record(path, entries, sealed=sealed)

@@ -178,7 +178,7 @@ class Linearizer:
         return partial(type(self), **options, engine=self._engine), (self.robot,)
 
     def _begins(self) -> bool:
-        """Whether the kernel takes over at this call, which then is there."""
+        """Return whether the kernel takes over at this call; if so, it is loaded."""
         self._calls += 1
         if self._engine is None:
             small = self._lower.start <= _LARGEST_COMPILED
@@ -190,7 +190,7 @@ class Linearizer:
         return self._one is not None
 
     def _by_kernel(self, q: Array, v: Array, u: Array) -> LinearModel | None:
-        """Return the model by the kernel, or None where that cannot vouch for it."""
+        """Return the model by the kernel, or None if the kernel cannot guarantee its accuracy."""
         ready, nx = self.prepared, self._lower.stop
         A, B = np.empty((nx, nx)), np.empty(self._shape_B)
         rate, x0 = np.empty(nx), np.empty(nx)

@@ -60,7 +60,7 @@ class Prepared:
         return {**self.common, **self.rest, "_when_asked": asked, **other}
 
     def kernel(self) -> PointKernel | None:
-        """Return the compiled equations, or None where the kernel does not know a joint."""
+        """Return the compiled equations, or None if the kernel does not support the robot."""
         from fflin.kernel.points import PointKernel
         from fflin.kernel.tree import batch_tree
 
@@ -162,7 +162,7 @@ def _state_at_rest(state: StateMap, q: Array) -> Array:
 
 
 def own_reference(robot: Robot, q: Array) -> Array:
-    """Return where the base of a configuration is (7,), which a model is about by default."""
+    """Return the base placement (7,) at a configuration, the default reference of a model."""
     root = robot.model.jointPlacements[ROOT]
     if root.isIdentity(0.0):
         return q[:7]

@@ -17,7 +17,7 @@ from fflin.dynamics.state import StateMap
 
 
 def at_rest(state: StateMap) -> Array:
-    """Return A (nx, nx) where nothing moves, pulls or pushes: N in its upper right block (2.1)."""
+    """Return A (nx, nx) at rest without forces, with N in its upper right block (2.1)."""
     nv = state.nx // 2
     A: Array = np.zeros((state.nx, state.nx))
     A[:nv, nv:] = np.diag([0.5] * 3 + [1.0] * (nv - 3))

@@ -27,7 +27,7 @@ _UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # of the others rad and rad/s
 
 
 class Convention(NamedTuple):
-    """How a tool writes a free flyer."""
+    """Convention of a tool for a free flyer."""
 
     attitude: str  # in x: "wxyz", "q_b", "euler", or a tangent: "turn", or "pose" with the position
     stored: str  # in q
@@ -227,7 +227,7 @@ def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCo
 
 
 def _centre(robot: Robot) -> pin.SE3:
-    """Return where the root link's own mass is, in the axes that its inertia is given in."""
+    """Return the placement of the root link's centre of mass and inertia axes."""
     frames = (f for f in robot.model.frames.tolist() if f.type == pin.FrameType.BODY)
     name = next((frame.name for frame in frames if frame.parentJoint == ROOT), "")
     if piece := pieces_of(robot)[0].get(name):
@@ -236,7 +236,7 @@ def _centre(robot: Robot) -> pin.SE3:
 
 
 def _way(robot: Robot, name: str) -> list[int]:
-    """Return where the joints from the root to one stand in the file; what has none comes last."""
+    """Return the file indices of the joints from the root to a joint; unknown ones come last."""
     frames, way, order = robot.model.frames, list[int](), robot.file_joints
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
     while at:

@@ -160,7 +160,7 @@ class Trajectory(Design):
 
     @property
     def residual(self) -> Array:
-        """Error (N,) of the knots as a motion: the larger error of the intervals beside each knot.
+        """Residual (N,) of the motion at each knot: the larger error of its adjacent intervals.
 
         Each interval is integrated from its first knot under its inputs. Its error is the
         difference from the next knot divided by the interval, relative to the largest rate of the
@@ -220,7 +220,7 @@ class Trajectory(Design):
 
     @property
     def _fault(self) -> str:
-        """Say why the knots are no motion of the robot; nothing if they are one."""
+        """Return why the knots are not a motion of the robot; empty if they are."""
         missed = self.flow.residual
         k = int(missed.argmax())
         where = f"'{self.robot.name}': from t = {self.t[k]:g} to {self.t[k + 1]:g} s"
@@ -315,7 +315,7 @@ class Trajectory(Design):
 
 
 def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
-    """Return q (count, nq), where it is narrower with the cosine and sine of each angle."""
+    """Return q (count, nq); single angles are replaced by their cosine and sine."""
     rows, cosines = as_double("q", q), np.array(list(robot.unbounded), dtype=int)
     narrow = (count, robot.nq - len(cosines))
     if rows.shape == (count, robot.nq):

@@ -109,7 +109,7 @@ class Coordinates:
         return v
 
     def _followed(self, q: Array) -> Array:
-        """Return a copy of q (nq,) with the followers put right where they are within 1e-6."""
+        """Return a copy of q (nq,) with mimic joints corrected if they are within 1e-6."""
         placed = q.copy()
         self.follow(placed)
         for joint, leader, *_ in self.followers:

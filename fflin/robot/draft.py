@@ -65,7 +65,7 @@ def _lines(mark: str, values: Mapping[str, str]) -> str:
 
 
 def _candidate(robot: Robot, index: int) -> str:
-    """Return the input that a link looks like, in comments; nothing where it looks like none."""
+    """Return the input that a link's name suggests, in comments; empty if it suggests none."""
     model, frame = robot.model, robot.model.frames[index]
     kind = next((kind for kind, look in _LOOKS.items() if look.search(frame.name)), "")
     if not kind or frame.type != pin.FrameType.BODY or frame.parentJoint < ROOT:

@@ -137,7 +137,7 @@ def _outputs(value: Any) -> tuple[Output, ...]:
 
 
 def _by_joint(what: str, value: Any, find: Find, joints: Sequence[str]) -> dict[str, float]:
-    """Return {joint: value} of a mapping, or of one value for all where none can be negative."""
+    """Return {joint: value} from a mapping, or (except for rest) from one value for all joints."""
     if not isinstance(value, Mapping):
         if what == "rest":
             raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
@@ -172,7 +172,7 @@ def range_of(name: str, value: Any) -> Range:
 
 
 def _start(value: Any, find: Find, joints: Sequence[str]) -> dict[str, Any]:
-    """Return where a robot starts, with joints and rates by their full names."""
+    """Return a robot's initial state, with joints and rates by their full names."""
     start = _parts("start", value, _START)
     if "joints" in start:
         values = numbers("start joints", start["joints"], "joint", "start of joint")

@@ -29,7 +29,7 @@ def frame_index(model: pin.Model, name: str) -> int:
 
 
 def find_frame(model: pin.Model, name: str | None) -> Carried:
-    """Return where a frame is, see `frame_index`; the base's root frame where none is named."""
+    """Return the location of a frame, see `frame_index`; of the base's root frame for None."""
     if name is None:
         return Carried(ROOT, pin.SE3.Identity())
     frame = model.frames[frame_index(model, name)]
@@ -37,7 +37,7 @@ def find_frame(model: pin.Model, name: str | None) -> Carried:
 
 
 def find_joint(model: pin.Model, name: str) -> Carried:
-    """Return where a joint's frame is, also of one that was welded."""
+    """Return the location of a joint's frame, even if the joint was welded."""
     if model.existJointName(name):
         return Carried(model.getJointId(name), pin.SE3.Identity())
     frame = model.frames[model.getFrameId(name, pin.FrameType.FIXED_JOINT)]

@@ -91,7 +91,7 @@ class BaseTorque(Input):
     Parameters
     ----------
     max, min : float or sequence of float (3,), optional
-        Limits [N m] of each entry; keyword only. Every kind of input has them.
+        Limits [N m] of each entry; keyword only. Every kind of input has these limits.
 
     Examples
     --------
@@ -315,7 +315,7 @@ def _positive(what: str, value: float, unit: str, hint: str = "") -> float:
 
 
 def _unit(what: str, value: Vector3, hint: str) -> tuple[float, float, float]:
-    """Return three numbers scaled to length 1, or raise `InputError` where they are zero."""
+    """Return three numbers scaled to length 1, or raise `InputError` if they are zero."""
     x, y, z = three_numbers(what, value)
     largest = max(abs(x), abs(y), abs(z))
     if largest == 0.0:

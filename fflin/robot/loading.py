@@ -124,7 +124,7 @@ def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
 def _load(
     found: RobotFile, locks: Sequence[Lock | None], package_dirs: tuple[Path, ...]
 ) -> tuple[Robot, tuple[Advice, ...]]:
-    """Return the robot of a URDF, and what is to be told of it where its fields say no more."""
+    """Return the robot of a URDF, and the warnings that its fields may still remove."""
     description = read_urdf(found.path, found.prune)
     loaded = _robot(description.model, found.name, locks, description.mimics)
     folders = (*package_dirs, *found.package_dirs)

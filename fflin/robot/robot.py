@@ -283,7 +283,7 @@ class Robot(Coordinates):
 
     @cached_property
     def stored_momentum(self) -> tuple[tuple[int, Array], ...]:
-        """Wheels without inertia: (Pinocchio joint, momentum (3,) [N m s] in its axes)."""
+        """Momentum of wheels without inertia: (joint index, vector (3,) [N m s] in its axes)."""
         return stored_momentum(self.model, self.inputs)
 
     @cached_property

@@ -70,7 +70,7 @@ def _settings(robot: Robot) -> list[str]:
     shown = {
         "stiffness [N m/rad | N/m]": robot.stiffness,
         "damping [N m s/rad | N s/m]": robot.damping,
-        "springs relaxed at [rad | m]": robot.rest,
+        "spring rest positions [rad | m]": robot.rest,
         "passive joints": robot.passive,
         "locked joints": robot.locked,
         "gravity [m/s^2]": robot.gravity if any(robot.gravity) else (),

@@ -57,7 +57,7 @@ class JointElement(NamedTuple):
 
 
 def read_joint(element: Element) -> JointElement:
-    """Read a <joint>; raise `UrdfError` where something in it is wrong."""
+    """Read a <joint>; raise `UrdfError` if something in it is wrong."""
     name = element.text("name", "a <joint>")
     of = f"joint {quoted(name)}"
     if name == "universe":

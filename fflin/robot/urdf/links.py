@@ -56,7 +56,7 @@ class Link(NamedTuple):
 
 
 def read_link(element: Element) -> Link:
-    """Read a <link>; raise `UrdfError` where something in it is wrong."""
+    """Read a <link>; raise `UrdfError` if something in it is wrong."""
     name = element.text("name", "a <link>")
     of = f"link {quoted(name)}"
     refuse_near_miss(element, of, ("inertial",))
@@ -78,7 +78,7 @@ def read_link(element: Element) -> Link:
 
 
 def read_pose(element: Element, of: str) -> Pose:
-    """Read the <origin> of an element; the identity where it has none."""
+    """Read the <origin> of an element; the identity if it has none."""
     origin = element.find("origin", of)
     if origin is None:
         return Pose()

@@ -27,7 +27,7 @@ _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 @lru_cache(128)  # a file has a few of them many times
 def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
-    """Return what of the known is nearest to a name, None where nothing is near."""
+    """Return the known name nearest to a name, or None if no name is near."""
     import difflib
 
     return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), None)
@@ -46,7 +46,7 @@ class Element:
     notes: dict[str, list[int]] = field(default_factory=dict)
 
     def error(self, message: str) -> UrdfError:
-        """Build an error that says where this element stands."""
+        """Build an error that names the file and line of this element."""
         return UrdfError(f"{self.origin}:{self.line}: {message}")
 
     def note(self, message: str) -> None:
@@ -136,7 +136,7 @@ class Element:
 
 
 def decimal(text: str) -> float:
-    """Return a decimal number, infinite where it overflows; NaN of anything else."""
+    """Return a decimal number, infinite if it overflows; NaN for any other text."""
     return float(text) if _DECIMAL.fullmatch(text) else math.nan
 
 
