@@ -369,9 +369,9 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: flo
     if joints:
         sizes = " or ".join(f"{d:.2g} {unit}" for unit, d in joints.items())
         from_where.append(f"{sizes} of the joints")
-    source = "the limits of the URDF" if lin.limits else "mass and size, the URDF has no limits"
+    source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
     slow = f"; bandwidth set by {limit.what}" if limit.what else ""
     if beyond := [name for name, room in _efforts(lin).items() if room <= 0.0]:
         slow += f"; at or beyond the URDF limit at the point itself: {listed(beyond)}"
     pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"
-    return f"from {source}, for displacements of {', '.join(from_where)}: {pace}{slow}"
+    return f"from {source}, for displacements of {' and '.join(from_where)}: {pace}{slow}"

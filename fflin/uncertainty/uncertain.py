@@ -154,8 +154,8 @@ class Uncertain:
                 lost += 1
                 if lost >= _TRIES * (len(found) + 1):
                     raise InputError(
-                        f"of {lost + len(found)} robots drawn from these ranges, only {len(found)} "
-                        f"are physically realisable: {why}; give narrower ranges"
+                        f"only {len(found)} of {lost + len(found)} robots drawn from these ranges "
+                        f"are valid: {why}; give narrower ranges"
                     )
                 continue
             found.append(delta)
@@ -293,10 +293,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     made = Uncertain(robot, (*alone.values(), *together), variants)
     _refuse_overlap(variants.pieces, made.ranges)
     if why := made._refusal(np.zeros(len(made.blocks))):
-        raise InputError(
-            f"the robot at the middle of the ranges is not physically realisable: {why}; give "
-            "other ranges"
-        )
+        raise InputError(f"no robot exists at the middle of the ranges: {why}; give other ranges")
     return made
 
 
@@ -330,7 +327,7 @@ def _range(one: Parameter, value: Any) -> Range:
                 f"'{one.name}' is 0, so a relative range is empty; give (least, largest)"
             )
         least, largest = sorted((one.value * (1.0 - share), one.value * (1.0 + share)))
-    expected = "" if least < largest else "least less than largest"
+    expected = "" if least < largest else "least < largest"
     if least < 0.0 and one.part in ("stiffness", "damping"):
         expected = "values of 0 or more"
     if least <= 0.0 and one.part in ("mass", "density", "inertia"):  # the last is a wheel's

@@ -335,7 +335,7 @@ def test_its_table_ranks_links_or_what_is_asked_for():
     assert {len(row) for row in shown("density")} == {7}  # name, 1, 0.1, and two of "x %"
     with pytest.raises(fflin.UnknownNameError, match="'masss'"):
         S.table(3, "masss")
-    assert says(S.table(3, "joint_1.stiffness"), "none")
+    assert says(S.table(3, "joint_1.stiffness"), "no effect")
 
 
 @pytest.mark.parametrize("axis", "xyz")

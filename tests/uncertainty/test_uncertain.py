@@ -141,7 +141,7 @@ def test_what_is_wrong_is_one_line():
     cases = [
         (lambda: fflin.uncertain(robot, {}), "ranges"),
         (lambda: fflin.uncertain(robot, {"link_99.mass": 0.1}), "link_99"),
-        (lambda: fflin.uncertain(robot, {"base.mass": (3.0, 2.0)}), "least less than largest"),
+        (lambda: fflin.uncertain(robot, {"base.mass": (3.0, 2.0)}), "least < largest"),
         (lambda: fflin.uncertain(robot, {"link_1.com.y": 0.1}), "(least, largest)"),
         (lambda: fflin.uncertain(robot, {"base.mass": (-3.0, 2.0)}), "base.mass"),
         (lambda: fflin.uncertain(robot, {"base.inertia.xx": (1e-3, 2e-3)}), "robot"),
