@@ -103,11 +103,12 @@ def controllability(lin: LinearModel) -> Controllability:
     - At rest, the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved. They, and the
       coordinates :math:`W M N^{-1} x_1` that they drive, are split off exactly. Without springs and
       dampers this completes the result: the dimension is 2 rank(B).
-    - With symmetric springs and dampers, the remaining part is decided on the second-order form
-      :math:`M a + D v + K s = S u`, by the rank of :math:`[p^2 M + p D + K, S]` at each pole p.
+    - With symmetric springs and dampers, the second-order form :math:`M a + D v + K s = S u`
+      decides on the remaining part: the rank of :math:`[p^2 M + p D + K, S]` at each pole p.
       Entries within rounding error are set to zero, and each row is scaled by its entries.
-    - At nonzero velocity, or if springs or dampers are not symmetric, the singular values of
-      :math:`[A - p E, B]` in units of energy decide (Popov, Belevitch, Hautus).
+    - At nonzero velocity, the Popov-Belevitch-Hautus test decides: the singular values of
+      :math:`[A - p E, B]`, in units of energy. The same holds if springs or dampers are not
+      symmetric.
 
     A sampled model has the structure of its continuous model. The exception is a vibration whose
     period divides the sample time: sampling makes it uncontrollable. A file contains the sampled

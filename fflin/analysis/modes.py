@@ -103,8 +103,8 @@ class Modes:
     zero_eigenvalues : int
         Number of zero eigenvalues; a rigid-body mode without friction has two.
     residual : float
-        Largest ``|A x - pole x|`` relative to ``|A| |x|``, in states scaled to unit inertias and to
-        the time of the fastest motion.
+        Largest ``|A x - pole x|`` relative to ``|A| |x|``. The states are scaled to unit inertias
+        and to the time of the fastest motion.
     equilibrium : bool
         Whether the operating point is an equilibrium or a relative equilibrium. Otherwise the
         eigenvalues belong to a frozen model and do not show stability.

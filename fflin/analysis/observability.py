@@ -75,10 +75,11 @@ class Observability(FrozenArrays):
 def observability(lin: LinearModel) -> Observability:
     r"""Determine the observable subspace from C and the structure of A.
 
-    At rest the decision uses the second-order form :math:`M a + D v + K s = 0`: the null space of
-    :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p, with one decision for p = 0. At nonzero
-    velocity the unobservable subspace is the orthogonal complement of the controllable subspace of
-    the dual pair :math:`(A^T, C^T)`, in units of energy, as in `controllability`.
+    At rest the second-order form :math:`M a + D v + K s = 0` decides, by the null space of
+    :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. The pole p = 0 is a single decision. At
+    nonzero velocity the dual pair :math:`(A^T, C^T)` decides, in units of energy, as in
+    `controllability`. The unobservable subspace is the orthogonal complement of its controllable
+    subspace.
 
     Parameters
     ----------

@@ -50,9 +50,12 @@ class Funnel(Design):
     outcomes : ndarray (m, N)
         Outcome of each run, in ascending order of level: 0 it reached the goal, 1 it was stopped
         early, 2 it exceeded `within`, 3 it missed the goal.
-    rho, inside, inside_rate : ndarray (m,)
-        Largest level up to which every run succeeded, the number of these runs, and a lower bound,
-        with `confidence`, of the success rate of starts up to that level.
+    rho : ndarray (m,)
+        Largest level up to which every run succeeded.
+    inside : ndarray (m,)
+        Number of runs up to the level `rho`.
+    inside_rate : ndarray (m,)
+        Lower bound, with `confidence`, of the success rate of starts up to the level `rho`.
     rate : ndarray (m, 2)
         Clopper-Pearson interval of the success rate of all starts up to the level `tried`.
     attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)

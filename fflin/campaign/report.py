@@ -17,7 +17,7 @@ def campaign_report(campaign: Any) -> str:
     by = ", compiled" if campaign.engine == "compiled" else ""
     few = f" of {campaign.asked:,} requested" if count < campaign.asked else ""
     title = f"{campaign.robot}: {count:,} runs{few}, {campaign.duration:g} s each"
-    rows = [["error", "unit", "median", "95 %", "99 %", "worst, 95 %", "settling, 95 % [s]"]]
+    rows = [["error", "unit", "median", "95 %", "99 %", "worst 95 %", "settle 95 % [s]"]]
     for name, unit in KINDS.items():
         figures = [quantile(name, p).value for p in _SHARES]
         figures.append(quantile(f"worst {name}", 0.95).value)

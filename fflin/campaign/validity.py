@@ -47,8 +47,9 @@ class Validity(FrozenArrays):
     levels : ndarray (k,)
         Levels at which the prediction error was measured.
     prediction_error : ndarray (k,)
-        Largest error of the linear closed loop over three of its time constants, relative to the
-        displacement, in the norm of its Lyapunov function. NaN if a run left the chart.
+        Largest error of the linear closed loop over three time constants, relative to the
+        displacement. Errors are measured in the norm of the loop's Lyapunov function. NaN if a run
+        left the chart.
     slope : float
         Order of the absolute error in the displacement, over the four smallest levels; 2 is
         expected. NaN if one of these errors is as small as the integration error, or a run left
@@ -62,9 +63,10 @@ class Validity(FrozenArrays):
         Outcome of each random run: "settled", "slow", "chart" or "diverged".
     holds : dict
         Displacement, with the keys of `trusted`, up to which every run settled.
-    inside, inside_rate : int, float
-        Number of runs up to `holds`, and a lower bound, with `confidence`, of the fraction of
-        displacements up to `holds` that settle.
+    inside : int
+        Number of runs up to `holds`.
+    inside_rate : float
+        Lower bound, with `confidence`, of the fraction of displacements up to `holds` that settle.
     rate : tuple of float
         Clopper-Pearson interval of the fraction of all displacements that settle.
     confidence : float

@@ -60,19 +60,18 @@ class Motion(Design):
         Angular momentum about the centre of mass [N m s], then linear momentum [N s], in world
         axes. In orbit the momentum of the motion relative to the frame.
     momentum_drift : ndarray (N,)
-        Deviation of the momentum from its initial value plus the impulse since, relative to the
-        largest momentum that the kinetic energy allows, (11.5) of docs/derivation.md:
+        Deviation of the momentum from its initial value plus the impulse since. It is divided by
+        the largest momentum that the kinetic energy allows, (11.5) of docs/derivation.md:
 
-        - The scale of the linear part is the mass times the rms speed of its elements at the
-          fastest row.
-        - The scale of the angular part is that speed times the mass and the radius of gyration
-          about the base's first position, plus the momentum stored in wheels.
+        - Linear part: the mass times the rms speed of its elements at the fastest row.
+        - Angular part: that speed times the mass times the radius of gyration about the base's
+          first position, plus the momentum stored in wheels.
 
         Momentum is not conserved in orbit. There the drift is the deviation of `energy` from its
         initial value plus the work since, relative to the largest terms of the energy.
     com_drift : ndarray (N,)
-        Distance [m] of the centre of mass from the position that follows from its initial
-        velocity and the impulse since. No rows in orbit, or if the file lacks it.
+        Distance [m] of the centre of mass from the position predicted by its initial velocity and
+        the impulse since. No rows in orbit, or if the file lacks it.
     state_names, input_names, state_units, input_units : tuple of str
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
     robot, urdf_sha256 : str
@@ -216,8 +215,8 @@ class Motion(Design):
         Parameters
         ----------
         *later : Impact or Motion
-            Later phases in order: an impact, from `capture` or `jam`, at the last row of the phase
-            before it, then the motion that `simulate` computes from there on.
+            Later phases in order. An impact, from `capture` or `jam`, happens at the last row of
+            the phase before it. A motion, from `simulate`, starts where the last phase ended.
 
         Returns
         -------

@@ -87,7 +87,7 @@ def test_metres_are_not_taken_for_degrees_nor_wheels_for_joints():
     motion = settling(robot, 1.0)
     shown = panel(robot, motion, every(motion), target[None])
     labels = {each["label"]: each["unit"] for each in shown["readouts"]}
-    assert labels["largest joint error"] == "°" and labels["largest slide error"] == "m"
+    assert labels["largest joint error"] == "°" and labels["largest prismatic joint error"] == "m"
     assert subtitle(robot) == f"{robot.n - 1} joints, 1 wheel, 17.45 kg"
 
 
