@@ -45,42 +45,27 @@ def lqr(
     .. math:: \int_0^\infty \delta x^T Q\,\delta x + 2\,\delta x^T N\,\delta u
               + \delta u^T R\,\delta u\;dt,
 
-    for a sampled one the same sum over its samples; `sampled_cost` takes the weights of the
-    integral to those of the sum. The Riccati equation of a fully actuated model is solved by
-    half its usual size, any other by SciPy's solver; either is refined by Newton's method, and
-    the residual in the model's own variables comes with the result. A weight that is formed with
-    the inertia, such as M^-1 R_a M^-1 on accelerations, has lost what the inertia's condition
-    takes before any solver sees it: `acceleration_lqr` does without.
-
-    Without weights the regulator is one that the robot can bear: its slowest motion comes back at
-    0.2 rad/s, or as much slower as the efforts and speeds of the URDF ask for where the base is
-    turned by 30 deg and the joints by 0.3 rad; see (10.7) of docs/derivation.md. Every input
-    then bears 60 deg of phase, and any gain from a half up. With springs or gravity each mode that
-    the inputs reach keeps the decay that it has at rest (10.8); ``gain.weights`` has the
-    bandwidth, decay and damping of the loop, and names the modes that are slower.
-
-    Of a model with reaction wheels what can be is regulated, and named in ``gain.regulated``:
-    wheels' angles are ignorable, their speeds follow the body's rate where only they turn it, and
-    no input may push the base, (9.4) of docs/derivation.md. Weights on these have no effect.
+    for a sampled model the sum over its samples, see `sampled_cost`. Without weights
+    the regulator keeps the inputs within the limits of the robot, see (10.7) and (10.8)
+    of docs/derivation.md; ``gain.weights`` states the rule. With reaction wheels
+    ``gain.regulated`` names the states that are fed back, (9.4).
 
     Parameters
     ----------
     lin : LinearModel
         About a fixed point, or about a steady motion with ``moving=True``.
     Q : array_like (nx, nx) or (nx,), float, or mapping, optional
-        Weight on the state, positive semidefinite: a matrix, its diagonal, or {name: weight}
-        with names of states or of their groups, such as ``q_b``; what is not named costs nothing.
+        Weight on the state, positive semidefinite: a matrix, its diagonal, or
+        {state or group: weight}, such as ``q_b``, with 0 for the others.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
         Weight on the inputs, positive definite; likewise.
     N : array_like (nx, nu), optional
-        Cross weight, with which Q - N R^-1 N' is positive semidefinite.
+        Cross weight; Q - N R^-1 N' must be positive semidefinite.
     weights : {"urdf", "identity"}, optional
-        Instead of Q and R: those above (default), or 1 on every state and input. Of a sampled
-        model they are those of the continuous cost under the hold.
+        Rule that replaces Q and R: the limits of the URDF (default), or 1 on each.
     wheel_speeds : bool, optional
-        Whether wheels come back to the speeds of the point: by default where other inputs can
-        bring them; True also where wheels turn against each other, False none. The default
-        weights bring them back at a tenth of w.
+        Regulate wheel speeds: by default if other inputs can; True: also of wheels
+        that turn against each other; False: none.
 
     Returns
     -------
@@ -91,10 +76,10 @@ def lqr(
     EquilibriumError
         If the point is not a fixed point; with the rows of f0 that are not zero.
     StabilizabilityError
-        If the inputs cannot hold a mode that does not settle by itself; it is named.
+        If the inputs cannot stabilise a mode; with its name.
     InputError
-        If a weight is of a wrong size, not positive (semi)definite, or leaves out a mode that does
-        not settle by itself.
+        If a weight has a wrong size, is not positive (semi)definite, or leaves out a
+        mode that is not stable.
     UnknownNameError
         If a name does not exist.
     ModelError
@@ -103,11 +88,7 @@ def lqr(
     Warns
     -----
     FflinWarning
-        If the weights are so badly scaled that the equation is solved to less than 1e-8.
-
-    References
-    ----------
-    B. D. O. Anderson and J. B. Moore, Optimal Control: Linear Quadratic Methods, 1990.
+        If badly scaled weights leave a residual above 1e-8.
 
     Examples
     --------

@@ -265,36 +265,33 @@ def linearize(
     q : array_like (nq,), optional
         Configuration in Pinocchio's order, see `configuration`; neutral by default.
     v : array_like (nv,), optional
-        Velocity in Pinocchio's order; at rest by default.
+        Velocity in Pinocchio's order, see `velocity`; zero by default.
     u : array_like (nu,), optional
-        Over the robot's inputs, those on the base in the frame's axes; zero by default.
+        Inputs of the robot, see `effort`; zero by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
-        Axes of the base's velocities and wrenches, see `StateMap`; "hybrid" by default, of a robot
-        in orbit "lvlh".
+        Axes of the base's velocities and wrenches, see `StateMap`; by default
+        "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
-        Placement that attitude and position are relative to; the base's own by default, in orbit
-        the orbit's frame.
+        Pose that attitude and position are relative to; by default the base pose,
+        or the orbit's frame if the robot is in orbit.
     moving : bool
-        The error dynamics about a reference that moves through the point, see `Linearizer`.
+        Return the error dynamics about a reference that moves through the point.
 
     Returns
     -------
     LinearModel
+        The equations stand in `Linearizer`, which prepares this for many points.
 
     Raises
     ------
     InputError
         If an argument has a wrong size or value.
     ChartError
-        If the base is turned by pi from the reference.
+        If the base is rotated by 180 deg from the reference.
     SingularInertiaError
         If a joint moves no mass.
     ModelError
         If the robot is too large.
-
-    See Also
-    --------
-    Linearizer : the same, prepared once for many points; the equations stand there.
 
     Examples
     --------

@@ -35,17 +35,16 @@ def load(
     Parameters
     ----------
     robot : str or Path
-        Bundled name, example-robot-data name, or path to a URDF or to a robot file, a TOML that
-        names a URDF and what else is known of the robot; see the guide. No mesh is loaded.
+        Name of a bundled robot or of example-robot-data, or path of a URDF or of a
+        robot file (TOML, see the guide). Meshes are not loaded.
     lock : mapping or iterable of str, optional
-        {joint: value [rad|m]} welded at that value (None: at neutral), or names; a name
-        may be a pattern, ``hinge_*``. What mimics a locked joint is welded with it.
+        Joints to weld: {joint: value [rad|m]}, None for neutral, or names. A name
+        may be a pattern, ``hinge_*``. Joints that mimic a locked joint are welded too.
     package_dirs : sequence of path
-        Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
-        before those that the URDF lies in.
+        Folders searched first for ``package://`` paths when the robot is drawn.
     **fields
-        inputs, outputs, stiffness, damping, rest, gravity, orbit, limits, passive, weights, start:
-        see `Robot.replace`. What is given here goes before what a robot file says; of locks,
+        inputs, outputs, stiffness, damping, rest, gravity, orbit, limits, passive,
+        weights, start: see `Robot.replace`. They override those of a robot file; locks,
         limits, springs and dampers name by name.
 
     Returns
@@ -55,7 +54,7 @@ def load(
     Raises
     ------
     UnknownNameError
-        If there is no such robot, joint, frame or field.
+        If a robot, joint, frame or field does not exist.
     InputError
         If a field has a wrong value.
     FileError, UrdfError
@@ -68,7 +67,7 @@ def load(
     Warns
     -----
     FflinWarning
-        Of what the file holds and the model does not, and of what cannot be quite right in it.
+        Names what the model leaves out of the file, and likely errors in the file.
 
     Examples
     --------

@@ -62,104 +62,87 @@ def simulate(
 ) -> Motion:
     r"""Simulate a robot under a policy.
 
-    Steps of fixed size on the manifold, by default of the commutator-free method CF4 of order 4.
-    After each step the base is shifted so that the centre of mass is where momentum and impulse
-    take it, and its velocity is set so that the momentum is what the impulse from outside makes
-    it, :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`, where H is integrated with the weights of
-    the method. Thrusters never pull: a negative thrust is cut to zero.
-
-    In orbit q and v are relative to the orbit's frame, here and in what a policy is given; nothing
-    keeps the momentum, and no base is shifted.
+    Steps of fixed size on the manifold keep the momentum and the centre of mass: after
+    each step the base is shifted, and its velocity set to
+    :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`, where H is the integral of the
+    wrench from outside. Thrusters never pull: a negative thrust is cut to zero. In orbit
+    q and v are relative to the orbit's frame, and momentum is not conserved.
 
     Parameters
     ----------
     robot : Robot
     policy : callable, optional
-        policy(t, q, v) -> u (nu,) over the robot's inputs, such as
-        ``StateFeedback(lin, gain.K)``; of a `GainSchedule` the feedback along its trajectory. None
-        acts by default.
+        policy(t, q, v) -> u (nu,), such as ``StateFeedback(lin, gain.K)``, or a
+        `GainSchedule`; by default no input acts.
     x0 : array_like (nx,), optional
-        Initial state in the chart of the policy's model, or of `frame` and `reference`.
-    q0 : array_like (nq,), optional
-    v0 : array_like (nv,), optional
-        Initial configuration and velocity in Pinocchio's order, instead of `x0`; neutral and at
-        rest by default, or where nothing of these is given the start of the trajectory that is
-        followed, or the robot's `start`.
+        Initial state in the chart of the policy's model, or of `frame`, `reference`.
+    q0, v0 : array_like (nq,), (nv,), optional
+        Initial configuration and velocity in Pinocchio's order, instead of `x0`; by
+        default the trajectory's or the robot's `start`, else neutral and at rest.
     duration : float, optional
-        [s]; by default that of the trajectory that is followed.
+        [s]; by default the duration of the trajectory that is followed.
     dt : float, optional
-        Step [s]; by default 0.01, or less if the loop's fastest pole or the samples ask for it. If
-        the motion diverges in steps of that size, it is flown again in steps of a quarter, up to
-        three times, and `Motion.notes` say so. A motion with an event, a callback, a disturbance or
-        a policy of your own in Python is flown once, as these may remember their calls. Where the
-        input is neither sampled nor late, the step is made to divide the duration.
+        Step [s]; by default 0.01, or less if the loop's fastest pole or the samples
+        need it. A diverging run is repeated with a quarter of the step, up to three times,
+        unless Python functions act in it; `Motion.notes` reports this.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
         Whether momentum and centre of mass are kept as above.
     sample : float, optional
-        Time [s] between the samples of the policy, a multiple of dt, between which u is held; by
-        default that of the policy's model where it is sampled, else the policy is asked at every
-        stage of every step.
+        Time [s] for which u is held, a multiple of dt; by default the policy's own.
     delay : float
-        Time [s] from a sample to its effect, a multiple of dt; until then u0 of the policy's
-        model acts, or nothing. Where there is a delay and no `sample`, samples are dt apart.
+        Time [s] from a sample to its effect, a multiple of dt; until then u0 of the
+        policy's model acts. With a delay and without `sample`, samples are dt apart.
     limits : "urdf", float, mapping or list of them, optional
-        What cuts the inputs: "urdf" for all limits of the robot (efforts of the URDF, `min` and
-        `max` of the inputs, the largest speeds of wheels, `Robot.limits`), the largest magnitude
-        of all inputs, or {input, group or pattern: magnitude, or (least, largest)}; in a list such
-        as ``["urdf", {"tau_m": 5.0}]`` what is given goes first. Nothing is cut by default. On-off
-        thrusters fire in pulses in any case, and `Motion.passed` tells which limits were passed.
+        Limits that saturate the inputs: "urdf" for all limits of the robot, one
+        magnitude for all, {input, group or pattern: magnitude or (least, largest)}, or
+        a list such as ``["urdf", {"tau_m": 5.0}]``. None by default. On-off thrusters
+        always pulse.
     disturbance : callable, optional
         disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order.
     events : sequence of callable
-        event(t, q, v) -> float; the run ends after the step in which one is no longer positive.
+        event(t, q, v) -> float; the run ends after the step in which one is <= 0.
     callback : callable, optional
         callback(t, q, v, u), called at every recorded row.
     linear : LinearModel or bool, optional
-        Predicts the motion under the same law, of a StateFeedback, a feedback along a trajectory,
-        an OutputFeedback or LinearController without its noise, or none; by default the policy's
-        own model, False for none. Sampled, it does so where every row is at a sample.
+        Model that predicts the motion; by default the policy's own, False for none.
     target : LinearModel or array_like (nx,), optional
-        State, or model whose point it is, that errors are counted from; by default the point of
-        the policy's own model, or along a trajectory the state that it has at each time, and none
-        under a policy without one.
-    frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
-    reference : pin.SE3, optional
-        Chart of x and axes of u; the policy's by default, else hybrid, in orbit lvlh, and the
-        identity.
+        Where errors count from; by default the point or trajectory of the policy.
+    frame, reference : {"hybrid", "local", "world", "lvlh", "hill"}, pin.SE3, optional
+        Chart of x and axes of u; by default the policy's, else hybrid (lvlh in orbit)
+        and the identity.
     every : int, optional
-        Steps from one recorded row to the next; by default 1, or where that would be more than
-        100,000 rows, as many as leave 10,000, which the motion's `notes` say.
+        Steps from one recorded row to the next; by default 1, or as many as leave
+        10,000 of more than 100,000 rows.
     progress : bool, optional
-        Whether a bar is shown on stderr; by default on a terminal, for runs that take long.
+        Show a bar on stderr; by default on a terminal, for runs that take long.
     engine : {"python", "compiled"}, optional
-        What runs the loop; by default the compiled one where it can and is the quicker. It needs
-        numba, no orbit, and no policy, event, callback or disturbance in Python. Both give the
-        same to rounding.
+        By default the faster one that can run the loop. Compiled needs numba, no orbit,
+        and no policy, event, callback or disturbance in Python.
 
     Returns
     -------
     Motion
-        Ended early, ``stopped`` says why: an event, an interrupt (Ctrl-C), or a loop that left
-        the chart or diverged, and in steps of which size.
+        If it ended early, ``stopped`` states why.
 
     Raises
     ------
     InputError
-        If an argument has a wrong size or value, a policy or disturbance returns what is no
-        input or force, or dt is too large for the loop.
+        If an argument, or what a policy or disturbance returns, has a wrong size or
+        value, or dt is too large for the loop.
     UnknownNameError
-        If there is no such method or input.
+        If a method or input does not exist.
 
     Warns
     -----
     FflinWarning
-        If the loop's fastest pole, which is named, asks for more than 50,000 steps, or springs
-        and gravity at the target for more than the limits.
+        If the loop's fastest pole needs more than 50,000 steps, or springs and gravity at
+        the target need more than the limits.
 
     References
     ----------
-    E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
+    E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems
+    19(3), 2003.
 
     Examples
     --------
