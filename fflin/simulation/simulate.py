@@ -65,8 +65,8 @@ def simulate(
     Steps of fixed size on the manifold keep the momentum and the centre of mass: after
     each step the base is shifted, and its velocity set to
     :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`, where H is the integral of the
-    wrench from outside. Thrusters never pull: a negative thrust is cut to zero. In orbit
-    q and v are relative to the orbit's frame, and momentum is not conserved.
+    wrench from outside. Thrusters never pull: a negative thrust is cut to zero. In
+    orbit q and v are relative to the orbit's frame, and momentum is not conserved.
 
     Parameters
     ----------
@@ -136,8 +136,8 @@ def simulate(
     Warns
     -----
     FflinWarning
-        If the loop's fastest pole needs more than 50,000 steps, or springs and gravity at
-        the target need more than the limits.
+        If the loop's fastest pole needs more than 50,000 steps, or springs and gravity
+        at the target need more than the limits.
 
     References
     ----------
