@@ -53,5 +53,5 @@ def _init(arguments: argparse.Namespace) -> int:
         robot = load(arguments.robot)
     write_whole({target: draft(robot, urdf).encode()})
     load(target)  # warns of what the file leaves open
-    print(f"wrote {target}; try: fflin simulate {target}")
+    print(f"init: wrote {target}; try: fflin simulate {target}")
     return DONE
