@@ -24,6 +24,7 @@ extensions = [
     "sphinx_copybutton",
     "executed",
     "from_code",
+    "index_terms",
 ]
 exclude_patterns = ["_*"]
 templates_path = ["_templates"]

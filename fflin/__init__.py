@@ -30,9 +30,21 @@ def __getattr__(name: str) -> Any:
     if name not in _modules:
         raise AttributeError(f"module 'fflin' has no attribute '{name}'")
     value = getattr(import_module(_modules[name]), name)
+    if type(value) is type(__getattr__):
+        _untyped(value)
     globals()[name] = value
     return value
 
 
+def _untyped(function: Any) -> None:
+    """Let help show a signature without types, which its docstring gives in words and shapes."""
+    from inspect import Parameter, signature
+
+    shown = signature(function)
+    plain = [each.replace(annotation=Parameter.empty) for each in shown.parameters.values()]
+    function.__signature__ = shown.replace(parameters=plain, return_annotation=Parameter.empty)
+
+
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_modules})
+    own = (name for name in globals() if name.startswith("__") and name.endswith("__"))
+    return sorted({*own, *_modules})

@@ -70,3 +70,19 @@ def test_help_begins_with_the_public_names_each_under_one_title():
         assert listed.count(name) == 1, name
     titles = [line.strip() for line in fflin.__doc__.splitlines()[1:] if line[:1].strip()]
     assert titles[0] == "Robots" and {"Control", "Figures", "Errors"} <= set(titles)
+
+
+def test_completion_offers_public_names_alone():
+    offered = {name for name in dir(fflin) if not (name.startswith("__") and name.endswith("__"))}
+    assert offered == set(fflin.__all__)
+
+
+@pytest.mark.parametrize(
+    ("name", "lines"), [("linearize", 50), ("load", 50), ("lqr", 65), ("simulate", 95)]
+)
+def test_help_of_what_is_used_most_is_short(name, lines):
+    said = pydoc.plain(pydoc.render_doc(getattr(fflin, name))).splitlines()[2:]
+    assert len(said) <= lines
+    # The signature of `simulate` is wider than a screen: it has 20 arguments.
+    assert max(map(len, said[name == "simulate" :])) <= 88
+    assert ":" not in said[0] and "->" not in said[0]  # the types stand below

@@ -1,9 +1,12 @@
 """The site of the documents is whole and needs no network."""
 
 import contextlib
+import http.server
 import os
 import re
 import sys
+import threading
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -13,8 +16,6 @@ import pytest
 import fflin
 from tests.support.browser import Watched
 from tests.support.patience import finished
-
-pytestmark = pytest.mark.docs
 
 pytestmark = pytest.mark.docs
 
@@ -125,3 +126,58 @@ def test_formulas_search_and_pages_that_play_work_from_disk(site, browser):
         element.scroll_into_view_if_needed()
         watched.wait("window.fflin && fflin.ready", element.content_frame())
     assert all(url.startswith(("file:", "data:", "blob:", "about:")) for url in asked), asked
+
+
+# Words that people type, and pages of which one must be among the first three hits.
+SOUGHT = {
+    "spring": {"guide/equilibria_modes", "guide/robot_files"},
+    "thruster": {"guide/inputs"},
+    "MATLAB": {"guide/files"},
+    "quaternion": {"conventions"},
+    "gain margin": {"guide/lqr_kalman"},
+    "thrust allocation": {"guide/inputs"},
+    "noise": {"guide/lqr_kalman"},
+    "orbit": {"guide/orbits"},
+    "docking": {"guide/capture"},
+}
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def do_GET(self):
+        if self.path == "/favicon.ico":  # which browsers ask for on their own
+            self.send_response(204)
+            self.end_headers()
+        else:
+            super().do_GET()
+
+    def log_message(self, *given):
+        pass
+
+
+@pytest.fixture(scope="module")
+def served(site):
+    """The address of the site on a server of this machine: excerpts need one."""
+    handler = partial(_Quiet, directory=site)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.browser
+def test_the_search_finds_the_page_of_a_task_first_and_shows_an_excerpt(served, browser):
+    missed = {}
+    with Watched(browser, f"{served}/search.html", ready="typeof Search === 'object'") as watched:
+        for word, pages in SOUGHT.items():
+            watched.page.fill("input[name=q]", word)
+            with watched.page.expect_navigation():
+                watched.page.press("input[name=q]", "Enter")
+            watched.page.wait_for_selector("p.search-summary:has-text('finished')")
+            watched.page.wait_for_selector("ul.search p.context")
+            hits = watched.page.query_selector_all("ul.search li")[:3]
+            found = [hit.query_selector("a").get_attribute("href") for hit in hits]
+            if not pages & {address.partition(".html")[0] for address in found}:
+                missed[word] = found
+    assert not missed

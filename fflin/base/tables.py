@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
 import textwrap
@@ -11,6 +12,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
+
+MOST_ROWS, _SPARE = 20, 2  # rows of a table that is read at a glance; a few more are not cut
 
 _GAP = "  "
 _EPS = sys.float_info.epsilon
@@ -25,6 +28,20 @@ def folded(lines: Iterable[str]) -> str:
     """Fold each line to the width, not at a no-break space; the rest goes below, indented."""
     wrap = textwrap.TextWrapper(width(), subsequent_indent="  ", break_on_hyphens=False)
     return "\n".join(map(wrap.fill, lines)).replace("\u00a0", " ")
+
+
+def headed(command: str, report: str) -> str:
+    """Put the name of a command before its report, and fold the first line again."""
+    first, *rest = re.split(r"\n(?!  \S)", report, maxsplit=1)
+    return "\n".join([folded([f"{command}: {' '.join(first.split())}"]), *rest])
+
+
+def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[str]]:
+    """Return the head and the first rows of a long table; `rest` says where the others are."""
+    left = len(rows) - 1 - MOST_ROWS
+    if left <= _SPARE:
+        return list(rows)
+    return [*rows[: 1 + MOST_ROWS], [f"... and {left} more, {rest}", *[""] * (len(rows[0]) - 1)]]
 
 
 def dim(text: str) -> str:
@@ -75,7 +92,7 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
     for fold in folds:
         shown = [i for i in range(len(rows)) if values[i, fold].any()]
         body = [[rows[i], *(text[i][j] for j in fold)] for i in shown]
-        blocks.append(grid([["", *(columns[j] for j in fold)], *body]))
+        blocks.append(grid(cut([["", *(columns[j] for j in fold)], *body])))
     return "\n\n".join(blocks)
 
 

@@ -23,11 +23,12 @@ def campaign_report(campaign: Any) -> str:
         figures.append(quantile(f"worst {name}", 0.95).value)
         when = _when(quantile(f"settle {name}", 0.95).value)
         rows.append([name, unit, *(f"{x:.3g}" for x in figures), when])
-    told = [goal_met(campaign, goal) for goal in campaign.goals]
+    told = []
     for name, found in whence(campaign).items():
         first = ", ".join(f"{key}\u00a0{value:+.2f}" for key, value in list(found.items())[:4])
         told.append(f"rank correlations with {name}: {first or 'none significant'}")
-    head = folded([f"{title}, seed {campaign.seed}{by}", ended_of(campaign)])
+    goals = [goal_met(campaign, goal) for goal in campaign.goals]
+    head = folded([*goals, ended_of(campaign), f"{title}, seed {campaign.seed}{by}"])
     return "\n".join([head, "", grid(rows, "ll"), "", folded(told)])
 
 

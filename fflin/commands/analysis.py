@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import InputError
+from fflin.base.tables import counted, headed
 from fflin.commands import DONE
 from fflin.commands.arguments import (
     Commands,
@@ -117,13 +118,21 @@ def _analyze(arguments: argparse.Namespace) -> int:
     check_figure(arguments.plot)
     _, lin = linear_model(arguments)
     found = modes(lin)
+    moved, shown = controllability(lin), observability(lin)
     parts = {
-        "inputs": str(controllability(lin)),
+        "inputs": str(moved),
         "momentum": _momentum(lin),
         "modes": str(found),
-        "outputs": str(observability(lin)),
+        "outputs": str(shown),
     }
-    print("\n\n".join(f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items()))
+    nx = len(lin.A)
+    head = [
+        "controllable" if moved.dimension == nx else f"not controllable ({moved.dimension}/{nx})",
+        "observable" if shown.dimension == nx else f"not observable ({shown.dimension}/{nx})",
+        counted(len(found.unstable), "unstable pole"),
+    ]
+    sections = (f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items())
+    print("\n\n".join([headed("analyze", ", ".join(head)), *sections]))
     draw(arguments.plot, "plot_modes", found)
     return DONE
 
@@ -139,7 +148,7 @@ def _modes(arguments: argparse.Namespace) -> int:
         check_place(arguments.html, (".html",))
     robot, lin = linear_model(arguments)
     found = modes(lin)
-    print(found)
+    print(headed("modes", str(found)))
     if any(robot.stiffness.values()):
         print(f"\n{effective_masses(lin)}")
     if robot.orbit and not found.equilibrium:
@@ -209,7 +218,7 @@ def _validity(arguments: argparse.Namespace) -> int:
             )
     finally:
         bar.close()
-    print(found)
+    print(headed("validity", str(found)))
     if cut or any(name in lin.limits for name in lin.input_names):
         print("inputs were " + ("cut to the limits of the robot" if cut else _FREE))
     draw(arguments.plot, "plot_validity", found)
@@ -221,7 +230,7 @@ def _sensitivity(arguments: argparse.Namespace) -> int:
 
     _, lin = linear_model(arguments)
     found = sensitivity(lin if arguments.dt is None else lin.discretize(arguments.dt))
-    say(found, arguments, found.table(arguments.top, arguments.only))
+    say("sensitivity", found, arguments, found.table(arguments.top, arguments.only))
     return DONE
 
 
@@ -229,5 +238,6 @@ def _uncertain(arguments: argparse.Namespace) -> int:
     from fflin.uncertainty.uncertain import uncertain
 
     robot, ranges = load_robot(arguments), once("--vary", arguments.vary)
-    say(uncertain(robot, ranges).lft(placed(robot, "--joint", arguments.joint)), arguments)
+    lft = uncertain(robot, ranges).lft(placed(robot, "--joint", arguments.joint))
+    say("uncertain", lft, arguments)
     return DONE

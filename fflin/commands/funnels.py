@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from fflin.base.errors import InputError
+from fflin.base.tables import headed
 from fflin.commands import DONE
 from fflin.commands import arguments as of
 from fflin.commands.loops import along
@@ -76,7 +77,7 @@ def _funnel(arguments: argparse.Namespace) -> int:
         found = funnel(robot, policy, goal, progress=bar.update, **kept)
     finally:
         bar.close()
-    print(found)
+    print(headed("funnel", str(found)))
     draw(arguments.plot, "plot_funnel", found)
     if arguments.output_file:
         found.save(arguments.output_file)

@@ -56,5 +56,5 @@ def _init(arguments: argparse.Namespace) -> int:
         robot = load(arguments.robot)
     write_whole({target: draft(robot, urdf).encode()})
     load(target)  # warns of settings that the file leaves open
-    print(f"wrote {target}; try: fflin simulate {target}")
+    print(f"init: wrote {target}; try: fflin simulate {target}")
     return DONE

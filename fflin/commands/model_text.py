@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from fflin.base.names import runs
-from fflin.base.tables import grid, matrix, signals, width
+from fflin.base.tables import cut, grid, matrix, signals, width
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
@@ -79,7 +79,7 @@ def inputs_report(robot: Robot) -> str:
     for name, unit in zip(acting.names, acting.units, strict=True):
         ends = limits.get(name, (-math.inf, math.inf))
         rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
-    return grid(rows, "ll")
+    return grid(cut(rows, "see linearize -o"), "ll")
 
 
 def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:

@@ -8,6 +8,7 @@ import warnings
 from typing import TYPE_CHECKING
 
 from fflin.base.errors import FflinError, FflinWarning, InputError
+from fflin.base.tables import headed
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
@@ -85,7 +86,7 @@ def _robots(_: argparse.Namespace) -> int:
             found = find_robot(name)
             reason = str(error).replace(f"{found.path.parent}{os.sep}", "")
             entries.append((name, reason, found.origin))
-    print(robot_list(entries))
+    print(headed("robots", robot_list(entries)))
     return DONE
 
 
@@ -95,7 +96,7 @@ def _info(arguments: argparse.Namespace) -> int:
     from fflin.robot.summary import robot_info
 
     robot = load_robot(arguments)
-    print(robot_info(robot))
+    print(headed("info", robot_info(robot)))
     default = replace(robot, inputs=()).inputs
     if arguments.inputs is not None or robot.limits or robot.inputs != default:
         from fflin.commands.model_text import inputs_report
@@ -124,11 +125,11 @@ def _linearize(arguments: argparse.Namespace) -> int:
         model = lin.to(arguments.tool) if arguments.tool else lin
         model.save(arguments.output_file)
         nx, nu = model.B.shape
-        print(f"wrote {arguments.output_file}: {nx} states, {nu} inputs")
+        print(f"linearize: wrote {arguments.output_file}: {nx} states, {nu} inputs")
     else:
         from fflin.commands.model_text import model_report
 
-        print(model_report(lin))
+        print(headed("linearize", model_report(lin)))
     draw(arguments.plot, "plot_matrices", lin)
     return DONE
 
@@ -141,6 +142,6 @@ def _check(arguments: argparse.Namespace) -> int:
     check_figure(arguments.plot)
     robot, lin = linear_model(arguments)
     found = check(robot, lin, tolerance=arguments.tolerance)
-    print(found)
+    print(headed("check", str(found)))
     draw(arguments.plot, "plot_check", found)
     return DONE if found.ok else FELL_SHORT

@@ -6,6 +6,7 @@ import argparse
 import json
 from typing import Any
 
+from fflin.base.tables import headed
 from fflin.commands import DONE
 from fflin.commands.arguments import Commands, add_options, add_output_file, command, input_file
 from fflin.commands.loops import add_loop, loop_of
@@ -100,5 +101,13 @@ def _montecarlo(arguments: argparse.Namespace) -> int:
         if arguments.json:
             print(json.dumps(campaign_record(campaign, arguments.worst), indent=2))
         else:
-            print("\n".join([str(campaign), *worst_runs(campaign, arguments.worst), *lines]))
+            print(
+                "\n".join(
+                    [
+                        headed("montecarlo", str(campaign)),
+                        *worst_runs(campaign, arguments.worst),
+                        *lines,
+                    ]
+                )
+            )
     return DONE

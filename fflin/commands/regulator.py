@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityError
+from fflin.base.tables import headed
 from fflin.commands import DONE
 from fflin.commands.arguments import (
     Commands,
@@ -115,7 +116,7 @@ def _lqr(arguments: argparse.Namespace) -> int:
         warnings.warn(pulling, FflinWarning, stacklevel=2)
     if arguments.output_file:
         gain.save(arguments.output_file)
-    print(gain)
+    print(headed("lqr", str(gain)))
     if arguments.output_file:
         print(f"\nwrote {arguments.output_file}")
     draw(arguments.plot, "plot_loops", gain)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import chosen, input_keys
+from fflin.base.tables import headed
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import Commands, add_options, add_output_file, command
 from fflin.commands.loops import add_loop, loop_of
@@ -67,7 +68,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     left = _leave_earlier(arguments) if interrupted else []
 
     # Printed after the files are written, so that a closed pipe does not prevent them.
-    lines = [motion_report(motion)]
+    lines = [headed("simulate", motion_report(motion))]
     try:
         if arguments.output_file:
             motion.save(arguments.output_file)

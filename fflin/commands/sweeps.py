@@ -147,7 +147,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
             work = {"executor": executor, "workers": arguments.workers, "progress": progress}
             batch = sweep(robot, q, v, u, **options, **work, out=path)
     states, inputs = len(batch.state_names), len(batch.input_names)
-    print(f"wrote {path}: {len(batch):,} points, {states} states, {inputs} inputs")
+    print(f"sweep: wrote {path}: {len(batch):,} points, {states} states, {inputs} inputs")
     return DONE
 
 

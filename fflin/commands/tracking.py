@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import InputError
+from fflin.base.tables import headed
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
@@ -83,7 +84,7 @@ def linearize_along(arguments: argparse.Namespace) -> int:
     along = models_along(arguments)
     if getattr(arguments, "dt", None) is not None:
         along = along.discretize(arguments.dt)
-    say(along, arguments)
+    say("linearize", along, arguments)
     return DONE
 
 
@@ -93,7 +94,7 @@ def check_along(arguments: argparse.Namespace) -> int:
 
     along = models_along(arguments)
     found = held_to(arguments.tolerance, along.check())
-    print(f"{along}\n\n{found}")
+    print(f"{headed('check', str(found))}\n\n{along}")
     return DONE if found.ok else FELL_SHORT
 
 
@@ -104,7 +105,8 @@ def _tvlqr(arguments: argparse.Namespace) -> int:
             "exists; leave it out"
         )
     along = models_along(arguments)
-    say(schedule_of(along, arguments, once("--qf", arguments.qf) or "steady"), arguments)
+    schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
+    say("tvlqr", schedule, arguments)
     return DONE
 
 
@@ -124,10 +126,10 @@ def schedule_of(
     return tvlqr(along, Qf=Qf, **options)
 
 
-def say(made: Any, arguments: argparse.Namespace, text: str = "") -> None:
+def say(command: str, made: Any, arguments: argparse.Namespace, text: str = "") -> None:
     """Save a result if -o is given, and print it."""
     if arguments.output_file:
         made.save(arguments.output_file)
-    print(text or made)
+    print(headed(command, text or str(made)))
     if arguments.output_file:
         print(f"wrote {arguments.output_file}")

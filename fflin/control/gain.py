@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -13,7 +14,7 @@ from fflin.analysis.wheels import picked
 from fflin.base.errors import listed
 from fflin.base.names import group_of, input_keys
 from fflin.base.record import NOT_VERIFIED, Design
-from fflin.base.tables import grid, matrix, width
+from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array
 from fflin.control.margins import Margins, input_margins
 from fflin.control.riccati import rates_of
@@ -119,7 +120,7 @@ class Gain(Design):
             "warning": "; ".join(filter(None, (fragility(self), one_sided(self)))),
         }
         parts = [
-            fold(f"{head}, frame {self.frame}, {time}"),
+            f"{_result(self)}\n{fold(f'{head}, frame {self.frame}, {time}')}",
             f"K ({nu} x {nx}){shown}",
             _poles(self),
             fold(_figures(self)),
@@ -272,28 +273,35 @@ def _poles(gain: Gain) -> str:
     else:
         order, heads = np.argsort(-poles.real), ["pole [1/s]", "frequency [rad/s]", "damping"]
         columns = [np.abs(poles), -poles.real / np.abs(poles)]
-    body = [
-        [_pole(poles[i]), *(f"{column[i]:.4g}" for column in columns)]
-        for i in (order if len(order) <= 24 else [*order[:12], *order[-4:]])
-    ]
-    if len(order) > 24:
-        body.insert(12, [f"... {len(order) - 16} more", "", ""])
+    every = [(_pole(poles[i]), *(f"{column[i]:.4g}" for column in columns)) for i in order]
+    times = Counter(every)
+    body = [[*row, f"{times[row]}"] for row in dict.fromkeys(every)]
+    if max(times.values()) > 1:
+        heads.append("times")
+    else:
+        body = [row[:-1] for row in body]
     title = "poles of A - B K, slowest first"
-    return f"{title}\n\n{grid([heads, *body], 'l')}"
+    return f"{title}\n\n{grid(cut([heads, *body]), 'l')}"
 
 
 def _pole(pole: complex) -> str:
     return f"{pole.real:.5g}" + (f" +- {pole.imag:.5g}i" if pole.imag else "")
 
 
-def _figures(gain: Gain) -> str:
-    margins = gain.margins
-    slowest = "1 - largest modulus" if gain.dt else "slowest decay [1/s]"
-    low, high = margins.gain
+def _result(gain: Gain) -> str:
     rates = rates_of(gain.poles, gain.dt)
     damping = float((-rates.real / np.abs(rates)).min())
     return (
-        f"Riccati residual {gain.residual:.1e} ({gain.method}); {slowest} {gain.margin:.5g}, least "
-        f"damping ratio {damping:.2g}; margins for simultaneous changes of all inputs: gain "
-        f"{low:.3g} to {high:.3g}, phase {margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
+        f"{len(gain.poles)} poles, slowest decay {-rates.real.max():.3g} 1/s, "
+        f"smallest damping ratio {damping:.2g}"
+    )
+
+
+def _figures(gain: Gain) -> str:
+    margins = gain.margins
+    low, high = margins.gain
+    return (
+        f"Riccati residual {gain.residual:.1e} ({gain.method}); margins for simultaneous changes "
+        f"of all inputs: gain {low:.3g} to {high:.3g}, phase {margins.phase:.3g} deg (disk margin "
+        f"{margins.disk:.3g})"
     )

@@ -1,9 +1,8 @@
 """Report of a check, as tables."""
 
-import textwrap
 from typing import NamedTuple
 
-from fflin.base.tables import grid, width
+from fflin.base.tables import folded, grid, width
 
 
 class Row(NamedTuple):
@@ -21,44 +20,78 @@ class Row(NamedTuple):
 
 
 def check_report(every: tuple[Row, ...], title: str) -> str:
-    """Return the report of a check: a table for each computation, single errors, the verdict."""
+    """Show the verdict of a check, a table of blocks, and the single figures."""
     states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
     blocks = [row.block for row in every]
     inputs = dict.fromkeys(b[:-1].split(", ")[1] for b in blocks if b.startswith("B["))
-    parts = [f"check of {title}\na dot means an error of exactly zero"]
-    for test in ("ABA derivatives", "differences"):
-        rows = {row.block: row for row in every if row.test == test}
-        tolerance = next(iter(rows.values())).tolerance
-        title = f"A and B against {test}: "
-        if not any(row.error for row in rows.values()):
-            parts.append(f"{title}all {len(rows)} blocks are equal")
-            continue
-        body = [
-            [
-                state,
-                *(_error(rows[f"A[{state}, {column}]"]) for column in states),
-                *(_error(rows[f"B[{state}, {column}]"]) for column in inputs),
-            ]
-            for state in states
-        ]
-        parts.append(f"{title}relative error of each block, at most {tolerance:.1e}")
-        parts.append(grid([["", *states, *inputs], *body]))
-    single = [r for r in every if r.test not in ("ABA derivatives", "differences")]
-    rest = [[f"{r.test}: {r.block}", _error(r), f"at most {r.tolerance:.1e}"] for r in single]
-    parts.append(grid(rest, "lrl"))
+    parts = [_verdict(every), folded([f"{title}, {len(every)} figures"])]
+    columns = {f"A[{{}}, {each}]": each for each in states}
+    columns |= {f"B[{{}}, {each}]": each for each in inputs}
+    found: dict[str, dict[str, Row]] = {
+        route: {row.block: row for row in every if row.test == test}
+        for test, route in _ROUTES.items()
+    }
+    allowed = [
+        f"{route}: {test} (allowed {_allowed(found[route])})" for test, route in _ROUTES.items()
+    ]
+    body = [
+        [route, state, *(_error(rows[key.format(state)]) for key in columns)]
+        for route, rows in found.items()
+        for state in states
+        if any(rows[key.format(state)].error for key in columns)
+    ]
+    if not body:
+        parts.append(f"A and B have no error in any of {2 * len(states) * len(columns)} blocks")
+    else:
+        heads = [["", "", *columns.values()], *body]
+        said = f"relative errors of the blocks of A and B compared with {', '.join(allowed)}"
+        parts.append(f"{folded([said])}\n\n{_fitted(heads, 2 + len(states))}")
+    single = [row for row in every if row.test not in _ROUTES]
+    rest = [["figure", "error", "allowed"]]
+    rest += [[f"{r.test}: {r.block}", _error(r), f"{r.tolerance:.1e}"] for r in single if r.error]
+    if rest[1:]:
+        parts.append(grid(rest, "l"))
+    exact: dict[str, list[str]] = {}
+    for row in single:
+        if not row.error:
+            exact.setdefault(row.test, []).append(row.block)
+    if exact:
+        said = "; ".join(f"{test} {', '.join(each)}" for test, each in exact.items())
+        parts.append(folded([f"without any error: {said}"]))
+    return "\n\n".join(parts)
+
+
+# The independent computations that A and B are compared with, and the rows of each.
+_ROUTES = {"ABA derivatives": "ABA", "differences": "diff"}
+
+
+def _verdict(every: tuple[Row, ...]) -> str:
     failures = [row for row in every if not row.ok]
     if not failures:
-        largest = max(row.error for row in every)
-        verdict = f"OK: all {len(every)} errors are within tolerance; the largest is {largest:.1e}"
-    else:
-        names = [f"{row.block} ({row.test})" for row in failures[:6]]
-        names += ["..."] * (len(failures) > 6)
-        verdict = (
-            f"FAILED: {len(failures)} of {len(every)} errors exceed their tolerance: "
-            f"{', '.join(names)}"
-        )
-    parts.append(textwrap.fill(verdict, width()))
-    return "\n\n".join(parts)
+        largest = max(every, key=lambda row: row.error)
+        said = f"largest error {largest.error:.1e} (allowed {largest.tolerance:.1e})"
+        return folded([f"A and B hold: {said}"])
+    names = [f"{row.block} ({row.test})" for row in failures[:6]]
+    names += ["..."] * (len(failures) > 6)
+    said = f"{len(failures)} of {len(every)} figures FAILED"
+    return folded([f"A and B do not hold: {said}: {', '.join(names)}"])
+
+
+def _allowed(rows: dict[str, Row]) -> str:
+    return f"{next(iter(rows.values())).tolerance:.1e}"
+
+
+def _fitted(rows: list[list[str]], split: int) -> str:
+    """Show a table, or its columns from `split` on below where it is too wide."""
+    table = grid(rows, "ll")
+    if max(map(len, table.splitlines())) <= width():
+        return table
+    halves = [row[:split] for row in rows], [[*row[:2], *row[split:]] for row in rows]
+    return "\n\n".join(grid([each[0], *filter(_told, each[1:])], "ll") for each in halves)
+
+
+def _told(row: list[str]) -> bool:
+    return any(cell != "." for cell in row[2:])
 
 
 def _error(row: Row) -> str:

@@ -274,37 +274,33 @@ def linearize(
     q : array_like (nq,), optional
         Configuration in Pinocchio's order, see `configuration`; neutral by default.
     v : array_like (nv,), optional
-        Velocity in Pinocchio's order; at rest by default.
+        Velocity in Pinocchio's order, see `velocity`; zero by default.
     u : array_like (nu,), optional
-        Inputs of the robot, zero by default. Inputs on the base are in the axes of `frame`.
+        Inputs of the robot, see `effort`; zero by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
-        Axes of the base velocities and wrenches, see `StateMap`. The default is "hybrid", for a
-        robot in orbit "lvlh".
+        Axes of the base's velocities and wrenches, see `StateMap`; by default
+        "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
-        Placement that attitude and position are relative to. The default is the base's own
-        placement, in orbit the orbit's frame.
+        Pose that attitude and position are relative to; by default the base pose,
+        or the orbit's frame if the robot is in orbit.
     moving : bool
-        Whether to return the error dynamics about a reference that moves through the point, see
-        `Linearizer`.
+        Return the error dynamics about a reference that moves through the point.
 
     Returns
     -------
     LinearModel
+        The equations stand in `Linearizer`, which prepares this for many points.
 
     Raises
     ------
     InputError
         If an argument has a wrong size or value.
     ChartError
-        If the base is rotated by pi from the reference.
+        If the base is rotated by 180 deg from the reference.
     SingularInertiaError
         If a joint moves no mass.
     ModelError
         If the robot is too large.
-
-    See Also
-    --------
-    Linearizer : prepares a robot once for many points; its documentation has the equations.
 
     Examples
     --------

@@ -56,7 +56,7 @@ def load(
     Raises
     ------
     UnknownNameError
-        If there is no such robot, joint, frame or field.
+        If a robot, joint, frame or field does not exist.
     InputError
         If a field has a wrong value.
     FileError, UrdfError

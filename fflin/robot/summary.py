@@ -22,7 +22,8 @@ def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
         else:
             rows.append([name, str(robot.n), f"{robot.mass:.6g}", origin])
     notes = [textwrap.fill(line, width(), subsequent_indent="  ") for line in refused]
-    return "\n\n".join((grid(rows, "lrrl"), *notes))
+    head = f"{len(rows) - 1} robots load by name, {len(refused)} cannot be loaded"
+    return "\n\n".join((head, grid(rows, "lrrl"), *notes))
 
 
 def robot_info(robot: Robot) -> str:

@@ -22,13 +22,10 @@ THERE, _NOTHING = 1e-9, 1e-14
 # Share of the rows for which it must have stayed so by the end.
 DWELL = 0.05
 
-# Share of the run with an input at its limit from which on it is there all along.
-_ALL_ALONG = 0.9
-
 # Beyond its limit is what is so by more than this share of it: less is the integration's.
 _SHARE = 1e-3
 
-_MOST = 8  # lines of a report
+_MOST, _NAMED = 8, 4  # lines of a report, and names of what is saturated in its first line
 
 # What has limits: its name, history (N,), unit, and least and largest value (2,).
 Limited: TypeAlias = "tuple[str, Array, str, Array]"
@@ -265,7 +262,7 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
         said = f"not settled: {_and(failed)} at the end"
     elif moved:
         when = motion.t[max(kind.settled for kind in moved)]
-        said = f"settled: {_and([kind.last for kind in moved])} after {when:.3g}\u00a0s"
+        said = f"settled after {when:.3g}\u00a0s to within {100.0 * SETTLED:g}\u00a0%"
     else:
         said = "settled: at the target throughout the run"
     aside = {k.title: k.last for k in places if k.late and not k.steered}
@@ -274,12 +271,17 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
         said += f"; not controlled: {_and([*aside.values()])}"
     if loose:
         said += "; position is not controlled"
+    return f"{said}; saturated inputs: {_full(motion)}"
+
+
+def _full(motion: Any) -> str:
+    """Name the inputs and wheels that were at a limit, with their fraction of the run."""
     shares: dict[str, float] = {}  # at either limit
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share
-    if full := [name for name, share in shares.items() if share > _ALL_ALONG]:
-        said += f"; at the limit throughout: {', '.join(full)}"
-    return said
+    said = [f"{name}\u00a0({100.0 * share:.2g}\u00a0%)" for name, share in shares.items()]
+    more = [f"{len(said) - _NAMED} more"] if len(said) > _NAMED else []
+    return ", ".join(said[:_NAMED] + more) or "none"
 
 
 def _and(words: list[str]) -> str:

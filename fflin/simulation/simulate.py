@@ -168,7 +168,8 @@ def simulate(
 
     References
     ----------
-    E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
+    E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems
+    19(3), 2003.
 
     Examples
     --------

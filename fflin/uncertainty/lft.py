@@ -15,7 +15,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.names import matching
 from fflin.base.record import Design
-from fflin.base.tables import grid
+from fflin.base.tables import counted, cut, folded, grid
 from fflin.base.validation import Array, as_double, numbers
 from fflin.linear.model import state_space
 
@@ -86,14 +86,15 @@ class LFT(Design):
         return f"LFT('{self.robot}', nx={len(self.A)}, {len(self.repeats)} parameters, nw={total})"
 
     def __str__(self) -> str:
-        rows = [("parameter", "least", "largest", "", "repeated")]
+        rows = [("parameter", "unit", "least", "largest", "repeated")]
         for name, unit, middle, half, repeats in zip(
             *(self.parameters, self.units, self.middle, self.half, self.repeats), strict=True
         ):
             ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
-            rows.append((name, *ends, "" if unit == "1" else unit, f"{repeats:g}"))
-        rows.append(("total", "", "", "", f"{self.repeats.sum():g}"))
-        return f"{self!r}\n{grid(rows, 'lrrlr')}"
+            rows.append((name, "." if unit == "1" else unit, *ends, f"{repeats:g}"))
+        many, count = counted(len(self.repeats), "parameter"), f"{self.repeats.sum():g}"
+        said = f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count} in all"
+        return f"{folded([said])}\n\n{grid(cut(rows), 'll')}"
 
     @property
     def dt(self) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.frozen import FrozenArrays
 from fflin.base.record import write_record
-from fflin.base.tables import grid
+from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, as_double, numbers, whole
 from fflin.base.writing import as_path
 from fflin.linear.files import record_of
@@ -235,15 +235,20 @@ class Sensitivity:
             step = 0.01 if small else 0.1 * (abs(one.value) or float(one.part[:9] == "direction"))
             effect = [step * np.abs(d).max() / of for d, of in zip((dA, dB), sizes, strict=True)]
             if one.name in shown and max(effect) > 0.0:
-                change = f"{step:.3g} {one.unit}".removesuffix(" 1")
-                shares = (f"{100.0 * x:.2g} %" for x in effect)
-                rows.append((max(effect), one.name, f"{one.value:.5g}", change, *shares))
+                unit = "." if one.unit == "1" else one.unit
+                shares = (f"{100.0 * x:.2g}" for x in effect)
+                rows.append(
+                    (max(effect), one.name, unit, f"{one.value:.5g}", f"{step:.3g}", *shares)
+                )
         rows.sort(key=lambda row: -row[0])
         most = [row[1:] for row in rows[: whole("top", top, 1)]]
-        title = f"{lin.robot}: first-order change of A and B, relative to their largest entries"
-        most = most or [("no effect on A or B", *"    ")]
-        heads = ("parameter", "value", "changed by", "A", "B")
-        return f"{title}\n" + grid([heads, *most], "lrrrr")
+        if not most:
+            return f"{lin.robot}: none of these parameters changes A or B"
+        largest = f"{most[0][0]} changes A and B most, by {100.0 * rows[0][0]:.2g} %"
+        title = folded([f"{lin.robot}: {largest} of their largest entry, to first order"])
+        heads = ("parameter", "unit", "value", "change", "A [%]", "B [%]")
+        more = f"... and {len(rows) - top} more, see --top"
+        return "\n".join([title, grid([heads, *most], "ll"), *[more] * (len(rows) > top)])
 
     def save(self, path: str | Path) -> None:
         """Write the derivatives to a .npz, .mat or .json file, atomically.

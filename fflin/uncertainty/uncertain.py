@@ -59,14 +59,14 @@ class Uncertain:
         return f"Uncertain('{self.robot.name}', {len(self.ranges)} parameters)"
 
     def __str__(self) -> str:
-        rows: list[tuple[str, ...]] = [("parameter", "nominal", "least", "largest", "")]
+        rows: list[tuple[str, ...]] = [("parameter", "unit", "value", "least", "largest", "")]
         for name, unit, middle, half, ranges in self.blocks:
             tied = len(ranges) > 1
             now = "" if tied else f"{ranges[0].parameter.value:.6g}"
             ends = (f"{x:.6g}" for x in (middle - half, middle + half))
-            more = ["" if unit == "1" else unit, f"{len(ranges)} tied" * tied]
-            rows.append((name, now, *ends, ", ".join(filter(None, more))))
-        return f"{self!r}\n{grid(rows, 'lrrrl')}"
+            more = f"{len(ranges)} tied" if tied else ""
+            rows.append((name, "." if unit == "1" else unit, now, *ends, more))
+        return f"{self!r}\n\n{grid(rows, 'llrrrl')}"
 
     @property
     def ranges(self) -> tuple[Range, ...]:

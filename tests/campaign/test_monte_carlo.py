@@ -696,7 +696,7 @@ def test_what_no_input_pushes_is_judged_in_no_campaign_either():
     runs = fflin.monte_carlo(robot, law, {"q_b": 0.05, "v_b": 0.01}, **options)
     assert runs.judged == ("attitude",) and np.isfinite(runs.values("settle")).all()
     motion = runs.replay(0)
-    assert str(motion).startswith("settled: attitude ")
+    assert str(motion).startswith("settled after ")
     # What has not settled is told as it is of a motion.
     assert np.isinf(runs.values("settle position")).all()
     row = next(line for line in str(runs).splitlines() if line.startswith("position "))

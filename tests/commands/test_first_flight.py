@@ -15,7 +15,7 @@ TOML = Path(__file__).parents[2] / "robots" / "inspector.toml"
 def test_the_inspector_flies_within_its_limits_at_the_first_try(tmp_path):
     code, out, err = run("simulate", TOML, "--html", "a.html", "-o", "a.npz", cwd=tmp_path)
     assert (code, err) == (0, "")
-    assert out.startswith("settled: attitude ")
+    assert out.startswith("simulate: settled after ")
     assert (tmp_path / "a.html").stat().st_size < 6e6
     motion = fflin.Motion.load(tmp_path / "a.npz")
     robot = fflin.load(TOML)

@@ -50,7 +50,7 @@ def test_the_chain_goes_from_a_file_to_gains(flown):
 
     code, out, err = run("check", *mat)
     assert (code, err) == (0, "")
-    assert "OK: all 123 errors are within tolerance" in out
+    assert "A and B hold" in out
 
     weights = ("--bryson", "q_b=0.05", "--bryson", "tau_m=0.5", "--qf", "q_b=9")
     code, out, err = run("tvlqr", *given, *weights, "--dt", "0.1", "-o", folder / "gains.npz")
