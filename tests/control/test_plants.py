@@ -197,17 +197,17 @@ def test_what_has_other_names_is_refused_with_the_names(nominal):
         return str(caught.value)
 
     other = Renamed(robot, names={3: "elbow"})
-    assert says(said(other), "'other'", "without", "tau_m.joint_2")
+    assert says(said(other), "'other'", "lacks the", "tau_m.joint_2")
     fewer = robot.replace(inputs=robot.inputs[:-1])
-    assert says(said(fewer), "without", "tau_m.joint_6;")
+    assert says(said(fewer), "lacks the", "tau_m.joint_6;")
     turned = robot.replace(inputs=robot.inputs[::-1])
     assert says(said(turned), "order")
     few = fflin.linearize(fewer)
     law = fflin.StateFeedback(few, np.zeros(few.B.T.shape))
-    assert says(said(robot, law), "with the", "tau_m.joint_6;")
+    assert says(said(robot, law), "also has the", "tau_m.joint_6;")
     assert says(
         said(fflin.load("cubesat")),
-        "without",
+        "lacks the",
         "tau_m.joint_1, tau_m.joint_2, tau_m.joint_3, tau_m.joint_4, ...",
     )
 

@@ -165,7 +165,7 @@ def test_what_does_not_go_on_is_one_line(flown):
         (lambda: approach.then(jammed, after), "begin"),
         (lambda: approach.then(turned), "'world'"),
         (lambda: approach.then(pushed), "jet"),
-        (whole.trajectory, "robots"),
+        (whole.trajectory, "several phases"),
     ]:
         with pytest.raises(fflin.InputError, match=said) as error:
             call()
