@@ -82,6 +82,6 @@ class LaneTally(Tally):
 
     def add(self, first: int, rows: Sequence[Array], raw: Any = None) -> LaneTally:
         """Take rows (steps, LANES, ..) from a step on into account, and `raw` as they came."""
-        kernel("tally", "take", "the statistics of eight runs")(self._marks, raw, first, len(rows[0]))
+        kernel("tally", "take", "statistics of eight runs")(self._marks, raw, first, len(rows[0]))
         self._last = *(each[-1] for each in rows[:3]), self._marks.x.T, self._marks.sizes.T
         return self
