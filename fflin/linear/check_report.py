@@ -45,6 +45,7 @@ def check_report(every: tuple[Row, ...], title: str) -> str:
     else:
         heads = [["", "", *columns.values()], *body]
         said = f"relative errors of the blocks of A and B compared with {', '.join(allowed)}"
+        said += "; a dot is no error"
         parts.append(f"{folded([said])}\n\n{_fitted(heads, 2 + len(states))}")
     single = [row for row in every if row.test not in _ROUTES]
     rest = [["figure", "error", "allowed"]]

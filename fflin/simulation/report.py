@@ -279,7 +279,7 @@ def _full(motion: Any) -> str:
     shares: dict[str, float] = {}  # at either limit
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share
-    said = [f"{name}\u00a0({100.0 * share:.2g}\u00a0%)" for name, share in shares.items()]
+    said = [f"{name}\u00a0({100.0 * share:.3g}\u00a0%)" for name, share in shares.items()]
     more = [f"{len(said) - _NAMED} more"] if len(said) > _NAMED else []
     return ", ".join(said[:_NAMED] + more) or "none"
 

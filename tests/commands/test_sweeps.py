@@ -61,7 +61,7 @@ def test_grid_random_and_file_say_the_same(tmp_path, robots):
             "10,000,000,000.*--yes",
         ),
         (("--random", "0"), "--random"),
-        (("--random", "3", "--range", "joint_1=-1e308:1e308"), "wider"),
+        (("--random", "3", "--range", "joint_1=-1e308:1e308"), "narrow"),
         (("--random", "3", "--grid", "joint_2=0:1:2"), "--grid"),
         (("--random", "3", "--joint", "joint_2=1", "--range", "joint_2=0:1"), "'joint_2'"),
         (("--configurations", "none.npz"), "none.npz"),

@@ -348,7 +348,8 @@ def test_a_gain_prints_in_80_columns(gain, lin):
     for each in (gain, sampled, small):
         text = str(each)
         assert max(map(len, text.splitlines())) <= 80
-        assert f"{each.residual:.1e}" in text and f"{each.margin:.5g}" in text
+        rates = np.log(each.poles) / each.dt if each.dt else each.poles
+        assert f"{each.residual:.1e}" in text and f"decay {-rates.real.max():.3g} 1/s" in text
     assert "norms of its blocks" in str(gain) and "qdot_m.joint_3" in str(small)
 
 

@@ -194,7 +194,7 @@ def test_a_tolerance_takes_the_place_of_every_figures_own():
     own, loose = fflin.check(robot, near), fflin.check(robot, near, tolerance=1e-6)
     assert not own.ok and loose.ok and loose.max_error == own.max_error
     assert {row.tolerance for row in loose.rows} == {1e-6}
-    assert str(loose).count("at most 1.0e-06") > 3 and "at most 1.0e-06" in loose.title
+    assert "at most 1.0e-06" in loose.title
     assert not fflin.check(robot, planted(lin, "A", slice(6, 9), slice(9, 12)), tolerance=1e-6).ok
     assert not fflin.check(robot, lin, tolerance=1e-20).ok
     for wrong in (0.0, -1e-6, 1.0, np.nan, np.inf, "much", True):

@@ -36,11 +36,11 @@ def test_groups_names_and_patterns_pick_panels_and_lines(motion):
     names = motion.state_names
     panels = drawn(motion, ["q_b.z", "*.joint_1", "F_b"])
     assert set(panels) == {
-        *("attitude q_b", "joints q_m", "joint rates", "forces", "joint inputs tau_m")
+        *("attitude q_b", "joints q_m", "joint rates qdot_m", "forces", "joint inputs tau_m")
     }
     np.testing.assert_array_equal(panels["attitude q_b"]["z"], motion.x[:, 2])
     np.testing.assert_array_equal(
-        panels["joint rates"]["joint_1"], motion.x[:, names.index("qdot_m.joint_1")]
+        panels["joint rates qdot_m"]["joint_1"], motion.x[:, names.index("qdot_m.joint_1")]
     )
     assert list(panels["joints q_m"]) == ["joint_1"]
     assert list(panels["forces"]) == ["F_b.x", "F_b.y", "F_b.z"]

@@ -336,7 +336,7 @@ def test_its_table_ranks_links_or_what_is_asked_for():
     assert {len(row) for row in shown("density")} == {6}  # name, no unit, 1, 0.1, and A and B
     with pytest.raises(fflin.UnknownNameError, match="'masss'"):
         S.table(3, "masss")
-    assert says(S.table(3, "joint_1.stiffness"), "no effect")
+    assert says(S.table(3, "joint_1.stiffness"), "none of these")
 
 
 @pytest.mark.parametrize("axis", "xyz")

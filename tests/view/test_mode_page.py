@@ -167,7 +167,7 @@ def test_what_cannot_be_shown_is_one_line_and_no_file(robots, tmp_path):
         (rigid, fflin.modes(fflin.linearize(rigid)), "vibration", {"html": page}),
         (rigid, found, "'ets_vii'", {"html": page}),
         (bent, reduced, "'servicer_7dof'", {"html": page}),
-        (bent, found, "motion", {"png": tmp_path / "m.png"}),
+        (bent, found, "modes", {"png": tmp_path / "m.png"}),
     ):
         with pytest.raises(fflin.InputError, match=match) as caught:
             fflin.visualize(robot, given, **files)
