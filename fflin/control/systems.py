@@ -137,7 +137,7 @@ def _places(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -
     if size != len(names if named else known):
         raise InputError(
             f"the controller has {size} {kind}s and {len(names) if named else 'no'} names, "
-            f"expected a name for each, or a {kind} for each {of} of the model: {listed(known)}"
+            f"expected a name for each, or one {kind} for each {of} of the model: {listed(known)}"
         )
     if not named:
         return list(range(size))
@@ -147,7 +147,7 @@ def _places(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -
     for name, key in zip(names, own, strict=True):
         if key not in there:
             text = unknown(f"{of} of the model", name, known)
-            raise InputError(f"{kind} of the controller: {text}; or leave out all names")
+            raise InputError(f"{kind} of the controller: {text} (or leave out all names)")
         if own.count(key) > 1:
             raise InputError(
                 f"two {kind}s of the controller are named '{name}'; give them different names"

@@ -216,7 +216,7 @@ def _steady(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Array:
         return kalman(lin, W, V).P
     except (DetectabilityError, InputError) as error:
         raise type(error)(
-            f"no steady filter exists at the start of the trajectory: {error}; give P0"
+            f"no steady filter exists at the start of the trajectory: {error}; or give P0"
         ) from None
 
 
