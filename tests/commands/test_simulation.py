@@ -259,12 +259,12 @@ def test_inputs_are_cut_to_the_limits_of_the_robot_unless_told_otherwise(tmp_pat
 
     size, out = largest()
     assert size == 1e-3
-    assert says(out, "tau_b.x", "limit", "-0.001 N m") and "beyond" not in out
+    assert says(out, "tau_b.x", "limit", "-0.001 N m") and "exceeded" not in out
     size, _ = largest("--limit", "tau_b=2e-3")
     assert size == 2e-3
     size, out = largest("--limits", "none")
     assert size > 0.1
-    assert says(out, "beyond", "limit", "tau_b.x -0.1")
+    assert says(out, "exceeded", "limit", "tau_b.x -0.1")
     size, _ = largest("--limits", "none", "--limit", "tau_b.x=3e-3")
     assert size == 3e-3
     assert "--limits" in refused("simulate", "cubesat", "--limits", "all")
