@@ -64,9 +64,8 @@ class Saturated(NamedTuple):
     share: float
 
     def __str__(self) -> str:
-        size, share = f"{_shown(self.limit)} {self.unit}", 100.0 * self.share
-        percent = f"{share:.2g}" if share < 10.0 else f"{share:.0f}"
-        return f"{_name(self.name)} at its limit of {size} for {percent} % of the run"
+        size = f"{_shown(self.limit)} {self.unit}"
+        return f"{_name(self.name)} at its limit of {size} for {_percent(self.share)} % of the run"
 
 
 def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:
@@ -113,6 +112,10 @@ def limited(motion: Any) -> Iterator[Limited]:
 def _name(name: str) -> str:
     group, _, entry = name.partition(".")
     return entry if group in ("q_m", "qdot_m") else name
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.2g}" if share < 0.1 else f"{100.0 * share:.0f}"
 
 
 def _shown(value: float) -> str:
@@ -279,7 +282,7 @@ def _full(motion: Any) -> str:
     shares: dict[str, float] = {}  # at either limit
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share
-    said = [f"{name}\u00a0({100.0 * share:.3g}\u00a0%)" for name, share in shares.items()]
+    said = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]
     more = [f"{len(said) - _NAMED} more"] if len(said) > _NAMED else []
     return ", ".join(said[:_NAMED] + more) or "none"
 
