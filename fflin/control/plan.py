@@ -201,6 +201,11 @@ def plan(
     )
 
 
+import os
+
+FRESH = os.environ.get("FRESH")
+
+
 class _Made(NamedTuple):
     """A plan, and what it misses of the goal (nx,) and exceeds of limits (2, .., nx)."""
 
@@ -252,22 +257,27 @@ def _kept_between(
 ) -> _Made:
     """Return of all plans that reach the goal the one that exceeds limits by the least."""
     best, known, least, last = None, None, np.inf, np.inf
-    within = _at_knots(bounds, shooting)
+    within = whole = _at_knots(bounds, shooting)
     for _ in range(_MOST_PLANS):
         u = sought(shooting, partial(_room, shooting, end, within, asked), known)
         made = _flown(shooting, start, end, u, bounds, asked)
         most, reached = float((made.beyond / size).max()), made.missed.max() <= _REACHED
         if best is None or (reached and most < least):
             best, least = made, most
-        if least <= _BETWEEN or best.missed.max() > _REACHED:
+        if least <= _BETWEEN or (within is whole and not reached):
             break
-        within = _tighter(within, made.beyond)
-        enough = (within[1] - within[0] >= _OF_ROOM * (bounds[1] - bounds[0])).all()
+        tighter = _tighter(within, made.beyond)
+        enough = (tighter[1] - tighter[0] >= _OF_ROOM * (bounds[1] - bounds[0])).all()
+        if reached:
+            latest = made
         if reached and enough and most <= _OF_LAST * last:
-            known, last = made[1:4], most
+            known, last, within = made[1:4], most, tighter
         else:
-            shooting, known = _halved(best, size)
-            within, last = _at_knots(bounds, shooting), np.inf
+            shooting, known = _halved(latest, size)
+            if FRESH and most > 0.5:
+                known = None
+            within = whole = _at_knots(bounds, shooting)
+            last = np.inf
     assert best is not None
     return best
 
@@ -287,9 +297,10 @@ def _flown(
 
 
 def _halved(made: _Made, size: Array) -> tuple[Shooting, tuple[Array, Array, Array]]:
-    """Return a plan with a knot in the middle of each interval that exceeds a limit."""
+    """Return a plan with a knot in the middle of intervals that exceed a limit, and beside."""
     shares = (made.beyond / size).max(axis=(0, 2))[1:].reshape(-1, _PARTS).max(axis=1)
-    at = np.flatnonzero(shares > _BETWEEN)
+    far = np.pad(shares > _BETWEEN, 1)
+    at = np.flatnonzero(far[:-2] | far[1:-1] | far[2:])
     middle = made.u[at] if made.shooting.held else 0.5 * (made.u[at] + made.u[at + 1])
     rows = np.arange(len(made.u)) * _PARTS
     rows = np.insert(rows, at + 1, rows[at] + _PARTS // 2)
