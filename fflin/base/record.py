@@ -64,7 +64,12 @@ def read_record(path: Path) -> tuple[Record, bool]:
     """Return the record in a file, and whether it is verified; to be called within `reading`."""
     # Arrays may have other shapes of that order: .mat knows no vectors, .json no empty matrices.
     check_ending(path, FORMATS)
-    return _CODECS[path.suffix][1](read_file(path, path.suffix))
+    return decoded(path.suffix, read_file(path, path.suffix))
+
+
+def decoded(suffix: str, content: bytes) -> tuple[Record, bool]:
+    """Return the record that the content of a file holds, and whether it is verified."""
+    return _CODECS[suffix][1](content)
 
 
 @contextmanager

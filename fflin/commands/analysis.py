@@ -79,7 +79,11 @@ def add_commands(commands: Commands) -> None:
         sensitivity, "--top N = 15: show the N parameters with the largest effect; 15 by default"
     )
     add_options(sensitivity, "--only NAME: show these parameters only: mass, link_3, *.density")
-    add_output_file(sensitivity, "save dA, dB, df0 for each parameter to FILE: .npz, .mat or .json")
+    add_output_file(
+        sensitivity,
+        "save dA, dB, df0 for each parameter to FILE: .npz, .mat or .json",
+        "Sensitivity",
+    )
     uncertain = command(
         *(commands, "uncertain", _uncertain),
         "show or save the exact linear-fractional model (LFT) of parameters in ranges, at rest",
@@ -95,7 +99,9 @@ def add_commands(commands: Commands) -> None:
         fraction of its value, such as 0.2, or LEAST:LARGEST; with RANGE,tied all parameters of
         the pattern share one delta"""
     add_options(uncertain, vary, type=_range, required=True)
-    add_output_file(uncertain, "save A, B1 .. D22 and the blocks to FILE: .npz, .mat or .json")
+    add_output_file(
+        uncertain, "save A, B1 .. D22 and the blocks to FILE: .npz, .mat or .json", "LFT"
+    )
 
 
 def _range(text: str) -> tuple[str, Any]:

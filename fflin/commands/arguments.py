@@ -254,6 +254,12 @@ def add_system(command: Container, *, axes: bool = True) -> None:
         add_options(command, frame)
 
 
-def add_output_file(command: Container, what: str) -> None:
-    """Add -o FILE with the help `what`, which lists the endings."""
+def add_output_file(command: Container, what: str, *kinds: str) -> None:
+    """Add -o FILE with the help `what`, which lists the endings.
+
+    With the `kinds` of results that are written there, add --force too; see `require_own_kind`.
+    """
     command.add_argument("-o", "--output-file", metavar="FILE", type=output_file, help=what)
+    if kinds:
+        add_options(command, "--force: let -o replace a file that holds anything of another kind")
+        command.set_defaults(kinds=kinds)

@@ -17,6 +17,7 @@ from fflin.base.version import __version__
 from fflin.base.writing import files_of_command
 from fflin.commands import BAD_INPUT, DONE
 from fflin.commands.arguments import files_of
+from fflin.commands.kinds import require_own_kind
 
 # The commands by task, in the order of the help, each with its module.
 TASKS = {
@@ -72,6 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = _parser(argv[0] if argv else "").parse_args(argv)
         with files_of_command(*files_of(arguments)):
+            require_own_kind(arguments)
             code: int = arguments.run(arguments)
         if sys.stdout is not None:
             sys.stdout.flush()

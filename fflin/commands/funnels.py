@@ -50,7 +50,7 @@ def add_commands(commands: of.Commands) -> None:
         --step H: integration step [s]; chosen automatically by default""",
     )
     add_figure(funnel, "plot the funnel")
-    of.add_output_file(funnel, "save the funnel to FILE: .npz, .mat or .json")
+    of.add_output_file(funnel, "save the funnel to FILE: .npz, .mat or .json", "Funnel")
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 

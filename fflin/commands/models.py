@@ -54,7 +54,8 @@ def add_commands(commands: Commands) -> None:
     )
     add_trajectory(linearize)
     add_output_file(
-        linearize, "save to FILE: .npz, .mat, .json, or .csv (one file per matrix: NAME.A.csv, ...)"
+        *(linearize, "save to FILE: .npz, .mat, .json, or .csv (one per matrix: NAME.A.csv, ...)"),
+        *("LinearModel", "LinearTrajectory", "ToolModel"),
     )
     add_figure(linearize, "plot the pattern of A and B")
     check = command(

@@ -35,7 +35,7 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(lqr)
     add_weights(lqr)
-    add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json")
+    add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json", "Gain")
     add_figure(lqr, "plot the poles, and the loop of each input with its margins,")
 
 

@@ -40,7 +40,7 @@ def add_commands(commands: Commands) -> None:
         --show NAME*: curves of --plot: a state, an input, a group or a pattern, such as q_m or
             '*.hinge_*'""",
     )
-    add_output_file(shown, "save the motion to FILE: .npz, .mat, .json or .csv")
+    add_output_file(shown, "save the motion to FILE: .npz, .mat, .json or .csv", "Motion")
     add_pictures(shown)
 
 

@@ -84,6 +84,7 @@ def add_commands(commands: Commands) -> None:
         sweep,
         "save to FILE: .h5 (HDF5) or .npz; the models are collected in FILE.part, from which the "
         "same command resumes",
+        "LinearBatch",
     )
 
 

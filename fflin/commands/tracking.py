@@ -41,7 +41,7 @@ def add_commands(commands: Commands) -> None:
         tvlqr,
         "--qf NAME=VALUE*: weight at the end; by default the cost of the steady regulator there",
     )
-    add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json")
+    add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json", "GainSchedule")
 
 
 def add_trajectory(parser: Container, *, required: bool = False) -> None:

@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 from fflin.analysis.mechanics import second_order, slopes
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array
-from fflin.control.riccati import Solution, half_size, rates_of, solve
+from fflin.control.riccati import half_size, rates_of, solve
 from fflin.control.saturation import warn_beyond
 from fflin.linear.model import LinearModel
 
@@ -26,9 +26,9 @@ TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 # least is slowed in vain.
 _TRIALS, _IN_VAIN = 8, 0.9
 
-# What grows is held by a loop of at least this fraction of its rate of growth. A slower one lets
-# light joints swing by radians.
-_OF_GROWTH = 0.4
+# What grows is held by a loop of at least this fraction of its rate of growth, and of the second
+# fraction where the efforts have less. A slower one lets light joints swing by radians.
+_OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
 # The inputs count as reaching each mode by at least this fraction of what holds it at rest. A mode
 # that they reach less keeps its decay.
@@ -43,7 +43,7 @@ _AS_SLOW = 0.9
 # So many times the bandwidth is sought at which damping counts.
 _PASSES = 4
 
-_NOT_ENOUGH = ", which is too small for these displacements"
+_NOT_ENOUGH = "is too small for all displacements"
 
 
 class Weights(NamedTuple):
@@ -157,8 +157,8 @@ def _of_inertia(
     rate = slopes(lin)
     loaded = rate[m:].any() or rate[:m, :m].any()
     if loaded:
-        growth = float(rates_of(np.linalg.eigvals(lin.A), lin.dt).real.max())
-        limit = max(limit, _Limit(_OF_GROWTH * growth, f"an unstable pole at {growth:.3g} 1/s"))
+        grows = _growth(lin)
+        limit = max(limit, grows._replace(bandwidth=_OF_GROWTH * grows.bandwidth))
     if pace.hold or lin.dt:
         fastest = pace.held / ((pace.hold or lin.dt) * rates[-1])
         limit = min(limit, _Limit(float(fastest), "the sampling time"))
@@ -174,7 +174,8 @@ def _of_inertia(
 
     if loaded:
         driven = (S**2 / cost).sum(axis=1) > _IDLE * D / unit
-        limit, achieved = _slowed(lin, costs, size, size * driven, limit)
+        least = min(grows._replace(bandwidth=_LEAST_OF_GROWTH * grows.bandwidth), limit)
+        limit, achieved = _slowed(lin, costs, size, size * driven, limit, least)
     rule = _rule(lin, size, limit, achieved, pace.share * TURN) + (
         "; joint damping is included" if damped else ""
     )
@@ -287,22 +288,46 @@ def _efforts(lin: LinearModel) -> dict[str, float]:
     return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
 
 
+def _growth(lin: LinearModel) -> _Limit:
+    """Return the largest rate of growth [1/s] of the model, and which mode has it."""
+    poles, modes = np.linalg.eig(lin.A)
+    growth = rates_of(poles, lin.dt).real
+    fastest, k = float(growth.max()), int(growth.argmax())
+    moving = listed(_moving_most(lin, modes[:, [k]]))
+    return _Limit(fastest, f"what grows by {fastest:.3g} 1/s ({moving})")
+
+
+class _Loop(NamedTuple):
+    """A gain (nu, nx), and the rates (nx,) [1/s] and modes of the loop it closes."""
+
+    K: Array
+    rates: Any
+    modes: Any
+
+
+def _loop(lin: LinearModel, K: Array) -> _Loop:
+    poles, modes = np.linalg.eig(lin.A - lin.B @ K)
+    return _Loop(K, rates_of(poles, lin.dt), modes)
+
+
 class _Trial(NamedTuple):
     """A loop, by what its limits leave of its bandwidth, and what its inputs are asked for."""
 
     limit: _Limit
     left: float
-    solution: Solution
+    effort: str  # the one that leaves the least
+    loop: _Loop
     asked: Array
 
 
 def _slowed(
-    lin: LinearModel, costs: _Costs, size: Array, driven: Array, limit: _Limit
+    lin: LinearModel, costs: _Costs, size: Array, driven: Array, limit: _Limit, least: _Limit
 ) -> tuple[_Limit, str]:
     """Slow a loop with springs or gravity until it respects the limits; report what it achieves.
 
-    Displacements `size` (m,) require efforts at the start, and displacements `driven` also on the
-    way back. The latter omit joints without a motor, which springs or gravity move.
+    The loop is slowed down to `least` and no further. Displacements `size` (m,) require efforts at
+    the start, and displacements `driven` also on the way back. The latter omit joints without a
+    motor, which springs or gravity move.
     """
     trials = list[_Trial]()
     for _ in range(_TRIALS):
@@ -311,49 +336,59 @@ def _slowed(
             solution = half_size(*arguments) or solve(*arguments)
         except np.linalg.LinAlgError:
             break
+        loop = _loop(lin, solution.K)
         use = np.maximum(
-            _largest(solution.K, size, lin.state_names), _on_the_way(lin, solution, driven)
+            _largest(solution.K, size, lin.state_names), _on_the_way(lin, loop, driven)
         )
         left, what = min(_limits("effort", _efforts(lin), use, 2.0), default=_Limit(1.0, ""))
-        trials.append(_Trial(limit, left, solution, np.abs(lin.u0) + use))
+        trials.append(_Trial(limit, left, what, loop, np.abs(lin.u0) + use))
         if left >= 1.0 - 1e-6:
-            return limit, _achieved(lin, solution, limit.bandwidth)
+            return limit, _achieved(lin, loop, limit.bandwidth)
+        if limit.bandwidth <= least.bandwidth:
+            break
         # What springs and gravity ask for stays however slow the loop.
-        limit = _Limit(min(max(left, 0.3), 0.8) * limit.bandwidth, what)
+        slower = _Limit(min(max(left, 0.3), 0.8) * limit.bandwidth, what)
+        limit = max(slower, least)
     if not trials:
         return limit, ""  # the regulator raises with the reason
     most = max(trial.left for trial in trials)
-    limit, _, solution, asked = next(x for x in trials if x.left >= _IN_VAIN * most)
+    limit, _, effort, loop, asked = next(x for x in trials if x.left >= _IN_VAIN * most)
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "to return from the displacements of the default weights"
     warn_beyond(lin.robot, where, lin.input_names, lin.input_units, asked[None], -high, high)
-    limit = limit._replace(what=f"{limit.what or trials[-1].limit.what}{_NOT_ENOUGH}")
-    return limit, _achieved(lin, solution, limit.bandwidth)
+    held = limit.what == least.what  # a slower loop holds less of what grows
+    what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
+    limit = limit._replace(what=what)
+    return limit, _achieved(lin, loop, limit.bandwidth)
 
 
-def _on_the_way(lin: LinearModel, solution: Solution, size: Array) -> Array:
+def _on_the_way(lin: LinearModel, loop: _Loop, size: Array) -> Array:
     """Return the largest inputs (nu,) on the way back from displacements (m,)."""
-    poles, modes = np.linalg.eig(lin.A - lin.B @ solution.K)
-    rates = rates_of(poles, lin.dt)
+    K, rates, modes = loop
     time = np.geomspace(0.1 / np.abs(rates).max(), 3.0 / np.abs(rates).min(), 60)
-    passing = (solution.K @ modes) * np.exp(rates * time[:, None])[:, None]
+    passing = (K @ modes) * np.exp(rates * time[:, None])[:, None]
     way = (passing @ np.linalg.inv(modes)[:, : len(size)]).real
     return _largest(way, size, lin.state_names).max(axis=0)
 
 
-def _achieved(lin: LinearModel, solution: Solution, bandwidth: float) -> str:
+def _achieved(lin: LinearModel, loop: _Loop, bandwidth: float) -> str:
     """Return a report of a loop's bandwidth and decay, and of modes slower than at rest."""
-    m, (poles, modes) = len(lin.M), np.linalg.eig(lin.A - lin.B @ solution.K)
-    rates = rates_of(poles, lin.dt)
+    _, rates, modes = loop
     decay, fast = -rates.real, np.abs(rates)
     said = f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} 1/s, "
     said += f"damping ratio at least {(decay / fast).min():.2g}"
     slow = np.flatnonzero(decay < _AS_SLOW * math.sqrt(0.5) * bandwidth)
-    large = np.abs(modes[:m, slow]) * np.sqrt(lin.M.diagonal())[:, None]
-    among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
-    if names := [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]:
+    if names := _moving_most(lin, modes[:, slow]):
         said += f"; slower than without springs, gravity or motion: {listed(names)}"
     return said
+
+
+def _moving_most(lin: LinearModel, modes: Any) -> list[str]:
+    """Return the coordinates that modes (nx, k) move most, weighed by inertia."""
+    m = len(lin.M)
+    large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
+    among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
+    return [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]
 
 
 def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: float) -> str:

@@ -30,8 +30,16 @@ from fflin.robot.robot import Robot
 _REACHED, _ENDS = 1e-7, 1e-8
 
 # Between knots limits are exceeded by no more than this share of them, looked at so many times an
-# interval. Where they are, they are tightened at the knots beside, this often.
-_BETWEEN, _PARTS, _MOST_TIGHTER = 0.01, 16, 8
+# interval.
+_BETWEEN, _PARTS = 0.01, 16
+
+# So many plans are made to that end. Limits are tightened at the knots beside if each tightening
+# leaves this share of what the last one left to exceed, and of the room between limits; if not,
+# the intervals are halved.
+_MOST_PLANS, _OF_LAST, _OF_ROOM = 16, 0.5, 0.5
+
+# A plan that exceeds limits by more than this share of them is no start for the next one.
+_FAR = 0.5
 
 # Intervals are flown as one motion where they miss each other by no more.
 _MEETS = 1e-10
@@ -79,8 +87,9 @@ def plan(
 
     Limits of joints and wheels hold at the knots, and to 1 % between knots. If the integrated
     motion exceeds a limit between knots, the limit is tightened at the neighbouring knots and the
-    plan is repeated. If more than 1 % remains, a warning is issued. The printed trajectory states
-    the largest excess.
+    plan is repeated. If that does not help, the intervals in question are halved. If more than 1 %
+    remains after 16 plans, a warning is issued. The printed trajectory states the largest excess,
+    its limit and its time.
 
     Parameters
     ----------
@@ -95,7 +104,7 @@ def plan(
         Start of the motion, as in `simulate`: a state, or a configuration and velocity. By default
         the robot's `start`.
     knots : int
-        Number of equally spaced knots.
+        Number of equally spaced knots; knots are added where limits need them.
     hold : {"previous", "linear"}
         Inputs between knots: held at the value of the previous knot, or linearly interpolated.
     limits : "urdf", float, mapping or list of them, optional
@@ -117,9 +126,9 @@ def plan(
     Raises
     ------
     InputError
-        If an argument has a wrong size or value, or if no motion to the goal within the limits is
-        found. The message states by how much the last trial misses the goal or exceeds a limit. A
-        feasible motion may still exist.
+        If an argument has a wrong size or value, the start or goal is outside a limit, or no
+        motion to the goal within the limits is found. The message states by how much the last
+        trial misses the goal or exceeds a limit. A feasible motion may still exist.
     MissingPackageError
         If PIQP is not installed.
     UnknownNameError
@@ -174,18 +183,18 @@ def plan(
     bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in state.names]).T
     size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
     size[size == 0.0] = 1.0
+    for name, point, which in (("start", start, slice(None)), ("goal", end, asked)):
+        _require_within(state, bounds, name, point, which)
     with np.errstate(all="ignore"):  # what leads nowhere may diverge, which is said
-        sought = partial(_sought, shooting, start, end, weights, np.array((low, high)))
-        q, v, u, beyond = _kept_between(shooting, start, end, sought, bounds, size, asked)
-        missed = np.abs(shooting.between((q[-1], v[-1]), end)) * asked
-    largest = beyond.max(axis=(0, 1))
-    at_knots = beyond[:, ::_PARTS].max(axis=(0, 1))
-    passed = np.where(at_knots > _REACHED, at_knots, 0.0)
+        sought = partial(_sought, start, end, weights, np.array((low, high)))
+        made = _kept_between(shooting, start, end, sought, bounds, size, asked)
+    missed, passed = made.missed, made.beyond[:, ::_PARTS].max(axis=(0, 1))
     if max(missed.max(), passed.max()) <= _REACHED:
+        t, q, v, u = made.shooting.t, made.q, made.v, made.u
         if asked.all():
             q[-1], v[-1] = end  # at rest, rounding would be all that a check sees
-        note = _note(state, largest / size)
-        if (largest > _BETWEEN * size).any():
+        note = _note(made, size)
+        if (made.beyond > _BETWEEN * size).any():
             warnings.warn(
                 f"{note}; give more knots or a longer duration", FflinWarning, stacklevel=2
             )
@@ -204,12 +213,43 @@ def plan(
     )
 
 
-def _note(state: StateMap, shares: Array) -> str:
-    """Return a note on the state (nx,) whose limit the integrated motion exceeds most."""
-    i = int(shares.argmax())
+class _Made(NamedTuple):
+    """A plan, and what it misses of the goal (nx,) and exceeds of limits (2, .., nx)."""
+
+    shooting: Shooting
+    q: Array
+    v: Array
+    u: Array
+    fine: Point  # q and v at _PARTS rows an interval
+    missed: Array
+    beyond: Array
+
+
+def _require_within(state: StateMap, bounds: Array, what: str, point: Point, which: Any) -> None:
+    """Raise `InputError` if a point is outside the limits of some states."""
+    values = _limited(state, point[0][None], point[1][None])[0]
+    asked = np.zeros(state.nx, dtype=bool)
+    asked[which] = True
+    outside = [
+        f"{state.names[i]} is {values[i]:.4g} {state.units[i]}, limit {limit:.4g} {state.units[i]}"
+        for side, limits in zip((-1.0, 1.0), bounds, strict=True)
+        for i, limit in enumerate(limits)
+        if asked[i] and side * (values[i] - limit) > _REACHED
+    ]
+    if outside:
+        raise InputError(f"the {what} is outside the limits: {listed(outside)}")
+
+
+def _note(made: _Made, size: Array) -> str:
+    """Say which limit of a state (nx,) the integrated motion exceeds most, by what and when."""
+    shares = (made.beyond / size).max(axis=0)
+    row, i = np.unravel_index(shares.argmax(), shares.shape)
     most = "exceeds no limit of a state"
-    if shares[i] > 0.0:
-        most = f"exceeds the limit of {state.names[i]} by {100.0 * shares[i]:.2g} %"
+    if shares[row, i] > 0.0:
+        shooting, (k, part) = made.shooting, divmod(int(row), _PARTS)
+        at = shooting.t[k] + (part / _PARTS * shooting.h[k] if part else 0.0)
+        percent = f"{100.0 * shares[row, i]:.2g} %"
+        most = f"exceeds the limit of {shooting.state.names[i]} by {percent} at t = {at:.4g} s"
     return f"the integrated motion {most}, checked at {_PARTS} points per interval"
 
 
@@ -221,35 +261,65 @@ def _kept_between(
     bounds: Array,
     size: Array,
     asked: Array,
-) -> tuple[Array, Array, Array, Array]:
-    """Return knots, inputs, and how far the motion is beyond limits at all points (2, .., nx).
-
-    Of all plans that reach the goal it is the one that exceeds limits between knots by the least.
-    """
-    within, known = np.repeat(bounds[:, None], len(shooting.t), axis=1), None
-    best, least = None, np.inf
-    for _ in range(_MOST_TIGHTER):
-        u = sought(partial(_room, shooting, end, within, asked), known)
-        fine = shooting.flown(start, u, _PARTS)
-        q, v = (each[::_PARTS] for each in fine)
-        beyond = _beyond(shooting.state, bounds, *fine)
-        most = float((beyond / size).max())
-        missed = float((np.abs(shooting.between((q[-1], v[-1]), end)) * asked).max())
-        if best is None or (missed <= _REACHED and most < least):
-            best, least = (q, v, u, beyond), most
-        known, within = (q, v, u), _tighter(within, beyond)
-        if most <= _BETWEEN or missed > _REACHED or (within[0] > within[1]).any():
+) -> _Made:
+    """Return of all plans that reach the goal the one that exceeds limits by the least."""
+    best, known, least, last = None, None, np.inf, np.inf
+    within = whole = _at_knots(bounds, shooting)
+    for _ in range(_MOST_PLANS):
+        u = sought(shooting, partial(_room, shooting, end, within, asked), known)
+        made = _flown(shooting, start, end, u, bounds, asked)
+        most, reached = float((made.beyond / size).max()), made.missed.max() <= _REACHED
+        if best is None or (reached and most < least):
+            best, least = made, most
+        if least <= _BETWEEN or (within is whole and not reached):
             break
+        tighter = _tighter(within, made.beyond)
+        enough = (tighter[1] - tighter[0] >= _OF_ROOM * (bounds[1] - bounds[0])).all()
+        if reached:
+            latest = made
+        if reached and enough and most <= _OF_LAST * last:
+            known, last, within = made[1:4], most, tighter
+        else:
+            shooting, known = _halved(latest, size)
+            known = known if most <= _FAR else None
+            within = whole = _at_knots(bounds, shooting)
+            last = np.inf
     assert best is not None
     return best
 
 
+def _at_knots(bounds: Array, shooting: Shooting) -> Array:
+    return np.repeat(bounds[:, None], len(shooting.t), axis=1)
+
+
+def _flown(
+    shooting: Shooting, start: Point, end: Point, u: Array, bounds: Array, asked: Array
+) -> _Made:
+    """Return what inputs make of the start."""
+    fine = shooting.flown(start, u, _PARTS)
+    q, v = (each[::_PARTS] for each in fine)
+    missed = np.abs(shooting.between((q[-1], v[-1]), end)) * asked
+    return _Made(shooting, q, v, u, fine, missed, _beyond(shooting.state, bounds, *fine))
+
+
+def _halved(made: _Made, size: Array) -> tuple[Shooting, tuple[Array, Array, Array]]:
+    """Return a plan with a knot in the middle of intervals that exceed a limit, and beside."""
+    shares = (made.beyond / size).max(axis=(0, 2))[1:].reshape(-1, _PARTS).max(axis=1)
+    far = np.pad(shares > _BETWEEN, 1)
+    at = np.flatnonzero(far[:-2] | far[1:-1] | far[2:])
+    middle = made.u[at] if made.shooting.held else 0.5 * (made.u[at] + made.u[at + 1])
+    rows = np.arange(len(made.u)) * _PARTS
+    rows = np.insert(rows, at + 1, rows[at] + _PARTS // 2)
+    q, v = (each[rows] for each in made.fine)
+    return made.shooting.halved(at), (q, v, np.insert(made.u, at + 1, middle, axis=0))
+
+
 def _sought(
-    shooting: Shooting,
     start: Point,
     end: Point,
     R: Array,
     limits: Array,
+    shooting: Shooting,
     room: Callable[[Array, Array], Array],
     known: tuple[Array, Array, Array] | None,
 ) -> Array:
@@ -319,7 +389,7 @@ class _Search(NamedTuple):
         weights = np.hstack((np.tile(near, (len(u), 1)), self.cost))
         H, of_x = weights[:, :, None] * np.eye(weights.shape[1]), np.zeros((len(u), nx))
         g, soft = np.hstack((of_x, effort)), np.hstack((of_x + _PRICE, np.full(u.shape, np.inf)))
-        scale = np.concatenate((np.ones(nx), (len(u) * self.cost[1]) ** -0.5))
+        scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))
         return StageQP(np.zeros(nx), A, B, D, missed, H, g, low, high, soft, scale).solve()
 
     def closed(self, start: Point, q: Array, v: Array, u: Array) -> Array:
@@ -349,10 +419,10 @@ class _Search(NamedTuple):
 
 def _shares(shooting: Shooting, R: Array, u: Array) -> Array:
     """Return the cost of squared inputs (N + 1, nu), scaled so that the guess costs 1."""
-    cost = np.tile(R, (len(u), 1))
+    h = shooting.h
     # Of the knots in an integral: by the trapezoidal rule, or as long as each input is held.
-    if not shooting.held:
-        cost[[0, -1]] *= 0.5
+    held = np.append(h, h[-1]) if shooting.held else 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
+    cost = held[:, None] * R
     cost /= (cost * u * u).sum() or cost.sum()
     return cost
 
@@ -376,10 +446,9 @@ def _limited(state: StateMap, q: Array, v: Array) -> Array:
 
 
 def _beyond(state: StateMap, bounds: Array, q: Array, v: Array) -> Array:
-    """Return how far rows are below and above limits (2, N, nx), more than the first one is."""
+    """Return how far rows are below and above limits (2, N, nx)."""
     values = _limited(state, q, v)
-    far = np.maximum(np.array((bounds[0] - values, values - bounds[1])), 0.0)
-    return np.maximum(far - far[:, :1], 0.0)
+    return np.maximum(np.array((bounds[0] - values, values - bounds[1])), 0.0)
 
 
 def _tighter(within: Array, beyond: Array) -> Array:

@@ -25,10 +25,16 @@ class Shooting:
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
         self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
         self.steps = _FEWEST_STEPS
+        self.h = np.diff(t)
         # Of one engine, so that a plan is the same to the last bit whatever ran before.
         self._linearizer = Linearizer(robot, moving=True, engine="python")
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
+
+    def halved(self, intervals: Array) -> "Shooting":
+        """Return it with a knot in the middle of some intervals."""
+        middle = self.t[intervals] + 0.5 * self.h[intervals]
+        return Shooting(self.state.robot, np.insert(self.t, intervals + 1, middle), self.held)
 
     def between(self, start: Point, end: Point) -> Array:
         """Return the step z (nx,) from a point to another; wheels may be at any angle."""
@@ -78,7 +84,7 @@ class Shooting:
         """Return Jacobians of the intervals' ends over z, the input there and the next one."""
         # By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
         flow, (nx, nu), steps = self._flow(q, v, u), (len(self._size), u.shape[1]), self.steps // 4
-        h, Z = self.t[1] / steps, np.tile(np.eye(nx, nx + 2 * nu), (len(q) - 1, 1, 1))
+        h, Z = self.h[:, None, None] / steps, np.tile(np.eye(nx, nx + 2 * nu), (len(q) - 1, 1, 1))
         at = list(zip(q, v, strict=True))[:-1]
 
         def rates(half: int) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@
 
 import re
 import sys
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -435,29 +436,63 @@ def test_panels_on_springs_come_to_rest_as_the_base_does(stiffness, inputs):
     assert ("slower than without springs" in gain.weights) == (least < 0.9)
 
 
-@pytest.mark.parametrize("name", ["bolt", "talos", "b1_z1"])
+LEGGED = (
+    *("solo8", "solo12", "hyq", "a1", "b1", "go1", "go2", "laikago", "anymal", "anymal_c"),
+    *("anymal_kinova", "quadruped", "talos_legs", "talos_full", "simple_humanoid"),
+    *("simple_humanoid_classical", "g1_with_hands", "icub_reduced", "human", "alexander"),
+    *("alex_nub_hands", "centauro", "canadarm2", "servicer_7dof"),
+)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "bolt",
+        "talos",
+        "b1_z1",
+        "g1",
+        *(pytest.param(n, marks=pytest.mark.exhaustive) for n in LEGGED),
+    ],
+)
 def test_a_robot_that_is_held_in_gravity_comes_back_from_five_degrees(name):
     robot = fflin.load(name, gravity=(0.0, 0.0, -9.81))
     lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
-    gain = fflin.lqr(lin)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", fflin.FflinWarning)  # of 30 deg, with all joints at once
+        gain = fflin.lqr(lin)
     bandwidth = float(re.search(r"bandwidth at least ([\d.]+) rad/s", gain.weights)[1])
     assert bandwidth == pytest.approx(np.abs(gain.poles).min(), rel=5e-3)
     assert gain.margin > 0.99 * BANDWIDTH * np.sqrt(0.5)
-    axis = np.random.default_rng(3).normal(size=3)
-    turn = pin.exp3(np.radians(5.0) * axis / np.linalg.norm(axis))
-    q0 = fflin.configuration(robot, base=pin.SE3(turn, np.zeros(3)))
-    motion = fflin.simulate(
-        robot,
-        fflin.StateFeedback(lin, gain.K),
-        q0=q0,
-        duration=4.0 / gain.margin,
-        linear=False,
-        every=20,
-    )
-    assert not motion.stopped
-    assert motion.attitude_error[-1] < 0.05 * motion.attitude_error[0]
-    last = np.abs(motion.x[-1] - motion.target)
-    assert last[6 : 6 + robot.n].max() < 0.02
+    for seed in (3, 4, 5):
+        axis = np.random.default_rng(seed).normal(size=3)
+        turn = pin.exp3(np.radians(5.0) * axis / np.linalg.norm(axis))
+        q0 = fflin.configuration(robot, base=pin.SE3(turn, np.zeros(3)))
+        motion = fflin.simulate(
+            robot,
+            fflin.StateFeedback(lin, gain.K),
+            q0=q0,
+            duration=4.0 / gain.margin,
+            linear=False,
+            every=20,
+        )
+        assert not motion.stopped
+        assert motion.attitude_error[-1] < 0.05 * motion.attitude_error[0]
+        last = np.abs(motion.x[-1] - motion.target)
+        assert last[6 : 6 + robot.n].max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "effort"),
+    [("canadarm2", "q_m.joint_7", "joint_2"), ("servicer_7dof", "q_m.joint_2", "joint_2")],
+)
+def test_a_robot_that_cannot_hold_its_weight_names_what_grows(name, mode, effort):
+    robot = fflin.load(name, gravity=(0.0, 0.0, -9.81))
+    lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
+    growth = np.linalg.eigvals(lin.A).real.max()
+    with pytest.warns(fflin.FflinWarning, match="do not hold"):
+        gain = fflin.lqr(lin)
+    assert says(gain.weights, f"what grows by {growth:.3g} 1/s", mode, f"the effort of {effort}")
+    assert says(gain.weights, "not enough", "the point alone asks")
 
 
 def test_largest_values_of_all_are_brysons_rule_and_of_some_are_on_its_scale(loops):

@@ -203,10 +203,71 @@ def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monke
     assert found and float(found[1]) > 3.0
     assert max(fine) / 0.13 - 1.0 == pytest.approx(0.01 * float(found[1]), rel=0.02)
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.01)
-    monkeypatch.setattr("fflin.control.plan._MOST_TIGHTER", 1)
-    with pytest.warns(fflin.FflinWarning, match="qdot_m.joint_1"):
+    monkeypatch.setattr("fflin.control.plan._MOST_PLANS", 1)
+    with pytest.warns(fflin.FflinWarning, match=r"qdot_m\.joint_1 by \S+ % at t = \S+ s"):
         left = fflin.plan(robot, (goal, None), 10.0, **options)
     assert str(left) == str(motion)
+
+
+def largest_speeds(motion, parts=64):
+    """Return the largest speeds of the joints (n,) of the motion integrated between knots."""
+    largest = np.abs(motion.v[:, 6:]).max(axis=0)
+    for k in range(len(motion.t) - 1):
+        q, v = motion.q[k], motion.v[k]
+        for part in range(parts):
+            q, v = motion.flow.end(k, 1, q, v, (part / parts, (part + 1) / parts))
+            largest = np.maximum(largest, np.abs(v[6:]))
+    return largest
+
+
+@pytest.mark.parametrize("knots", [4, 5])
+def test_knots_are_added_where_tighter_limits_do_not_help(one_joint, knots):
+    robot, goal = one_joint
+    options = {"knots": knots, "hold": "linear", "limits": SPEEDS}
+    motion = fflin.plan(robot, (goal, None), 10.0, **options)
+    h = np.diff(motion.t)
+    assert len(h) > knots - 1
+    assert motion.t[[0, -1]].tolist() == [0.0, 10.0]
+    # Each interval is one of those that were asked for, halved some times.
+    halvings = np.log2(10.0 / (knots - 1) / h)
+    assert halvings == pytest.approx(np.round(halvings), abs=1e-9)
+    assert largest_speeds(motion).max() <= 1.01 * SPEEDS["qdot_m"]
+    assert missed(robot, motion, goal) < 1e-6 and motion.residual.max() < 1e-6
+
+
+@pytest.mark.exhaustive
+def test_light_joints_of_a_servicer_keep_their_speeds_between_far_knots():
+    """In 4 s between knots a constant torque takes joint_1 to twelve times its speed limit."""
+    locked = ["panel_*", "joint_3", "joint_5", "joint_6", "joint_7"]
+    robot = fflin.load("servicer_7dof", lock=locked, limits={"tau_b": 60.0, "F_b": 40.0})
+    goal = turned(robot, 1.2, joints={"joint_2": 0.6, "joint_4": -1.1})
+    motion = fflin.plan(robot, (goal, None), 60.0, knots=16)
+    assert (largest_speeds(motion) <= 1.01 * robot.model.velocityLimit[6:]).all()
+    assert missed(robot, motion, goal) < 1e-6 and motion.residual.max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("end", "words"),
+    [
+        ({"q_m.joint_1": 1.2}, ("goal", "q_m.joint_1", "1.2 rad", "1 rad")),
+        ({"qdot_m.joint_1": -0.3}, ("goal", "qdot_m.joint_1", "-0.3 rad/s", "-0.2 rad/s")),
+    ],
+)
+def test_a_start_or_goal_outside_a_limit_is_refused_before_planning(
+    one_joint, monkeypatch, end, words
+):
+    robot, _ = one_joint
+    state = fflin.StateMap(robot)
+    x = np.zeros(state.nx)
+    for name, value in end.items():
+        x[state.names.index(name)] = value
+    monkeypatch.setattr("fflin.control.plan._kept_between", None)  # the work
+    limits = {"q_m": 1.0, "qdot_m": 0.2}
+    with pytest.raises(fflin.InputError, match="limit") as told:
+        fflin.plan(robot, x, 10.0, limits=limits)
+    assert all(word in str(told.value) for word in words) and "\n" not in str(told.value)
+    with pytest.raises(fflin.InputError, match="start"):
+        fflin.plan(robot, (None, None), 10.0, x0=x, limits=limits)
 
 
 @pytest.mark.exhaustive
