@@ -19,8 +19,8 @@ def enter(app: Sphinx, page: str, source: list[str]) -> None:
 
 
 def _directive(found: re.Match[str]) -> str:
-    terms = (f"single: ! {' '.join(term.split())}" for term in found[1].split(","))
-    return "\n".join(["```{index}", *terms, "```"])
+    terms = ", ".join(f"! {' '.join(term.split())}" for term in found[1].split(","))
+    return f"```{{index}} {terms}\n```"
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

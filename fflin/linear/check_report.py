@@ -41,11 +41,12 @@ def check_report(every: tuple[Row, ...], title: str) -> str:
         if any(rows[key.format(state)].error for key in columns)
     ]
     if not body:
-        parts.append(f"A and B have no error in any of {2 * len(states) * len(columns)} blocks")
+        said = f"A and B compared with {' and '.join(_ROUTES)}: no difference in any of "
+        parts.append(folded([f"{said}{len(states) * len(columns)} blocks"]))
     else:
         heads = [["", "", *columns.values()], *body]
-        said = f"relative errors of the blocks of A and B compared with {', '.join(allowed)}"
-        said += "; a dot is no error"
+        said = f"relative errors of the blocks of A and B compared with {', '.join(allowed)}; "
+        said += "a dot is an error of exactly zero"
         parts.append(f"{folded([said])}\n\n{_fitted(heads, 2 + len(states))}")
     single = [row for row in every if row.test not in _ROUTES]
     rest = [["figure", "error", "allowed"]]
