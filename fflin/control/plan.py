@@ -190,7 +190,7 @@ def plan(
         made = _kept_between(shooting, start, end, sought, bounds, size, asked)
     missed, passed = made.missed, made.beyond[:, ::_PARTS].max(axis=(0, 1))
     if max(missed.max(), passed.max()) <= _REACHED:
-        t, q, v, u = made.shooting.t, made.q, made.v, made.u
+        q, v, u = made.q, made.v, made.u
         if asked.all():
             q[-1], v[-1] = end  # at rest, rounding would be all that a check sees
         note = _note(made, size)
@@ -198,7 +198,7 @@ def plan(
             warnings.warn(
                 f"{note}; give more knots or a longer duration", FflinWarning, stacklevel=2
             )
-        return Trajectory(robot, t, q, v, u, hold=hold, _note=note)
+        return Trajectory(robot, made.shooting.t, q, v, u, hold=hold, _note=note)
     units = ["rad"] * 3 + [*state.units[3:]]
     by = [
         f"{words} {state.names[i]} by {far[i]:.2g} {units[i]}"

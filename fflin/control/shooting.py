@@ -2,6 +2,7 @@
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
@@ -31,7 +32,7 @@ class Shooting:
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
-    def halved(self, intervals: Array) -> "Shooting":
+    def halved(self, intervals: NDArray[np.intp]) -> "Shooting":
         """Return it with a knot in the middle of some intervals."""
         middle = self.t[intervals] + 0.5 * self.h[intervals]
         return Shooting(self.state.robot, np.insert(self.t, intervals + 1, middle), self.held)
@@ -84,7 +85,8 @@ class Shooting:
         """Return Jacobians of the intervals' ends over z, the input there and the next one."""
         # By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
         flow, (nx, nu), steps = self._flow(q, v, u), (len(self._size), u.shape[1]), self.steps // 4
-        h, Z = self.h[:, None, None] / steps, np.tile(np.eye(nx, nx + 2 * nu), (len(q) - 1, 1, 1))
+        h: Array = self.h[:, None, None] / steps
+        Z = np.tile(np.eye(nx, nx + 2 * nu), (len(q) - 1, 1, 1))
         at = list(zip(q, v, strict=True))[:-1]
 
         def rates(half: int) -> tuple[Array, Array]:
