@@ -294,7 +294,7 @@ def _growth(lin: LinearModel) -> _Limit:
     growth = rates_of(poles, lin.dt).real
     fastest, k = float(growth.max()), int(growth.argmax())
     moving = listed(_moving_most(lin, modes[:, [k]]))
-    return _Limit(fastest, f"what grows by {fastest:.3g} 1/s ({moving})")
+    return _Limit(fastest, f"the unstable mode of {moving}, {fastest:.3g} 1/s")
 
 
 class _Loop(NamedTuple):
@@ -356,7 +356,7 @@ def _slowed(
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "to return from the displacements of the default weights"
     warn_beyond(lin.robot, where, lin.input_names, lin.input_units, asked[None], -high, high)
-    held = limit.what == least.what  # a slower loop holds less of what grows
+    held = limit.what == least.what  # a slower loop loses an unstable mode
     what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
     limit = limit._replace(what=what)
     return limit, _achieved(lin, loop, limit.bandwidth)

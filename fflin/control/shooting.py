@@ -103,7 +103,8 @@ class Shooting:
 
         last = rates(0)
         for step in range(steps):
-            F, total, rate = (last, rates(2 * step + 1), rates(2 * step + 2)), 0.0, 0.0 * Z
+            F = last, rates(2 * step + 1), rates(2 * step + 2)
+            total, rate = np.zeros_like(Z), np.zeros_like(Z)
             last = F[2]
             for i, share, weight in ((0, 0.0, 1.0), (1, 0.5, 2.0), (1, 0.5, 2.0), (2, 1.0, 1.0)):
                 rate = F[i][0] @ (Z + share * h * rate) + F[i][1]

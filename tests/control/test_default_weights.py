@@ -489,10 +489,10 @@ def test_a_robot_that_cannot_hold_its_weight_names_what_grows(name, mode, effort
     robot = fflin.load(name, gravity=(0.0, 0.0, -9.81))
     lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
     growth = np.linalg.eigvals(lin.A).real.max()
-    with pytest.warns(fflin.FflinWarning, match="do not hold"):
+    with pytest.warns(fflin.FflinWarning, match="too small"):
         gain = fflin.lqr(lin)
-    assert says(gain.weights, f"what grows by {growth:.3g} 1/s", mode, f"the effort of {effort}")
-    assert says(gain.weights, "not enough", "the point alone asks")
+    assert says(gain.weights, f"unstable mode of {mode}, {growth:.3g} 1/s", f"effort of {effort}")
+    assert says(gain.weights, "too small", "at or beyond the URDF limit")
 
 
 def test_largest_values_of_all_are_brysons_rule_and_of_some_are_on_its_scale(loops):
