@@ -136,7 +136,7 @@ def monte_carlo(
     overwrite : bool
         Whether to replace a file `out` of another call or of something else; refused by default.
     engine : {"python", "compiled"}, optional
-        As of `simulate`.
+        By default the compiled one where it can run them, see `simulate`.
     **options
         Of `simulate`: x0, q0, v0, dt, method, project, sample, delay, limits, disturbance, target,
         frame, reference.
@@ -186,7 +186,7 @@ def monte_carlo(
     check_room(runs, 8 * runs * sum(map(math.prod, shapes.values())), path, "runs")
     if executor or workers:
         _require_sendable(job)
-    job.choose(engine, runs)
+    job.choose(engine)
     header = _header(job) | {"seed": seed, "asked": runs, "confidence": confidence}
     header["goals"] = _goals(goals, until, shapes, header)
     with placed(dispersions):

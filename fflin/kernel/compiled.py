@@ -21,8 +21,6 @@ from fflin.base.errors import unknown
 # not. To load it takes half a second, which a sweep of that size does not win back but the next
 # ones do: sweeps are seldom alone.
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
-# Fewest steps of the loop for which its kernel is: loaded and kept on disk, kept, and neither.
-_BREAK_EVEN_LOOP, _BREAK_EVEN_LOOP_UNLOADED, _BREAK_EVEN_COMPILING = 100, 4000, 20_000
 # Fewest points, one by one, for which their kernel is, of these three.
 POINT_BREAK_EVENS = 1, 20_000, 200_000
 
@@ -68,15 +66,6 @@ def pays(count: int) -> bool:
 def numba_is_there() -> bool:
     """Whether the kernel can be compiled."""
     return find_spec("numba") is not None
-
-
-def loop_pays(steps: int, name: str = "advance") -> bool:
-    """Whether a compiled loop is there and beats the one in Python over so many steps."""
-    if steps < _BREAK_EVEN_LOOP or not numba_is_there():
-        return False
-    if not _kept_somewhere("loop", name):
-        return steps >= _BREAK_EVEN_COMPILING
-    return steps >= _BREAK_EVEN_LOOP_UNLOADED or "numba" in sys.modules
 
 
 def checked_engine(engine: Any) -> str | None:
@@ -147,14 +136,15 @@ def _between_processes(path: Path) -> Iterator[None]:
         lock.release()
 
 
-def _kept_somewhere(module: str, name: str) -> bool:
+def is_kept(module: str, name: str) -> bool:
+    """Whether the machine code of a function is on disk, for the sources as they are."""
     chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
     return any(_kept(folder, module, name) for folder in folders)
 
 
 def _point_is_kept() -> bool:
-    if not _FOUND and _kept_somewhere("linearise", "linearise_one"):
+    if not _FOUND and is_kept("linearise", "linearise_one"):
         _FOUND.add("linearise_one")
     return bool(_FOUND)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,10 @@ from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.dynamics.state import StateMap
 from fflin.kernel import channel, course, forward, laws, loop, sharing, tracking
-from fflin.kernel.accelerations import layout_of, loads_of
-from fflin.kernel.tree import Tree, batch_tree
+from fflin.kernel.accelerations import layout_of, loads_of, work_space
+from fflin.kernel.arguments import empty, laid_out, words_of
+from fflin.kernel.compiled import kernel
+from fflin.kernel.tree import LANES, Tree, batch_tree
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.limits import limits_of
 from fflin.simulation.conservation import Conserved, Course
@@ -27,10 +30,11 @@ from fflin.simulation.plant import Plant, triads
 from fflin.simulation.times import LARGEST_TURN, Times
 
 SLOTS = 128  # samples whose noise is there at a time, and steps of a campaign
+_MEMORY = 2**22  # [bytes] of rows that are there at a time
 
 
-def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[Any, ...]:
-    """Return what `kernel.loop.advance` takes of a plan whose policy and method it knows."""
+def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.Arguments:
+    """Return what `kernel.loop.advance` reads of a plan whose policy and method it knows."""
     h, state, u = plan.times.dt, plant.state, plan.initial
     size, (way, speed) = 6 + state.robot.n, plan.method.shares(h)
     nodes, weights, moments = (
@@ -48,8 +52,8 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[
     squares = np.full(state.robot.nv, LARGEST_SPEED**2)
     squares[plan.turning] = (LARGEST_TURN / h) ** 2
     sign = np.sign(plan.chart.scalar(plan.q)) if plan.chart else 0.0
-    q, second, mechanics = plan.q.copy(), plan.q.copy(), _mechanics(plant, tree)
-    return (
+    q, second, mechanics = plan.q.copy(), plan.q.copy(), mechanics_of(plant, tree)
+    return loop.Arguments(
         mechanics,
         loop.Method(
             *(h, origins, way.ravel(), speed.ravel(), nodes, weights, h * moments),
@@ -57,7 +61,9 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[
         ),
         _law(plan, plant, mechanics),
         _channel(plan, plant),
-        (kept, plan.project, not plant.isolated(driven=plan.law is not None)),
+        kept,
+        plan.project,
+        not plant.isolated(driven=plan.law is not None),
         loop.Watch(state.velocities(squares), np.array([float(sign)])),
         forward.Point(plan.q.copy(), state.velocities(plan.v), u.copy(), u.copy(), np.zeros(6)),
         loop.Stages(
@@ -67,7 +73,47 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[
     )
 
 
-def _mechanics(plant: Plant, tree: Tree) -> forward.Mechanics:
+class CompiledLoop:
+    """The compiled loop of eight runs, with arrays of its own: not to be shared by threads.
+
+    `parts` are its arguments, in lanes, and `fresh` the arrays in lanes, each with a column of its
+    values as they were. `columns` are those of a row: q, nu, u, momentum and centre of mass.
+    """
+
+    def __init__(self, parts: loop.Arguments) -> None:
+        self.fresh: list[tuple[Array, Array]] = []
+        self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self.fresh.append(pair))
+        self._words = words_of(self.parts, loop.ARGUMENTS)
+        self._work = work_space(self.parts.robot.layout.size)
+        self._advance = kernel("loop", "advance", "the loop of eight runs at a time")
+        point = self.parts.point
+        ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3]).tolist()
+        self.width = ends[-1]
+        self.columns = [slice(first, end) for first, end in pairwise([0, *ends])]
+
+    def rows(self, most: int) -> Array:
+        """Return room for so many rows or for fewer, that do not fill the memory."""
+        return work_space(max(1, min(most, _MEMORY // (8 * LANES * self.width))) * self.width)
+
+    def advance(self, clock: Any, last: int, every: int, rows: Array) -> None:
+        """Go on up to a step, see `kernel.loop.advance`."""
+        self._advance(self._words, clock, last, every, rows, self._work)
+
+    def split(self, rows: Array) -> list[Array]:
+        """Return what rows hold, each (rows, LANES, size)."""
+        by_row = rows.reshape(-1, self.width, LANES).transpose(0, 2, 1)
+        return [by_row[..., part] for part in self.columns]
+
+
+def kept_at(parts: loop.Arguments, t: float) -> list[Array]:
+    """Return the momentum (6,) and the centre of mass (3,) that the first run is to have."""
+    start, sums = parts.course.start[:, 0], parts.course.sums[:, 0]
+    momentum, center = np.split(start[:9] + sums[:9], [6])
+    return [momentum, center + t * parts.course.per_mass[0, 0] * start[:3]]
+
+
+def mechanics_of(plant: Plant, tree: Tree) -> forward.Mechanics:
+    """Return a robot as the kernel reads it."""
     robot, actuation = plant.robot, plant.actuation
     fixed, springs = actuation.fixed, robot.springs
     loads = loads_of(robot, actuation, tree)
@@ -90,23 +136,14 @@ def _mechanics(plant: Plant, tree: Tree) -> forward.Mechanics:
 
 def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
     state, policy, asking = plant.state, plan.policy, plant
-    none, nowhere = np.zeros(0), _places([])
     shared = isinstance(policy, Allocation)
     if shared:
         asking = Plant(StateMap(policy.design, reference=state.reference, frame=state.frame))
         policy = policy.policy
-    law = laws.Law(
-        laws.NOTHING,
-        np.array(state.axes),
-        pin.SE3ToXYZQUAT(state.origin),
-        np.zeros(state.robot.n),
-        laws.Grid(nowhere, _places([0]), none, nowhere, none, none, none),
-        laws.Filter(*(none,) * 9),
-        *(nowhere, laws.Gyros(nowhere, none), np.zeros(state.nx), none, none),
-        np.zeros(len(asking.actuation.names)),
-        _path(plan, policy, asking),
-        _sharing(plant, asking, mechanics) if shared else None,
-    )
+    law = no_law(state, np.zeros(len(asking.actuation.names)))
+    law = law._replace(path=_path(law.path, plan, policy, asking))
+    if shared:
+        law = law._replace(sharing=_sharing(plant, asking, mechanics))
     if isinstance(policy, StateFeedback):
         K, offset, near = policy.terms(state)
         direct = law.filter._replace(D=-K.ravel(), u0=offset, y0=np.zeros(state.nx))
@@ -121,6 +158,22 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
         law = law._replace(kind=laws.LINEAR, measured=np.arange(state.nx))
     size, slots = len(law.measured), SLOTS if noise_of(plan) else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
+
+
+def no_law(state: StateMap, u: Array) -> laws.Law:
+    """Return the law that asks for nothing, and reads states and errors."""
+    law = empty(laws.LAW)
+    q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
+    point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
+    return law._replace(
+        kind=laws.NOTHING,
+        turned=np.array(state.axes),
+        origin=pin.SE3ToXYZQUAT(state.origin),
+        near=np.zeros(state.robot.n),
+        x=np.zeros(state.nx),
+        u=u,
+        path=law.path._replace(along=np.zeros(len(nu)), e=np.zeros(state.nx), point=point),
+    )
 
 
 def noise_of(plan: Plan) -> Any:
@@ -189,7 +242,7 @@ def _sharing(plant: Plant, asking: Plant, giving: forward.Mechanics) -> sharing.
     """Return how what the inputs of one ask for is shared out to those of the other."""
     none, names, tree = np.zeros(0), plant.actuation.names, batch_tree(asking.robot)
     assert tree is not None
-    k, size, asks = len(names), plant.state.nx // 2, _mechanics(asking, tree)
+    k, size, asks = len(names), plant.state.nx // 2, mechanics_of(asking, tree)
     limits = [limits_of(plant.robot).get(key, (-np.inf, np.inf)) for key in names]
     least, most = (np.array(each) for each in zip(*limits, strict=True))
     asked = np.zeros(len(asking.actuation.names))
@@ -200,14 +253,8 @@ def _sharing(plant: Plant, asking: Plant, giving: forward.Mechanics) -> sharing.
     return sharing.Sharing._make((asks, giving, point, least, most, work, *free))
 
 
-def _path(plan: Plan, policy: Any, asking: Plant) -> tracking.Path:
-    state, none, nowhere = asking.state, np.zeros(0), _places([])
-    size, count = state.nx // 2, len(asking.actuation.names)
-    point = forward.Point(plan.q.copy(), np.zeros(size), np.zeros(count), none, none)
-    path = tracking.Path(
-        *(none, none, none, none, none, False, 0.0, False, nowhere, 0.0, 0.0, none, none, 1),
-        *(np.zeros(size), np.zeros(state.nx), point),
-    )
+def _path(path: tracking.Path, plan: Plan, policy: Any, asking: Plant) -> tracking.Path:
+    state, count = asking.state, len(asking.actuation.names)
     if type(policy) is not TrajectoryFeedback:
         return path
     motion, schedule = policy.trajectory, policy.schedule

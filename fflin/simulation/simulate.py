@@ -133,9 +133,9 @@ def simulate(
     progress : bool, optional
         Whether a bar is shown on stderr; by default on a terminal, for runs that take long.
     engine : {"python", "compiled"}, optional
-        What runs the loop; by default the compiled one where it can and is the quicker. It needs
-        numba, no orbit, and no policy, event, callback or disturbance in Python. Both give the
-        same to rounding.
+        What runs the loop; by default Python, and the compiled one for a run of more than 20,000
+        steps if its machine code is there already. It needs numba, no orbit, and no policy, event,
+        callback or disturbance in Python. Both give the same to rounding.
 
     Returns
     -------
