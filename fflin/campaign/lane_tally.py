@@ -16,7 +16,7 @@ from fflin.kernel.accelerations import work_space
 from fflin.kernel.arguments import LANED, empty, laid_out, words_of
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tally import MARKS, Marks
-from fflin.kernel.tree import LANES, Tree
+from fflin.kernel.tree import LANES, batch_tree
 from fflin.simulation.packing import mechanics_of, no_law
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
@@ -29,9 +29,10 @@ class LaneTally(Tally):
     """A `Tally` of eight; `way` has the q and nu of the rows of `home`, where it has rows."""
 
     def __init__(
-        self, plan: Plan, plant: Plant, home: Array, steps: Array, way: list[Array], tree: Tree
+        self, plan: Plan, plant: Plant, home: Array, steps: Array, way: list[Array]
     ) -> None:
-        state = plant.state
+        state, tree = plant.state, batch_tree(plant.robot)
+        assert tree is not None
         super().__init__(plan, state, home, LANES, steps)
         kind = np.zeros(state.nx, dtype=np.intp)
         for number, part in enumerate(self._parts, 1):

@@ -104,9 +104,7 @@ class CampaignJob:
         if count == LANES:
             from fflin.campaign.lane_tally import LaneTally
 
-            tree = batch_tree(self.plant.robot)
-            assert tree is not None
-            return LaneTally(self.plan, self.plant, self.home, self.steps, self._way, tree)
+            return LaneTally(self.plan, self.plant, self.home, self.steps, self._way)
         return Tally(self.plan, self.plant.state, self.home, count, self.steps)
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:

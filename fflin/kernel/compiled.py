@@ -33,6 +33,9 @@ _QUOTAS = (
 
 ENGINES = ("python", "compiled")
 
+# In the names of numba's files.
+VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
+
 # Wait for another process's compilation for so long [s] before saying so, and at most.
 _SILENCE, _LONGEST_WAIT = 2.0, 600.0
 
@@ -94,7 +97,7 @@ def _prepared(module: str, name: str, what: str) -> Any:
     compiled = getattr(import_module(f"fflin.kernel.{module}"), name)
     folder = Path(compiled.stats.cache_path)
     with _between_processes(folder / f"{module}.{name}.lock"):
-        older = set(folder.glob(f"{module}.{name}-*.nbi")) - set(_kept(folder, module, name))
+        older = set(_entries(folder, module, name)) - set(_kept(folder, module, name))
         for entry in older:
             entry.unlink(missing_ok=True)
     compiled.compile = partial(_compile_alone, compiled.compile, folder, module, name, what)
@@ -153,8 +156,13 @@ def _kept(folder: Path, module: str, name: str) -> list[Path]:
     """Return what is kept of a function and not older than any source."""
     # numba compares with the function's own file, not with those of the functions that it calls.
     source = max(file.stat().st_mtime for file in _sources())
-    entries = folder.glob(f"{module}.{name}-*.nbi")
+    entries = _entries(folder, module, name)
     return [entry for entry in entries if entry.stat().st_mtime >= source]
+
+
+def _entries(folder: Path, module: str, name: str) -> list[Path]:
+    """Return what there is of a function for this version of Python."""
+    return list(folder.glob(f"{module}.{name}-*.{VERSION}*.nbi"))
 
 
 def _sources() -> list[Path]:

@@ -7,21 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError
 from fflin.base.progress import Progress
 from fflin.control.linear_controller import LinearController, measured_at
 from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback
-from fflin.kernel.compiled import is_kept, numba_is_there
+from fflin.kernel.compiled import checked_engine, is_kept, numba_is_there
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.frames import ROOT
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import Recording, ending_of, go
-
-ENGINES = ("python", "compiled")
 
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
@@ -36,9 +34,7 @@ def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> s
     Many runs go by the compiled loop where it can run them; one does if it is long and the machine
     code is there already.
     """
-    if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
-        raise unknown("engine", str(engine), list(ENGINES))
-    if engine == "python":
+    if checked_engine(engine) == "python":
         return "python"
     reason = _reason(plan, plant)
     if engine == "compiled":

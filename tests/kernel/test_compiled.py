@@ -50,7 +50,7 @@ def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_pat
     assert all(each.result() is compiled for each in found)
     assert not caplog.records
     compiled.compile("double")
-    (tmp_path / "factor.invert-1.nbi").write_bytes(b"")
+    (tmp_path / f"factor.invert-1.{kernel_code.VERSION}.nbi").write_bytes(b"")
     compiled.compile("long")
     assert signatures == ["double", "long"]
     assert [record.message for record in caplog.records] == [
@@ -61,7 +61,7 @@ def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_pat
 @pytest.mark.compiled
 @pytest.mark.parametrize("older", [False, True])
 def test_code_that_is_older_than_any_source_is_not_taken(compiled, caplog, tmp_path, older):
-    kept = tmp_path / "factor.invert-1.nbi"
+    kept = tmp_path / f"factor.invert-1.{kernel_code.VERSION}.nbi"
     kept.write_bytes(b"")
     newest = max(file.stat().st_mtime for file in kernel_code._sources())
     os.utime(kept, (newest, newest + (-1.0 if older else 1.0)))
@@ -74,9 +74,11 @@ def test_machine_code_is_found_where_numba_keeps_it(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     assert not kernel_code.is_kept("loop", "advance")
     (tmp_path / "kernel_0").mkdir()
-    (tmp_path / "kernel_0" / "loop.advance-1.nbi").write_bytes(b"")
+    (tmp_path / "kernel_0" / f"loop.advance-1.{kernel_code.VERSION}.nbi").write_bytes(b"")
     assert kernel_code.is_kept("loop", "advance")
     assert not kernel_code.is_kept("loop", "another")
+    monkeypatch.setattr(kernel_code, "VERSION", "py39")
+    assert not kernel_code.is_kept("loop", "advance")
 
 
 WAITER = """

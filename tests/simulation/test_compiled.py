@@ -9,6 +9,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.kernel.compiled import ENGINES
 from fflin.kernel.tree import batch_tree
 from fflin.simulation import compiled, packing, run
 from fflin.simulation.conservation import Conserved
@@ -36,9 +37,9 @@ def both(robot, policy=None, tolerance=1e-10, rounding=2e-14, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fflin.FflinWarning)
         python, motion = (
-            fflin.simulate(robot, policy, **options, engine=engine) for engine in compiled.ENGINES
+            fflin.simulate(robot, policy, **options, engine=engine) for engine in ENGINES
         )
-    assert (python.engine, motion.engine) == compiled.ENGINES
+    assert (python.engine, motion.engine) == ENGINES
     assert motion.stopped == python.stopped
     for name in ("t", "q", "v", "x", "u", "energy", "momentum"):
         expected, found = getattr(python, name), getattr(motion, name)
@@ -355,7 +356,7 @@ def test_a_command_that_is_no_number_is_told(robots):
     x0 = displaced(lin, offset=100.0)
     options = {"x0": x0, "sample": 0.01, "duration": 0.1, "linear": False}
     said = []
-    for engine in compiled.ENGINES:
+    for engine in ENGINES:
         with np.errstate(over="ignore"), pytest.raises(fflin.InputError) as caught:
             fflin.simulate(robot, policy, **options, engine=engine)
         said.append(str(caught.value))
