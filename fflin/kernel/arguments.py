@@ -140,7 +140,7 @@ def laid_out(value: Any, kind: Any, fresh: Callable[[Array, Array], None] | None
             fresh(lanes, column)
         return lanes
     if isinstance(kind, numba.types.Array):
-        return np.require(value, _DTYPES[kind.dtype], ("C", "W")) if len(value) else value
+        return np.require(value, _DTYPES[kind.dtype], ("C", "W"))
     return {REAL: float, FLAG: bool}.get(kind, int)(value)
 
 

@@ -35,40 +35,52 @@ _MEMORY = 2**22  # [bytes] of rows that are there at a time
 
 def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.Arguments:
     """Return what `kernel.loop.advance` reads of a plan whose policy and method it knows."""
-    h, state, u = plan.times.dt, plant.state, plan.initial
-    size, (way, speed) = 6 + state.robot.n, plan.method.shares(h)
-    nodes, weights, moments = (
-        np.array(each) * h for each in (plan.method.nodes, plan.method.weights, plan.method.moments)
-    )
-    nodes = np.minimum(nodes, plan.last_node * h)
-    origins = np.array(plan.method.origins)
-    start = Course(conserved, plan.method, h, plan.q, plan.v)
-    kept = course.Course(
-        np.concatenate((start.momentum, start.center(0.0), plan.q[:3])),
-        conserved.mass * np.array(state.robot.gravity),
-        np.array([1.0 / conserved.mass]),
-        np.zeros(course.SUMS),
-    )
+    h, state, method = plan.times.dt, plant.state, plan.method
+    size, (way, speed) = 6 + state.robot.n, method.shares(h)
+    start = Course(conserved, method, h, plan.q, plan.v)
     squares = np.full(state.robot.nv, LARGEST_SPEED**2)
     squares[plan.turning] = (LARGEST_TURN / h) ** 2
-    sign = np.sign(plan.chart.scalar(plan.q)) if plan.chart else 0.0
-    q, second, mechanics = plan.q.copy(), plan.q.copy(), mechanics_of(plant, tree)
+    mechanics = mechanics_of(plant, tree)
     return loop.Arguments(
-        mechanics,
-        loop.Method(
-            *(h, origins, way.ravel(), speed.ravel(), nodes, weights, h * moments),
-            plan.method.tangent,
+        robot=mechanics,
+        method=loop.Method(
+            h=h,
+            origin=method.origins,
+            way=way.ravel(),
+            speed=speed.ravel(),
+            nodes=np.minimum(np.array(method.nodes) * h, plan.last_node * h),
+            weights=np.array(method.weights) * h,
+            moments=h * (np.array(method.moments) * h),
+            tangent=method.tangent,
         ),
-        _law(plan, plant, mechanics),
-        _channel(plan, plant),
-        kept,
-        plan.project,
-        not plant.isolated(driven=plan.law is not None),
-        loop.Watch(state.velocities(squares), np.array([float(sign)])),
-        forward.Point(plan.q.copy(), state.velocities(plan.v), u.copy(), u.copy(), np.zeros(6)),
-        loop.Stages(
-            *(np.zeros(speed.shape[1] * size), np.zeros(size), np.zeros(size)),
-            *(q, second, u.copy()),
+        law=_law(plan, plant, mechanics),
+        channel=_channel(plan, plant),
+        course=course.Course(
+            start=np.concatenate((start.momentum, start.center(0.0), plan.q[:3])),
+            weight=conserved.mass * np.array(state.robot.gravity),
+            per_mass=[1.0 / conserved.mass],
+            sums=np.zeros(course.SUMS),
+        ),
+        project=plan.project,
+        pushed=not plant.isolated(driven=plan.law is not None),
+        watch=loop.Watch(
+            squares=state.velocities(squares),
+            sign=np.array([np.sign(plan.chart.scalar(plan.q)) if plan.chart else 0.0]),
+        ),
+        point=forward.Point(
+            q=plan.q,
+            nu=state.velocities(plan.v),
+            u=plan.initial,
+            pushing=plan.initial,
+            wrench=np.zeros(6),
+        ),
+        stages=loop.Stages(
+            rates=np.zeros(speed.shape[1] * size),
+            along=np.zeros(size),
+            total=np.zeros(size),
+            first=plan.q,
+            second=plan.q,
+            u=plan.initial,
         ),
     )
 
@@ -118,19 +130,19 @@ def mechanics_of(plant: Plant, tree: Tree) -> forward.Mechanics:
     fixed, springs = actuation.fixed, robot.springs
     loads = loads_of(robot, actuation, tree)
     return forward.Mechanics(
-        tree,
-        layout_of(tree, len(loads.input)),
-        loads,
-        np.array(robot.gravity),
-        _places([joint.idx_q for joint in robot.joints]),
-        np.array([joint.unbounded for joint in robot.joints], dtype=bool),
-        np.array((springs.stiffness != 0.0) | (springs.damping != 0.0), dtype=bool),
-        np.array(springs.rest),
-        _places(np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1)),
-        _places([held.columns.start for held in actuation.held]),
-        _places(triads(actuation)),
-        pin.SE3ToXYZQUAT(plant.state.origin),
-        forward.Drives(*plant.drives),
+        tree=tree,
+        layout=layout_of(tree, len(loads.input)),
+        loads=loads,
+        gravity=np.array(robot.gravity),
+        index=_places([joint.idx_q for joint in robot.joints]),
+        circling=np.array([joint.unbounded for joint in robot.joints], dtype=bool),
+        springy=np.array((springs.stiffness != 0.0) | (springs.damping != 0.0), dtype=bool),
+        rest=np.array(springs.rest),
+        row=_places(np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1)),
+        held=_places([held.columns.start for held in actuation.held]),
+        triads=_places(triads(actuation)),
+        origin=pin.SE3ToXYZQUAT(plant.state.origin),
+        drives=forward.Drives(*plant.drives),
     )
 
 
@@ -240,17 +252,30 @@ def _filtered(law: laws.Law, plan: Plan, policy: Any, asking: Plant, tree: Tree)
 
 def _sharing(plant: Plant, asking: Plant, giving: forward.Mechanics) -> sharing.Sharing:
     """Return how what the inputs of one ask for is shared out to those of the other."""
-    none, names, tree = np.zeros(0), plant.actuation.names, batch_tree(asking.robot)
+    names, tree = plant.actuation.names, batch_tree(asking.robot)
     assert tree is not None
     k, size, asks = len(names), plant.state.nx // 2, mechanics_of(asking, tree)
     limits = [limits_of(plant.robot).get(key, (-np.inf, np.inf)) for key in names]
     least, most = (np.array(each) for each in zip(*limits, strict=True))
-    asked = np.zeros(len(asking.actuation.names))
-    point = forward.Point(np.zeros(plant.robot.nq), none, none, asked, none)
-    work = np.zeros(max(asks.layout.size, giving.layout.size))
-    sizes = ((k + 1) * size, k * (size + k), k * k, size + k, size, *(k,) * 4)
-    free = (*(np.zeros(count) for count in sizes), np.zeros(k, dtype=np.intp))
-    return sharing.Sharing._make((asks, giving, point, least, most, work, *free))
+    given = empty(sharing.SHARING)
+    point = given.point._replace(
+        q=np.zeros(plant.robot.nq), pushing=np.zeros(len(asking.actuation.names))
+    )
+    return given._replace(
+        asking=asks,
+        giving=giving,
+        point=point,
+        least=least,
+        most=most,
+        work=np.zeros(max(asks.layout.size, giving.layout.size)),
+        columns=np.zeros((k + 1) * size),
+        Q=np.zeros(k * (size + k)),
+        R=np.zeros(k * k),
+        b=np.zeros(size + k),
+        wanted=np.zeros(size),
+        **{name: np.zeros(k) for name in ("x", "s", "low", "high")},
+        state=np.zeros(k, dtype=np.intp),
+    )
 
 
 def _path(path: tracking.Path, plan: Plan, policy: Any, asking: Plant) -> tracking.Path:
@@ -304,30 +329,40 @@ def _channel(plan: Plan, plant: Plant) -> channel.Channel:
     first = plant.state.groups.omega_b.start
     rows = [names.index(f"qdot_m.{name}") - first for name in w.names]
     wheels = channel.Wheels(
-        *(np.array(each, dtype=np.intp) for each in (w.at, rows)),
-        *(np.array(each, dtype=float) for each in (*w.torques, *w.limits, w.stiffness)),
+        at=w.at,
+        row=rows,
+        least_torque=w.torques[0],
+        most_torque=w.torques[1],
+        least_speed=w.limits[0],
+        most_speed=w.limits[1],
+        stiffness=w.stiffness,
     )
     fired = limits.pulses() if limits.pulses else Pulses([], limits.high, times.sample, times.dt)
-    figures, nothing = (fired.most, fired.least, fired.quantum), (np.zeros(len(fired.places)),) * 3
-    pulses = channel.Pulses._make(
-        (
-            *(np.array(fired.places, dtype=np.intp), np.array(fired.on_off, dtype=bool)),
-            *(np.array(each, dtype=float) for each in (*figures, *nothing)),
-            fired.time,
-        )
+    nothing = np.zeros(len(fired.places))
+    pulses = channel.Pulses(
+        at=fired.places,
+        on_off=fired.on_off,
+        most=fired.most,
+        least=fired.least,
+        quantum=fired.quantum,
+        left=nothing,
+        level=nothing,
+        end=nothing,
+        time=fired.time,
     )
     held: Array = np.minimum(np.maximum(plan.initial, limits.low), limits.high)
     # What would act after the end needs no place to wait in.
     waiting = min(times.delay, times.steps)
     slots = waiting // times.sample + 1 if times.sample else 1
     return channel.Channel(
-        np.array(limits.low),
-        np.array(limits.high),
-        held,
-        np.zeros(slots * len(held)),
-        slots,
-        times.sample,
-        *(np.array([float(times.delay)]), np.zeros(1)),
-        wheels,
-        pulses,
+        low=limits.low,
+        high=limits.high,
+        held=held,
+        pending=np.zeros(slots * len(held)),
+        slots=slots,
+        sample=times.sample,
+        delay=[float(times.delay)],
+        fresh=np.zeros(1),
+        wheels=wheels,
+        pulses=pulses,
     )
