@@ -232,7 +232,7 @@ def funnel(
     places = _places(motion, by, knots)
     job = FunnelJob(robot, feedback, aim, bounds, places, samples, seed, options)
     first = job.campaign(0)
-    first.choose(engine, max(1, len(places) * samples // 2))
+    first.choose(engine)
     job.engine = first.engine
     with OwnWorkers(workers) if workers else nullcontext(executor) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}

@@ -12,16 +12,13 @@ from fflin.base.rotation import product_matrix
 from fflin.base.validation import Array
 from fflin.campaign.sensing import normals
 from fflin.campaign.tally import STOPS, stop_of
-from fflin.kernel.accelerations import work_space
-from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.simulation.conservation import Conserved
-from fflin.simulation.packing import SLOTS, noise_of, noises, packed
+from fflin.simulation.packing import SLOTS, CompiledLoop, kept_at, noise_of, noises, packed
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import ending_of
 
-_MEMORY = 2**22  # [bytes] of rows that are there at a time
 _DIVERGED = float(STOPS.index("diverged"))
 
 # Takes the first step of some, and their rows (steps, LANES, ..) of q, nu, u, momentum and centre.
@@ -38,59 +35,24 @@ class Lanes:
             latest = int(runs["delay"].max())
             plan = replace(plan, times=plan.times._replace(delay=latest))
         parts = packed(plan, plant, Conserved(plant.robot, plan.q), tree)
-        self._plan, self._state = plan, plant.state
-        mechanics, method, law, channel, (kept, *flags), watch, point, stages = parts
-        self._fresh: list[tuple[Array, Array]] = []
-        mechanics = mechanics._replace(
-            tree=self._wide(mechanics.tree, "bodies", "fixed"),
-            loads=self._wide(mechanics.loads, "wrench", "stored", "stiffness", "damping"),
-            drives=self._wide(mechanics.drives, *mechanics.drives._fields),
-        )
+        law = parts.law
         if "seed" in runs and len(law.added) == len(law.y):
             law = law._replace(added=np.zeros(SLOTS * len(law.y)))
-        law = self._wide(law, "x", "y", "added", "u")._replace(
-            path=self._wide(law.path, "e"),
-            grid=self._wide(law.grid, "at"),
-            filter=self._wide(law.filter, "z", "rates"),
-        )
-        if law.sharing:
-            own = self._wide(law.sharing.point, "q", "pushing")
-            wide = self._wide(law.sharing, "work", "columns")._replace(point=own)
-            law = law._replace(sharing=wide)
-        pulses = self._wide(channel.pulses, "left", "level", "end")
-        channel = self._wide(channel, "held", "pending", "delay", "fresh")._replace(pulses=pulses)
-        kept, point, stages = (self._wide(x, *x._fields) for x in (kept, point, stages))
         # All starts are given with the base on the side of the chart where this is positive.
-        watch = watch._replace(sign=np.abs(watch.sign))
-        self._parts = mechanics, method, law, channel, (kept, *flags), watch, point, stages
-        self._work = work_space(mechanics.layout.size)
-        self._sizes = [len(each) for each in (point.q, point.nu, point.u)] + [6, 3]
-        ends = np.cumsum(self._sizes).tolist()
-        self._columns = [
-            slice(end - size, end) for end, size in zip(ends, self._sizes, strict=True)
-        ]
+        watch = parts.watch._replace(sign=np.abs(parts.watch.sign))
+        self._plan, self._state = plan, plant.state
+        self._loop = CompiledLoop(parts._replace(law=law, watch=watch))
+        robot, point = self._loop.parts.robot, self._loop.parts.point
         # Noise has room for so many samples alone.
-        most = SLOTS if len(law.added) > len(law.y) else plan.times.steps
-        self._most = max(1, min(most, _MEMORY // (8 * LANES * ends[-1])))
-        self._rows = work_space(self._most * ends[-1])
-        self._begin = kernel("loop", "begin", "the start of eight runs")
-        self._advance = kernel("loop", "advance_eight", "the loop of eight runs at a time")
+        self._rows = self._loop.rows(SLOTS if len(law.added) > len(law.y) else plan.times.steps)
+        self._most = len(self._rows) // self._loop.width
         self._of = {
-            **{"q": point.q, "nu": point.nu, "delay": channel.delay},
-            **{key: getattr(mechanics.tree, key) for key in ("bodies", "fixed")},
-            **{key: getattr(mechanics.loads, key) for key in mechanics.loads._fields},
-            **mechanics.drives._asdict(),
+            **{"q": point.q, "nu": point.nu, "delay": self._loop.parts.channel.delay},
+            **{key: getattr(robot.tree, key) for key in ("bodies", "fixed")},
+            **{key: getattr(robot.loads, key) for key in robot.loads._fields},
+            **robot.drives._asdict(),
         }
         self._turn = product_matrix(plant.state.origin_quaternion)[3]
-
-    def _wide(self, part: Any, *names: str) -> Any:
-        """Return a part with arrays in lanes, which are remembered as they were."""
-        wide = {}
-        for name in names:
-            array = getattr(part, name)
-            wide[name] = work_space(len(array))
-            self._fresh.append((wide[name], array[:, None].copy()))
-        return part._replace(**wide)
 
     # A motion that diverges overflows before it is stopped: that is no reason to warn.
     @np.errstate(over="ignore", invalid="ignore")
@@ -103,33 +65,32 @@ class Lanes:
     ) -> list[str]:
         """Do up to eight, whose rows differ from the plan, into `out`; say why each was stopped."""
         plan, steps, count = self._plan, self._plan.times.steps, len(runs["q"])
-        parts, rows, width = self._parts, self._rows, sum(self._sizes)
-        mechanics, *_, (kept, *_), watch, point, _ = parts
-        for array, fresh in self._fresh:
+        loop, rows, width = self._loop, self._rows, self._loop.width
+        robot, kept, point = loop.parts.robot, loop.parts.course, loop.parts.point
+        for array, fresh in loop.fresh:
             array[:] = fresh
         of_lane = slice(None) if count == LANES else np.minimum(np.arange(LANES), count - 1)
         for name, values in runs.items():
             if name in self._of:
                 self._of[name][:] = values[of_lane].T
         sense = self._sensors(runs, of_lane)
-        mass = mechanics.tree.bodies[::10].sum(axis=0)
-        kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * mechanics.gravity[:, None]
+        mass = robot.tree.bodies[::10].sum(axis=0)
+        kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * robot.gravity[:, None]
         kept.start[9:] = point.q[:3]
-        self._begin(mechanics, kept, point, self._work)
         span = min(self._most, tally.span)
         clock, going, told = np.zeros(1, dtype=np.intp), np.ones(count, dtype=bool), [""] * count
         while clock[0] < steps and going.any():
             first = int(clock[0])
             last = min(steps, (first // span + 1) * span)
             sense(first, last)
-            self._advance(*parts, clock, last, 1, rows, self._work)
+            loop.advance(clock, last, 1, rows)
             done = int(clock[0])
             taken = rows[: (done - first) * width]
-            seen = self._split(taken)
+            seen = loop.split(taken)
             tally.add(first, seen, taken)
             if watcher:
                 watcher(first, seen)
-            lost = ~(point.nu**2 < watch.squares[:, None]).all(axis=0)
+            lost = ~(point.nu**2 < loop.parts.watch.squares[:, None]).all(axis=0)
             if plan.chart:
                 lost |= self._turn @ point.q[3:7] < 0.0
             for lane in (lost[:count] & going).nonzero()[0]:
@@ -143,13 +104,15 @@ class Lanes:
             # What has ended would stop the others: it goes on as one of them.
             if going.any():
                 over = ~going[of_lane]
-                for array, _ in self._fresh:
+                for array, _ in loop.fresh:
                     array[:, over] = array[:, [going.argmax()]]
         return told
 
     def _end(self, tally: Any, ending: Any, last: bool, done: int, stop: Array, out: Any) -> None:
         """Write how some of the runs ended, which may be the last."""
-        *_, (kept, *_), _, point, stages = self._parts
+        kept, point, stages = (
+            getattr(self._loop.parts, name) for name in ("course", "point", "stages")
+        )
         rows = np.vstack((point.q, point.nu, stages.u, kept.sums[:9]))
         away, count = (stop == _DIVERGED)[: len(ending)], len(ending)
         # Of what diverged the end is no number.
@@ -157,14 +120,14 @@ class Lanes:
             if not some.any():
                 continue
             if whole:
-                tally = (tally if last else tally.copy()).add(done, self._split(rows), rows)
+                tally = (tally if last else tally.copy()).add(done, self._loop.split(rows), rows)
             where = slice(None) if some.all() else some
             for name, values in tally.outcome(done, stop)._asdict().items():
                 out[name][where] = values[:count][where]
 
     def _sensors(self, runs: Mapping[str, Array], of_lane: Any) -> Callable[[int, int], None]:
         """Return what writes the errors of all that is sensed from a step up to another."""
-        law, times, noise = self._parts[2], self._plan.times, noise_of(self._plan)
+        law, times, noise = self._loop.parts.law, self._plan.times, noise_of(self._plan)
         size = len(law.y)
         rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
         nothing = np.zeros((LANES, size))
@@ -189,19 +152,12 @@ class Lanes:
 
     def kept(self, t: float) -> tuple[Array, Array]:
         """Return the momentum (6,) and the centre of mass (3,) that the first is to have."""
-        kept = self._parts[4][0]
-        start, sums = kept.start[:, 0], kept.sums[:, 0]
-        momentum, center = np.split(start[:9] + sums[:9], [6])
-        return momentum, center + t * kept.per_mass[0, 0] * start[:3]
+        momentum, center = kept_at(self._loop.parts, t)
+        return momentum, center
 
     def _said(self, q: Array, lane: int, done: int) -> str:
         """Say why a run ends where it is, or nothing."""
-        point = self._parts[-2]
+        point = self._loop.parts.point
         ending = ending_of(replace(self._plan, q=q))
         v = self._state.spread(point.nu[:, lane])
         return ending(done * self._plan.times.dt, point.q[:, lane].copy(), v)
-
-    def _split(self, rows: Array) -> list[Array]:
-        """Return what rows hold, each (steps, LANES, size)."""
-        by_step = rows.reshape(-1, sum(self._sizes), LANES).transpose(0, 2, 1)
-        return [by_step[..., part] for part in self._columns]

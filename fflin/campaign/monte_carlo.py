@@ -143,7 +143,7 @@ def monte_carlo(
     overwrite : bool
         Whether to replace a file `out` that was not written by the same call; refused by default.
     engine : {"python", "compiled"}, optional
-        As in `simulate`.
+        By default the compiled one if it can run them, see `simulate`.
     **options
         Options of `simulate`: x0, q0, v0, dt, method, project, sample, delay, limits, disturbance,
         target, frame, reference.
@@ -195,7 +195,7 @@ def monte_carlo(
     check_room(runs, 8 * runs * sum(map(math.prod, shapes.values())), path, "runs")
     if executor or workers:
         _require_sendable(job)
-    job.choose(engine, runs)
+    job.choose(engine)
     header = _header(job) | {"seed": seed, "asked": runs, "confidence": confidence}
     header["goals"] = _goals(goals, until, shapes, header)
     with placed(dispersions):

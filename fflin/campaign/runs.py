@@ -62,9 +62,9 @@ class CampaignJob:
         # What is bound to the robot is made anew by a worker.
         return partial(self._again, engine=self.engine), ()
 
-    def choose(self, engine: Any, runs: int) -> None:
-        """Settle which loop does so many runs."""
-        self.engine = engine_of(engine, self.plan, self.plant, runs)
+    def choose(self, engine: Any) -> None:
+        """Settle which loop does the runs."""
+        self.engine = engine_of(engine, self.plan, self.plant, many=True)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -104,7 +104,7 @@ class CampaignJob:
         if count == LANES:
             from fflin.campaign.lane_tally import LaneTally
 
-            return LaneTally(self.plan, self.plant.state, self.home, self.steps, self._way)
+            return LaneTally(self.plan, self.plant, self.home, self.steps, self._way)
         return Tally(self.plan, self.plant.state, self.home, count, self.steps)
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:

@@ -24,7 +24,6 @@ from fflin.control.policies import StateFeedback
 from fflin.control.saturation import Saturation
 from fflin.dynamics.state import Frame, StateMap
 from fflin.dynamics.state_rows import states_of
-from fflin.kernel.compiled import loop_pays
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
@@ -174,11 +173,6 @@ class SettlingJob(CampaignJob):
         self._again = partial(SettlingJob, loop, foresees, limits, joint, fine)
         self.finer = partial(SettlingJob, loop, foresees, limits, joint, fine + 1)
         self.step = self._foreseen(dt)
-
-    def choose(self, engine: Any, runs: int) -> None:
-        """Settle which loop does so many runs."""
-        kept = loop_pays(10_000, "advance_eight")  # else it is compiled first, for many alone
-        super().choose(engine, max(1, runs if kept else runs // 10))
 
     def _foreseen(self, dt: float) -> Array | None:
         """Return what takes the linear loop from look to look, by the method of the nonlinear one.

@@ -244,12 +244,20 @@ def validity(
     levels = (np.arange(samples) + 0.5) / samples
     foreseen = len(_LEVELS) * _DIRECTIONS
     total, done, found = len(loops) * (foreseen + samples), 0, list[Validity]()
+    kinds = ((True, foreseen), (False, samples))
+    # All of them before anything is compiled: what cannot be flown is refused at once.
+    jobs = {
+        (frame, foresees): SettlingJob(each, foresees, limits, largest["joint"])
+        for frame, each in loops.items()
+        for foresees, _ in kinds
+    }
+    for job in jobs.values():
+        job.choose(engine)
     with OwnWorkers(workers) if workers else nullcontext(executor) as others:
-        for each in loops.values():
+        for frame, each in loops.items():
             arrays = []
-            for foresees, count in ((True, foreseen), (False, samples)):
-                job = SettlingJob(each, foresees, limits, largest["joint"])
-                job.choose(engine, max(1, total // 3))
+            for foresees, count in kinds:
+                job = jobs[frame, foresees]
                 rows = partial(_displaced, each, largest, seed, None if foresees else levels)
                 told = progress and partial(_tell, progress, done, total)
                 how = {"executor": others, "workers": workers, "threads": threads, "progress": told}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import namedtuple
 
+from fflin.kernel.arguments import FLAGS, INDICES, LANED, REAL, WHOLE, Struct
 from fflin.kernel.lanes import chosen, inlined, load, peek, poke, store, whole, width
 from fflin.kernel.vectors import copy
 
@@ -28,6 +29,23 @@ class Channel(
 
     `delay` (1,) is in steps; `fresh` (1,) says whether a command begins to act.
     """
+
+
+WHEELS = Struct(Wheels, at=INDICES, row=INDICES)
+PULSES = Struct(
+    Pulses,
+    at=INDICES,
+    on_off=FLAGS,
+    time=REAL,
+    **dict.fromkeys(("left", "level", "end"), LANED),
+)
+CHANNEL = Struct(
+    Channel,
+    wheels=WHEELS,
+    pulses=PULSES,
+    **dict.fromkeys(("slots", "sample"), WHOLE),
+    **dict.fromkeys(("held", "pending", "delay", "fresh"), LANED),
+)
 
 
 @inlined

@@ -21,8 +21,6 @@ from fflin.base.errors import unknown
 # not. To load it takes half a second, which a sweep of that size does not win back but the next
 # ones do: sweeps are seldom alone.
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
-# Fewest steps of the loop for which its kernel is: loaded and kept on disk, kept, and neither.
-_BREAK_EVEN_LOOP, _BREAK_EVEN_LOOP_UNLOADED, _BREAK_EVEN_COMPILING = 100, 4000, 20_000
 # Fewest points, one by one, for which their kernel is, of these three.
 POINT_BREAK_EVENS = 1, 20_000, 200_000
 
@@ -34,6 +32,9 @@ _QUOTAS = (
 )
 
 ENGINES = ("python", "compiled")
+
+# In the names of numba's files.
+VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 
 # Wait for another process's compilation for so long [s] before saying so, and at most.
 _SILENCE, _LONGEST_WAIT = 2.0, 600.0
@@ -70,15 +71,6 @@ def numba_is_there() -> bool:
     return find_spec("numba") is not None
 
 
-def loop_pays(steps: int, name: str = "advance") -> bool:
-    """Whether a compiled loop is there and beats the one in Python over so many steps."""
-    if steps < _BREAK_EVEN_LOOP or not numba_is_there():
-        return False
-    if not _kept_somewhere("loop", name):
-        return steps >= _BREAK_EVEN_COMPILING
-    return steps >= _BREAK_EVEN_LOOP_UNLOADED or "numba" in sys.modules
-
-
 def checked_engine(engine: Any) -> str | None:
     """Return the name of an engine, or None, or raise `UnknownNameError`."""
     if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
@@ -105,7 +97,7 @@ def _prepared(module: str, name: str, what: str) -> Any:
     compiled = getattr(import_module(f"fflin.kernel.{module}"), name)
     folder = Path(compiled.stats.cache_path)
     with _between_processes(folder / f"{module}.{name}.lock"):
-        older = set(folder.glob(f"{module}.{name}-*.nbi")) - set(_kept(folder, module, name))
+        older = set(_entries(folder, module, name)) - set(_kept(folder, module, name))
         for entry in older:
             entry.unlink(missing_ok=True)
     if not isinstance(compiled.compile, partial):  # a lock within itself would wait for itself
@@ -148,14 +140,15 @@ def _between_processes(path: Path) -> Iterator[None]:
         lock.release()
 
 
-def _kept_somewhere(module: str, name: str) -> bool:
+def is_kept(module: str, name: str) -> bool:
+    """Whether the machine code of a function is on disk, for the sources as they are."""
     chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
     return any(_kept(folder, module, name) for folder in folders)
 
 
 def _point_is_kept() -> bool:
-    if not _FOUND and _kept_somewhere("linearise", "linearise_one"):
+    if not _FOUND and is_kept("linearise", "linearise_one"):
         _FOUND.add("linearise_one")
     return bool(_FOUND)
 
@@ -164,8 +157,13 @@ def _kept(folder: Path, module: str, name: str) -> list[Path]:
     """Return what is kept of a function and not older than any source."""
     # numba compares with the function's own file, not with those of the functions that it calls.
     source = max(file.stat().st_mtime for file in _sources())
-    entries = folder.glob(f"{module}.{name}-*.nbi")
+    entries = _entries(folder, module, name)
     return [entry for entry in entries if entry.stat().st_mtime >= source]
+
+
+def _entries(folder: Path, module: str, name: str) -> list[Path]:
+    """Return what there is of a function for this version of Python."""
+    return list(folder.glob(f"{module}.{name}-*.{VERSION}*.nbi"))
 
 
 def _sources() -> list[Path]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import namedtuple
 
 from fflin.kernel import vectors as vec
+from fflin.kernel.arguments import LANED, Struct
 from fflin.kernel.lanes import inlined, load, store
 from fflin.kernel.places import axes_of
 from fflin.kernel.rnea import spatial_inertia_times, stored_momentum
@@ -27,6 +28,9 @@ class Course(namedtuple("Course", "start weight per_mass sums")):
     `sums` (18,): impulse (6,) and way besides that of the initial velocity (3,), so far and of the
     step.
     """
+
+
+COURSE = Struct(Course, LANED)
 
 
 @inlined

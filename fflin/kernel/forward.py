@@ -8,12 +8,17 @@ from __future__ import annotations
 
 from collections import namedtuple
 
+import numba
+
 from fflin.kernel import vectors as vec
+from fflin.kernel.accelerations import Layout, Loads
+from fflin.kernel.arguments import FLAGS, INDICES, LANED, REALS, WHOLE, Struct
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import factorise, solve
-from fflin.kernel.lanes import angle, chosen, inlined, load, store
+from fflin.kernel.lanes import angle, called, chosen, inlined, load, store
 from fflin.kernel.places import attitude, axes_of, columns_of, quaternion_times
 from fflin.kernel.rnea import collect, load_bodies, move_bodies, write_columns
+from fflin.kernel.tree import Tree
 
 
 class Mechanics(
@@ -47,7 +52,35 @@ class Point(namedtuple("Point", "q nu u pushing wrench")):
     """
 
 
-@inlined
+_OF_BODIES = dict.fromkeys(("parent", "index", "coordinate", "target", "row", "depth", "path"))
+_SIZES = "entries places own inertias packed scaled diagonal square size"
+TREE = Struct(
+    Tree,
+    **dict.fromkeys(_OF_BODIES, INDICES),
+    **dict.fromkeys(_SIZES.split(), WHOLE),
+    **dict.fromkeys(("fixed", "bodies"), LANED),
+    unbounded=FLAGS,
+    axes=numba.types.Array(numba.float64, 3, "C"),
+    common=numba.types.Array(numba.intp, 2, "C"),
+)
+LAYOUT = Struct(Layout, WHOLE)
+LOADS = Struct(Loads, LANED, body=INDICES, input=INDICES, stored_body=INDICES)
+DRIVES, POINT = Struct(Drives, LANED), Struct(Point, LANED)
+# One that is the same for all lanes.
+COMMON_POINT = Struct(Point, name="CommonPoint")
+MECHANICS = Struct(
+    Mechanics,
+    INDICES,
+    tree=TREE,
+    layout=LAYOUT,
+    loads=LOADS,
+    drives=DRIVES,
+    **dict.fromkeys(("circling", "springy"), FLAGS),
+    **dict.fromkeys(("gravity", "rest", "origin"), REALS),
+)
+
+
+@called
 def configure(work, robot, q):
     """Write the places of all bodies and the packed M at a configuration."""
     outwards(work, robot.tree, q)
@@ -110,7 +143,7 @@ def push(work, robot, pushing):
             vec.add(work, force + row, load(work, layout.columns + row * count + index) * u)
 
 
-@inlined
+@called
 def accelerate(work, robot, point, rates, to):
     """Write the rates of nu at a point that is configured into `rates` from `to` on.
 

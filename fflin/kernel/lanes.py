@@ -27,6 +27,7 @@ from numba.extending import (
     type_callable,
 )
 
+from fflin.kernel.parts import PartCompiler
 from fflin.kernel.tree import LANES
 
 _DOUBLE, _INT32 = ir.DoubleType(), ir.IntType(32)
@@ -37,11 +38,13 @@ _BYTES = 8  # alignment of a double
 # infinite; and no references to arrays are counted, which takes three quarters of the time else,
 # and makes no function able to allocate.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
-inlined = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
+_PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
+inlined = numba.njit(forceinline=True, **_PART)
 # For what is a list of calls: compiled with its caller, and not for itself before.
 listed = numba.njit(inline="always", **_OPTIONS)
 # Called where it is seldom needed: what is inlined takes longest to compile.
-called = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
+called = numba.njit(**_PART)
 compiled = numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS)
 
 

@@ -6,11 +6,13 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.kernel.arguments import FLAGS, INDICES, LANED, WHOLE, Struct
 from fflin.kernel.forward import joint_position
 from fflin.kernel.lanes import called, chosen, inlined, load, peek, poke, splat, store, whole, width
 from fflin.kernel.places import columns_of, quaternion_times
 from fflin.kernel.rnea import MOTION, move_bodies
-from fflin.kernel.tracking import track
+from fflin.kernel.sharing import SHARING
+from fflin.kernel.tracking import PATH, track
 from fflin.kernel.tree import PLACE
 from fflin.kernel.vectors import across, copy, get3, get_columns, plus, product, put3, times
 
@@ -32,7 +34,7 @@ class Law(
     `turned` says whether omega_b and v_b of the state stand in reference axes; row by row, sample
     by sample and the last to the end, `origin` (7,) is the world's origin seen from where x is 0
     and `near` (n,) which turn is taken of joints that go round. `u` is what is commanded, to be
-    shared out where `sharing` is not None.
+    shared out by `sharing` where that has any inputs.
     """
 
 
@@ -55,7 +57,25 @@ class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
     """
 
 
-@inlined
+_PLACES = dict.fromkeys(("joint", "first", "stride"), INDICES)
+GRID = Struct(Grid, at=LANED, **_PLACES)
+GYROS = Struct(Gyros, body=INDICES)
+FILTER = Struct(Filter, z=LANED, rates=LANED)
+LAW = Struct(
+    Law,
+    kind=WHOLE,
+    turned=FLAGS,
+    grid=GRID,
+    filter=FILTER,
+    measured=INDICES,
+    gyros=GYROS,
+    **dict.fromkeys(("x", "y", "added", "u"), LANED),
+    path=PATH,
+    sharing=SHARING,
+)
+
+
+@called
 def read_state(robot, law, point, row):
     """Write the state in the chart."""
     x, q, nu, n = law.x, point.q, point.nu, len(robot.index)

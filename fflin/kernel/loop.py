@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import namedtuple
 
-from fflin.kernel.channel import arrive, limit, send, spare_wheels
-from fflin.kernel.course import add_wrench, begin_step, end_step, impose, kept_at, start_at
-from fflin.kernel.forward import accelerate, configure, seen, turn_inputs
-from fflin.kernel.lanes import below, called, compiled, inlined, load, store
-from fflin.kernel.laws import NOTHING, command
+from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, Struct, opener
+from fflin.kernel.channel import CHANNEL, arrive, limit, send, spare_wheels
+from fflin.kernel.course import COURSE, add_wrench, begin_step, end_step, impose, kept_at, start_at
+from fflin.kernel.forward import MECHANICS, POINT, accelerate, configure, seen, turn_inputs
+from fflin.kernel.lanes import below, called, compiled, inlined, listed, load, store
+from fflin.kernel.laws import LAW, NOTHING, command
 from fflin.kernel.places import displace, turn_back
 from fflin.kernel.sharing import share_out
 from fflin.kernel.vectors import copy, put3, put6
@@ -34,6 +35,28 @@ class Stages(namedtuple("Stages", "rates along total first second u")):
 
     `u` (nu,) is what acted as the last step began.
     """
+
+
+class Arguments(
+    namedtuple("Arguments", "robot method law channel course project pushed watch point stages")
+):
+    """What `advance` reads: whether the course is imposed and anything pushes from outside, too."""
+
+
+ARGUMENTS = Struct(
+    Arguments,
+    robot=MECHANICS,
+    method=Struct(Method, h=REAL, origin=INDICES, tangent=FLAG),
+    law=LAW,
+    channel=CHANNEL,
+    course=COURSE,
+    project=FLAG,
+    pushed=FLAG,
+    watch=Struct(Watch),
+    point=POINT,
+    stages=Struct(Stages, LANED),
+)
+_opened = opener(ARGUMENTS)
 
 
 @inlined
@@ -122,20 +145,15 @@ def _move(robot, method, stages, point, stage):
         displace(robot.tree, point.q, along, point.q)
 
 
-@compiled
-def advance(
-    robot, method, law, channel, course, watch, point, stages, clock, last, every, rows, work
-):
-    """Go on with a run up to a step, or to one that led where `watch` stops.
-
-    The point, the sums of the course, and what law and channel remember are brought up to there.
-    `course` says besides whether it is imposed and anything pushes from outside, clock (1,) how
-    many steps are done of `last`. Each `every` steps, where that is not 0, a row gets q, nu, u, and
-    the momentum (6,) and centre of mass (3,) that are kept. `work` has `Layout.size` entries.
-    """
-    kept, project, pushed = course
+@listed
+def go_on(of, clock, last, every, rows, work):
+    """Do as `advance`, of arguments that are opened."""
+    robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.course
+    point, stages = of.point, of.stages
     h, row = method.h, 0
     configure(work, robot, point.q)
+    if clock[0] == 0:
+        start_at(work, robot, kept, point)
     for step in range(clock[0], last):
         begin_step(kept)
         copy(point.q, 0, stages.first, 0, len(point.q))
@@ -149,34 +167,30 @@ def advance(
                     _record(rows, row, point, kept, step * h)
                     row += 1
             accelerate(work, robot, point, stages.rates, (1 + stage) * len(point.nu))
-            if pushed:
+            if of.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
                 add_wrench(work, robot, kept, point, weight, moment)
             _move(robot, method, stages, point, stage)
             if len(law.filter.rates) > len(law.filter.z):
                 _combine(method.speed, stage, law.filter.rates, law.filter.z)
             configure(work, robot, point.q)
-        if pushed:
+        if of.pushed:
             end_step(kept, h)
-        if project:
+        if of.project:
             impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
-        if not _goes_on(robot, watch, point):
+        if not _goes_on(robot, of.watch, point):
             break
 
 
 @compiled
-def begin(robot, course, point, work):
-    """Write the momentum and the centre of mass of the start into a course."""
-    configure(work, robot, point.q)
-    start_at(work, robot, course, point)
+def advance(words, clock, last, every, rows, work):
+    """Go on with eight runs up to a step, or to one that led where `watch` stops.
 
-
-@compiled
-def advance_eight(
-    robot, method, law, channel, course, watch, point, stages, clock, last, every, rows, work
-):
-    """Do as `advance` in eight lanes; kept on disk apart from it."""
-    advance(
-        robot, method, law, channel, course, watch, point, stages, clock, last, every, rows, work
-    )
+    `words` are of `Arguments`. The point, the sums of the course, and what law and channel remember
+    are brought up to there, clock (1,) how many steps are done of `last`; at the first the momentum
+    and the centre of mass of the start are written into the course. Each `every` steps, where that
+    is not 0, a row gets q, nu, u, and the momentum (6,) and centre of mass (3,) that are kept.
+    `work` has `Layout.size` entries.
+    """
+    go_on(_opened(words), clock, last, every, rows, work)

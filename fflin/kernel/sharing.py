@@ -14,9 +14,9 @@ from collections import namedtuple
 
 import numpy as np
 
-from fflin.kernel.crba import inwards, outwards
+from fflin.kernel.arguments import INDICES, LANED, Struct
 from fflin.kernel.factor import factorise
-from fflin.kernel.forward import push, seen, turn_held
+from fflin.kernel.forward import MECHANICS, POINT, configure, push, seen, turn_held
 from fflin.kernel.lanes import called, inlined, load, peek, poke, root, store, width
 from fflin.kernel.places import columns_of
 from fflin.kernel.rnea import write_columns
@@ -33,8 +33,20 @@ class Sharing(
 ):
     """Whose inputs ask, and whose give, (k,) within `least` and `most`.
 
-    The `point` has q and the inputs of either; `work` and what follows are work space.
+    The `point` has q and the inputs of either; `work` and what follows are work space. There is
+    nothing to share out where k is 0.
     """
+
+
+SHARING = Struct(
+    Sharing,
+    asking=MECHANICS,
+    giving=MECHANICS,
+    point=POINT,
+    work=LANED,
+    columns=LANED,
+    state=INDICES,
+)
 
 
 @inlined
@@ -50,8 +62,8 @@ def half_solve(work, tree, x, first):
 
 @inlined
 def share_out(sharing, point, asked):
-    """Write what is asked for, or shared out where there is a way to; compiled where there is."""
-    if sharing is None:
+    """Write what is asked for, or shared out where there is a way to."""
+    if len(sharing.least) == 0:
         copy(asked, 0, point.u, 0, len(point.u))
     else:
         share(sharing, point, asked)
@@ -64,8 +76,7 @@ def share(sharing, point, asked):
     own, tree = sharing.point, asking.tree
     size, count = len(tree.row), len(sharing.least)
     copy(point.q, 0, own.q, 0, len(own.q))
-    outwards(work, tree, own.q)
-    inwards(work, tree)
+    configure(work, asking, own.q)
     factorise(work, tree)
     copy(asked, 0, own.pushing, 0, len(asked))
     turn_held(asking, own)

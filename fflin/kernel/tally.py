@@ -6,28 +6,45 @@ from collections import namedtuple
 
 import numpy as np
 
-from fflin.kernel.lanes import angle, chosen, compiled, inlined, load, root, store
-from fflin.kernel.laws import read_state
+from fflin.kernel.arguments import INDICES, LANED, REAL, Struct, opener
+from fflin.kernel.forward import MECHANICS, POINT
+from fflin.kernel.lanes import angle, chosen, compiled, inlined, listed, load, root, store
+from fflin.kernel.laws import LAW, read_state
 from fflin.kernel.places import attitude, quaternion_times
-from fflin.kernel.tracking import error
+from fflin.kernel.tracking import PATH, error
 from fflin.kernel.vectors import copy, dot
 
 
 class Marks(
     namedtuple(
         "Marks",
-        "index circling origin turned near home way speed kind settled there steps point at x e "
+        "robot law path home way speed kind settled there steps at "
         "sizes largest_x largest_u largest outside errors inputs",
     )
 ):
-    """What is compared, as `Mechanics`, `Law` and `Path` name it, and the marks so far.
+    """What is compared, and the marks so far.
 
-    Errors are from the state `home` (nx,), which `point` has the attitude of, or from the rows q
-    and nu of a `way` and its `speed`. `kind` (nx,) is 0 for a state without a kind of its own and
+    States are read as the `law` says and errors as the `path` does: from the state `home` (nx,),
+    which the path's point has the attitude of, or from the rows q and nu of a `way` and its
+    `speed`. `kind` (nx,) is 0 for a state without a kind of its own and
     -1 for one that has no error either. `settled` is the share of the largest, and `there` (kinds,)
     the sizes, below which an error has settled; at `steps` (times,) errors and inputs are kept.
-    `at`, x and e are work space. All from `x` on are in lanes.
+    `at` is work space. All from there on are in lanes.
     """
+
+
+_IN_LANES = "sizes largest_x largest_u largest outside errors inputs"
+MARKS = Struct(
+    Marks,
+    robot=MECHANICS,
+    law=LAW,
+    path=PATH,
+    settled=REAL,
+    at=POINT,
+    **dict.fromkeys(("kind", "steps"), INDICES),
+    **dict.fromkeys(_IN_LANES.split(), LANED),
+)
+_opened = opener(MARKS)
 
 
 @inlined
@@ -44,19 +61,19 @@ def _grow(marks, index, value):
 @inlined
 def _compare(marks, step):
     """Write the errors at a step, and the size of each kind."""
-    at, there, sizes = marks.at, marks.point, marks.sizes
+    at, there, sizes, e = marks.at, marks.path.point, marks.sizes, marks.path.e
     if len(marks.way) > 0:
         copy(marks.way, step * len(there.q), there.q, 0, len(there.q))
         copy(marks.speed, step * len(there.nu), there.nu, 0, len(there.nu))
-        error(marks, marks, at)
+        error(marks.robot, marks.path, at)
     else:
-        read_state(marks, marks, at, 0)
-        for index in range(len(marks.e)):
-            store(marks.e, index, load(marks.x, index) - load(marks.home, index))
+        read_state(marks.robot, marks.law, at, 0)
+        for index in range(len(e)):
+            store(e, index, load(marks.law.x, index) - load(marks.home, index))
     for kind in range(len(sizes)):
         store(sizes, kind, 0.0)
-    for index in range(len(marks.e)):
-        value, kind = _size(load(marks.e, index)), marks.kind[index]
+    for index in range(len(e)):
+        value, kind = _size(load(e, index)), marks.kind[index]
         if kind >= 0:
             _grow(marks.largest_x, index, value)
         if kind > 0:
@@ -67,9 +84,9 @@ def _compare(marks, step):
     store(sizes, 0, half * (360.0 / np.pi))
 
 
-@compiled
-def take(marks, rows, first, count):
-    """Take so many rows as `loop.advance` writes, the first of which is of a step, into account."""
+@listed
+def note(marks, rows, first, count):
+    """Do as `take`, of marks that are opened."""
     at, sizes, kept = marks.at, marks.sizes, 0
     width, inputs = len(at.q) + len(at.nu), len(marks.largest_u)
     while kept < len(marks.steps) and marks.steps[kept] < first:
@@ -94,4 +111,13 @@ def take(marks, rows, first, count):
             copy(rows, begin + width, marks.inputs, kept * inputs, inputs)
             kept += 1
     if count > 0:
-        read_state(marks, marks, at, 0)
+        read_state(marks.robot, marks.law, at, 0)
+
+
+@compiled
+def take(words, rows, first, count):
+    """Take so many rows as `loop.advance` writes, the first of which is of a step, into account.
+
+    `words` are of `Marks`.
+    """
+    note(_opened(words), rows, first, count)

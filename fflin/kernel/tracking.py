@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import namedtuple
 
-import numpy as np
-
+from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, WHOLE, Struct
+from fflin.kernel.forward import COMMON_POINT
 from fflin.kernel.lanes import angle, chosen, inlined, load, splat, store
 from fflin.kernel.places import attitude, axes_of, displace, quaternion_times
 from fflin.kernel.vectors import across, copy, get3, minus, put3, times
@@ -30,6 +30,17 @@ class Path(
     """
 
 
+PATH = Struct(
+    Path,
+    **dict.fromkeys(("hold", "ends"), FLAG),
+    **dict.fromkeys(("ahead", "over", "last"), REAL),
+    held=INDICES,
+    order=WHOLE,
+    e=LANED,
+    point=COMMON_POINT,
+)
+
+
 @inlined
 def _cubic(coefficients, k, s, out):
     size = len(out)
@@ -40,10 +51,23 @@ def _cubic(coefficients, k, s, out):
 
 
 @inlined
+def _latest(knots, time):
+    """Return the last knot that is not after a time; the first where all are."""
+    low, high = 0, len(knots)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if knots[middle] <= time:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@inlined
 def _placed(knots, time):
     """Return which interval a time is in, and the share of it that is over."""
     last = len(knots) - 2
-    k = max(0, min(np.searchsorted(knots, time, side="right") - 1, last))
+    k = min(_latest(knots, time), last)
     s = (time - knots[k]) / (knots[k + 1] - knots[k])
     if s > 1.0 - _NEAR and k < last:
         k, s = k + 1, 0.0
@@ -106,7 +130,7 @@ def track(robot, path, point, u, t):
     error(robot, path, point)
     starts, count, width = path.starts, len(path.point.u), len(path.e)
     since = path.starts[0] + min(max(t, 0.0), path.last)
-    k = max(0, np.searchsorted(starts, since, side="right") - 1)
+    k = _latest(starts, since)
     since = 0.0 if after else since - starts[k]
     k = len(starts) if after else k
     first, size = k * path.order * count * width, count * width

@@ -7,41 +7,42 @@ from typing import Any
 
 import numpy as np
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError
 from fflin.base.progress import Progress
 from fflin.control.linear_controller import LinearController, measured_at
 from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback
-from fflin.kernel.compiled import kernel, loop_pays, numba_is_there
-from fflin.kernel.tree import batch_tree
+from fflin.kernel.compiled import checked_engine, is_kept, numba_is_there
+from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.frames import ROOT
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import Recording, ending_of, go
 
-ENGINES = ("python", "compiled")
-
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 _SLICE, _FIRST_SLICE = 0.05, 16  # [s] and steps between looks at the clock and at Ctrl-C
-# Multiplications in the factor of M, beyond which ABA in the loop in Python is quicker.
-_LARGEST_FACTOR = 200_000
+# Steps beyond which a single run goes by the compiled loop, if its machine code is there.
+LONG = 20_000
 
 
-def engine_of(engine: Any, plan: Plan, plant: Plant, runs: int = 0) -> str:
-    """Return which loop does a plan, or so many runs by eight: as asked for, or the quicker."""
-    if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
-        raise unknown("engine", str(engine), list(ENGINES))
-    if engine == "python":
+def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> str:
+    """Return which loop does a plan, or many runs of it: as asked for, or by the rule.
+
+    Many runs go by the compiled loop where it can run them; one does if it is long and the machine
+    code is there already.
+    """
+    if checked_engine(engine) == "python":
         return "python"
     reason = _reason(plan, plant)
-    if engine == "compiled" and reason:
-        raise InputError(f"engine='compiled' cannot run this: {reason}; leave engine out")
-    if reason or (engine is None and not (_small(plant) and _pays(plan, runs))):
-        return "python"
-    return "compiled"
+    if engine == "compiled":
+        if reason:
+            raise InputError(f"engine='compiled' cannot run this: {reason}; leave engine out")
+        return "compiled"
+    wanted = many or (plan.times.steps > LONG and is_kept("loop", "advance"))
+    return "compiled" if wanted and not reason else "python"
 
 
 def _reason(plan: Plan, plant: Plant) -> str:
@@ -82,48 +83,41 @@ def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
     return ""
 
 
-def _pays(plan: Plan, runs: int) -> bool:
-    steps = plan.times.steps
-    return loop_pays(runs * steps, "advance_eight") if runs else loop_pays(steps)
-
-
-def _small(plant: Plant) -> bool:
-    tree = batch_tree(plant.robot)
-    return tree is not None and int((tree.depth**2).sum()) < _LARGEST_FACTOR
-
-
 def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> Recording:
     """Run a plan to its end by an engine; `plant` and `conserved` are of the robot that moves."""
     return go(plan, plant, conserved) if engine == "python" else _fly(plan, plant, conserved)
 
 
 def _fly(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
-    """Run a plan by the compiled loop, slice by slice."""
-    from fflin.simulation.packing import SLOTS, noise_of, noises, packed
+    """Run a plan by the compiled loop, slice by slice, as the first of eight equal runs."""
+    from fflin.simulation.packing import SLOTS, CompiledLoop, kept_at, noise_of, noises, packed
 
-    tree, state, times = batch_tree(plant.robot), plant.state, plan.times
+    tree, state, times, every = batch_tree(plant.robot), plant.state, plan.times, plan.times.every
     assert tree is not None
-    advance = kernel("loop", "advance", "the loop of `simulate`")
-    parts = packed(plan, plant, conserved, tree)
-    (mechanics, _, law, _, (kept, *_), _, point, stages), noise = parts, noise_of(plan)
-    ends = np.cumsum([len(each) for each in (point.q, point.nu, point.u, kept.start[:6])])
-    rows, clock = np.empty((times.rows, ends[-1] + 3)), np.zeros(1, dtype=np.intp)
-    flat, work = rows.reshape(-1), np.empty(mechanics.layout.size)
+    loop = CompiledLoop(packed(plan, plant, conserved, tree))
+    law, point, stages = loop.parts.law, loop.parts.point, loop.parts.stages
+    noise, clock = noise_of(plan), np.zeros(1, dtype=np.intp)
+    rows, space = np.empty((times.rows, loop.width)), loop.rows(times.rows)
+    room = len(space) // loop.width * every  # in steps
     ending, bar = ending_of(plan), Progress(plan.progress)
     stopped, length = "", _FIRST_SLICE
     try:
         while not stopped and clock[0] < times.steps:
-            began, first = time.perf_counter(), -(-int(clock[0]) // times.every)
-            last = min(times.steps, int(clock[0]) + length)
+            began, step = time.perf_counter(), int(clock[0])
+            first = -(-step // every)
+            last = min(times.steps, step + length, first * every + room)
             if noise:
-                last = min(last, (int(clock[0]) // times.sample + SLOTS) * times.sample)
-                at, values = noises(noise, times, len(law.y), int(clock[0]), last)
-                law.added.reshape(SLOTS, -1)[at % SLOTS] = values
-            advance(*parts, clock, last, times.every, flat[first * rows.shape[1] :], work)
-            stopped = ending(clock[0] * times.dt, point.q, state.spread(point.nu))
+                last = min(last, (step // times.sample + SLOTS) * times.sample)
+                at, values = noises(noise, times, len(law.y), step, last)
+                law.added.reshape(SLOTS, -1, LANES)[at % SLOTS] = values[..., None]
+            loop.advance(clock, last, every, space)
+            done = -(-int(clock[0]) // every)
+            taken = space[: (done - first) * loop.width, 0]
+            rows[first:done] = taken.reshape(-1, loop.width)
+            stopped = ending(clock[0] * times.dt, point.q[:, 0], state.spread(point.nu[:, 0]))
             bar.update(int(clock[0]), times.steps)
-            taken = max(time.perf_counter() - began, 1e-6)
-            length = max(_FIRST_SLICE, int(length * min(8.0, _SLICE / taken)))
+            spent = max(time.perf_counter() - began, 1e-6)
+            length = max(_FIRST_SLICE, int(length * min(8.0, _SLICE / spent)))
     except KeyboardInterrupt:
         if not clock[0]:
             raise
@@ -132,12 +126,12 @@ def _fly(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
         bar.close()
     if not np.isfinite(stages.u).all():
         return go(plan, plant, conserved)  # which says whose command was no number
-    count, end = -(-int(clock[0]) // times.every), clock[0] * times.dt
-    t = np.append(times.every * np.arange(count) * times.dt, end)
-    momentum, center = np.split(kept.start[:9] + kept.sums[:9], [6])
-    center += end * kept.per_mass * kept.start[:3]
-    rows[count] = np.concatenate((point.q, point.nu, stages.u, momentum, center))
+    count, end = -(-int(clock[0]) // every), clock[0] * times.dt
+    t = np.append(every * np.arange(count) * times.dt, end)
+    momentum, center = kept_at(loop.parts, end)
+    ended = point.q[:, 0], point.nu[:, 0], stages.u[:, 0], momentum, center
+    rows[count] = np.concatenate(ended)
     count += not stopped.startswith(("diverged", "interrupted"))
-    q, nu, u, momentum, center = np.split(rows[:count], ends, axis=1)
+    q, nu, u, momentum, center = (rows[:count, part] for part in loop.columns)
     v, steps = state.spread(nu), int(clock[0])
     return Recording(t[:count], q, v, u, momentum, center, steps, stopped, "compiled")

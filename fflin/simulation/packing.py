@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,10 @@ from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.dynamics.state import StateMap
 from fflin.kernel import channel, course, forward, laws, loop, sharing, tracking
-from fflin.kernel.accelerations import layout_of, loads_of
-from fflin.kernel.tree import Tree, batch_tree
+from fflin.kernel.accelerations import layout_of, loads_of, work_space
+from fflin.kernel.arguments import empty, laid_out, words_of
+from fflin.kernel.compiled import kernel
+from fflin.kernel.tree import LANES, Tree, batch_tree
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.limits import limits_of
 from fflin.simulation.conservation import Conserved, Course
@@ -27,86 +30,132 @@ from fflin.simulation.plant import Plant, triads
 from fflin.simulation.times import LARGEST_TURN, Times
 
 SLOTS = 128  # samples whose noise is there at a time, and steps of a campaign
+_MEMORY = 2**22  # [bytes] of rows that are there at a time
 
 
-def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[Any, ...]:
-    """Return what `kernel.loop.advance` takes of a plan whose policy and method it knows."""
-    h, state, u = plan.times.dt, plant.state, plan.initial
-    size, (way, speed) = 6 + state.robot.n, plan.method.shares(h)
-    nodes, weights, moments = (
-        np.array(each) * h for each in (plan.method.nodes, plan.method.weights, plan.method.moments)
-    )
-    nodes = np.minimum(nodes, plan.last_node * h)
-    origins = np.array(plan.method.origins)
-    start = Course(conserved, plan.method, h, plan.q, plan.v)
-    kept = course.Course(
-        np.concatenate((start.momentum, start.center(0.0), plan.q[:3])),
-        conserved.mass * np.array(state.robot.gravity),
-        np.array([1.0 / conserved.mass]),
-        np.zeros(course.SUMS),
-    )
+def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.Arguments:
+    """Return what `kernel.loop.advance` reads of a plan whose policy and method it knows."""
+    h, state, method = plan.times.dt, plant.state, plan.method
+    size, (way, speed) = 6 + state.robot.n, method.shares(h)
+    start = Course(conserved, method, h, plan.q, plan.v)
     squares = np.full(state.robot.nv, LARGEST_SPEED**2)
     squares[plan.turning] = (LARGEST_TURN / h) ** 2
-    sign = np.sign(plan.chart.scalar(plan.q)) if plan.chart else 0.0
-    q, second, mechanics = plan.q.copy(), plan.q.copy(), _mechanics(plant, tree)
-    return (
-        mechanics,
-        loop.Method(
-            *(h, origins, way.ravel(), speed.ravel(), nodes, weights, h * moments),
-            plan.method.tangent,
+    mechanics = mechanics_of(plant, tree)
+    return loop.Arguments(
+        robot=mechanics,
+        method=loop.Method(
+            h=h,
+            origin=method.origins,
+            way=way.ravel(),
+            speed=speed.ravel(),
+            nodes=np.minimum(np.array(method.nodes) * h, plan.last_node * h),
+            weights=np.array(method.weights) * h,
+            moments=h * (np.array(method.moments) * h),
+            tangent=method.tangent,
         ),
-        _law(plan, plant, mechanics),
-        _channel(plan, plant),
-        (kept, plan.project, not plant.isolated(driven=plan.law is not None)),
-        loop.Watch(state.velocities(squares), np.array([float(sign)])),
-        forward.Point(plan.q.copy(), state.velocities(plan.v), u.copy(), u.copy(), np.zeros(6)),
-        loop.Stages(
-            *(np.zeros(speed.shape[1] * size), np.zeros(size), np.zeros(size)),
-            *(q, second, u.copy()),
+        law=_law(plan, plant, mechanics),
+        channel=_channel(plan, plant),
+        course=course.Course(
+            start=np.concatenate((start.momentum, start.center(0.0), plan.q[:3])),
+            weight=conserved.mass * np.array(state.robot.gravity),
+            per_mass=[1.0 / conserved.mass],
+            sums=np.zeros(course.SUMS),
+        ),
+        project=plan.project,
+        pushed=not plant.isolated(driven=plan.law is not None),
+        watch=loop.Watch(
+            squares=state.velocities(squares),
+            sign=np.array([np.sign(plan.chart.scalar(plan.q)) if plan.chart else 0.0]),
+        ),
+        point=forward.Point(
+            q=plan.q,
+            nu=state.velocities(plan.v),
+            u=plan.initial,
+            pushing=plan.initial,
+            wrench=np.zeros(6),
+        ),
+        stages=loop.Stages(
+            rates=np.zeros(speed.shape[1] * size),
+            along=np.zeros(size),
+            total=np.zeros(size),
+            first=plan.q,
+            second=plan.q,
+            u=plan.initial,
         ),
     )
 
 
-def _mechanics(plant: Plant, tree: Tree) -> forward.Mechanics:
+class CompiledLoop:
+    """The compiled loop of eight runs, with arrays of its own: not to be shared by threads.
+
+    `parts` are its arguments, in lanes, and `fresh` the arrays in lanes, each with a column of its
+    values as they were. `columns` are those of a row: q, nu, u, momentum and centre of mass.
+    """
+
+    def __init__(self, parts: loop.Arguments) -> None:
+        self.fresh: list[tuple[Array, Array]] = []
+        self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self.fresh.append(pair))
+        self._words = words_of(self.parts, loop.ARGUMENTS)
+        self._work = work_space(self.parts.robot.layout.size)
+        self._advance = kernel("loop", "advance", "the loop of eight runs at a time")
+        point = self.parts.point
+        ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3]).tolist()
+        self.width = ends[-1]
+        self.columns = [slice(first, end) for first, end in pairwise([0, *ends])]
+
+    def rows(self, most: int) -> Array:
+        """Return room for so many rows or for fewer, that do not fill the memory."""
+        return work_space(max(1, min(most, _MEMORY // (8 * LANES * self.width))) * self.width)
+
+    def advance(self, clock: Any, last: int, every: int, rows: Array) -> None:
+        """Go on up to a step, see `kernel.loop.advance`."""
+        self._advance(self._words, clock, last, every, rows, self._work)
+
+    def split(self, rows: Array) -> list[Array]:
+        """Return what rows hold, each (rows, LANES, size)."""
+        by_row = rows.reshape(-1, self.width, LANES).transpose(0, 2, 1)
+        return [by_row[..., part] for part in self.columns]
+
+
+def kept_at(parts: loop.Arguments, t: float) -> list[Array]:
+    """Return the momentum (6,) and the centre of mass (3,) that the first run is to have."""
+    start, sums = parts.course.start[:, 0], parts.course.sums[:, 0]
+    momentum, center = np.split(start[:9] + sums[:9], [6])
+    return [momentum, center + t * parts.course.per_mass[0, 0] * start[:3]]
+
+
+def mechanics_of(plant: Plant, tree: Tree) -> forward.Mechanics:
+    """Return a robot as the kernel reads it."""
     robot, actuation = plant.robot, plant.actuation
     fixed, springs = actuation.fixed, robot.springs
     loads = loads_of(robot, actuation, tree)
     return forward.Mechanics(
-        tree,
-        layout_of(tree, len(loads.input)),
-        loads,
-        np.array(robot.gravity),
-        _places([joint.idx_q for joint in robot.joints]),
-        np.array([joint.unbounded for joint in robot.joints], dtype=bool),
-        np.array((springs.stiffness != 0.0) | (springs.damping != 0.0), dtype=bool),
-        np.array(springs.rest),
-        _places(np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1)),
-        _places([held.columns.start for held in actuation.held]),
-        _places(triads(actuation)),
-        pin.SE3ToXYZQUAT(plant.state.origin),
-        forward.Drives(*plant.drives),
+        tree=tree,
+        layout=layout_of(tree, len(loads.input)),
+        loads=loads,
+        gravity=np.array(robot.gravity),
+        index=_places([joint.idx_q for joint in robot.joints]),
+        circling=np.array([joint.unbounded for joint in robot.joints], dtype=bool),
+        springy=np.array((springs.stiffness != 0.0) | (springs.damping != 0.0), dtype=bool),
+        rest=np.array(springs.rest),
+        row=_places(np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1)),
+        held=_places([held.columns.start for held in actuation.held]),
+        triads=_places(triads(actuation)),
+        origin=pin.SE3ToXYZQUAT(plant.state.origin),
+        drives=forward.Drives(*plant.drives),
     )
 
 
 def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
     state, policy, asking = plant.state, plan.policy, plant
-    none, nowhere = np.zeros(0), _places([])
     shared = isinstance(policy, Allocation)
     if shared:
         asking = Plant(StateMap(policy.design, reference=state.reference, frame=state.frame))
         policy = policy.policy
-    law = laws.Law(
-        laws.NOTHING,
-        np.array(state.axes),
-        pin.SE3ToXYZQUAT(state.origin),
-        np.zeros(state.robot.n),
-        laws.Grid(nowhere, _places([0]), none, nowhere, none, none, none),
-        laws.Filter(*(none,) * 9),
-        *(nowhere, laws.Gyros(nowhere, none), np.zeros(state.nx), none, none),
-        np.zeros(len(asking.actuation.names)),
-        _path(plan, policy, asking),
-        _sharing(plant, asking, mechanics) if shared else None,
-    )
+    law = no_law(state, np.zeros(len(asking.actuation.names)))
+    law = law._replace(path=_path(law.path, plan, policy, asking))
+    if shared:
+        law = law._replace(sharing=_sharing(plant, asking, mechanics))
     if isinstance(policy, StateFeedback):
         K, offset, near = policy.terms(state)
         direct = law.filter._replace(D=-K.ravel(), u0=offset, y0=np.zeros(state.nx))
@@ -121,6 +170,22 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
         law = law._replace(kind=laws.LINEAR, measured=np.arange(state.nx))
     size, slots = len(law.measured), SLOTS if noise_of(plan) else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
+
+
+def no_law(state: StateMap, u: Array) -> laws.Law:
+    """Return the law that asks for nothing, and reads states and errors."""
+    law = empty(laws.LAW)
+    q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
+    point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
+    return law._replace(
+        kind=laws.NOTHING,
+        turned=np.array(state.axes),
+        origin=pin.SE3ToXYZQUAT(state.origin),
+        near=np.zeros(state.robot.n),
+        x=np.zeros(state.nx),
+        u=u,
+        path=law.path._replace(along=np.zeros(len(nu)), e=np.zeros(state.nx), point=point),
+    )
 
 
 def noise_of(plan: Plan) -> Any:
@@ -187,27 +252,34 @@ def _filtered(law: laws.Law, plan: Plan, policy: Any, asking: Plant, tree: Tree)
 
 def _sharing(plant: Plant, asking: Plant, giving: forward.Mechanics) -> sharing.Sharing:
     """Return how the commands of one robot's inputs are allocated to the other robot's inputs."""
-    none, names, tree = np.zeros(0), plant.actuation.names, batch_tree(asking.robot)
+    names, tree = plant.actuation.names, batch_tree(asking.robot)
     assert tree is not None
-    k, size, asks = len(names), plant.state.nx // 2, _mechanics(asking, tree)
+    k, size, asks = len(names), plant.state.nx // 2, mechanics_of(asking, tree)
     limits = [limits_of(plant.robot).get(key, (-np.inf, np.inf)) for key in names]
     least, most = (np.array(each) for each in zip(*limits, strict=True))
-    asked = np.zeros(len(asking.actuation.names))
-    point = forward.Point(np.zeros(plant.robot.nq), none, none, asked, none)
-    work = np.zeros(max(asks.layout.size, giving.layout.size))
-    sizes = ((k + 1) * size, k * (size + k), k * k, size + k, size, *(k,) * 4)
-    free = (*(np.zeros(count) for count in sizes), np.zeros(k, dtype=np.intp))
-    return sharing.Sharing._make((asks, giving, point, least, most, work, *free))
-
-
-def _path(plan: Plan, policy: Any, asking: Plant) -> tracking.Path:
-    state, none, nowhere = asking.state, np.zeros(0), _places([])
-    size, count = state.nx // 2, len(asking.actuation.names)
-    point = forward.Point(plan.q.copy(), np.zeros(size), np.zeros(count), none, none)
-    path = tracking.Path(
-        *(none, none, none, none, none, False, 0.0, False, nowhere, 0.0, 0.0, none, none, 1),
-        *(np.zeros(size), np.zeros(state.nx), point),
+    given = empty(sharing.SHARING)
+    point = given.point._replace(
+        q=np.zeros(plant.robot.nq), pushing=np.zeros(len(asking.actuation.names))
     )
+    return given._replace(
+        asking=asks,
+        giving=giving,
+        point=point,
+        least=least,
+        most=most,
+        work=np.zeros(max(asks.layout.size, giving.layout.size)),
+        columns=np.zeros((k + 1) * size),
+        Q=np.zeros(k * (size + k)),
+        R=np.zeros(k * k),
+        b=np.zeros(size + k),
+        wanted=np.zeros(size),
+        **{name: np.zeros(k) for name in ("x", "s", "low", "high")},
+        state=np.zeros(k, dtype=np.intp),
+    )
+
+
+def _path(path: tracking.Path, plan: Plan, policy: Any, asking: Plant) -> tracking.Path:
+    state, count = asking.state, len(asking.actuation.names)
     if type(policy) is not TrajectoryFeedback:
         return path
     motion, schedule = policy.trajectory, policy.schedule
@@ -257,30 +329,40 @@ def _channel(plan: Plan, plant: Plant) -> channel.Channel:
     first = plant.state.groups.omega_b.start
     rows = [names.index(f"qdot_m.{name}") - first for name in w.names]
     wheels = channel.Wheels(
-        *(np.array(each, dtype=np.intp) for each in (w.at, rows)),
-        *(np.array(each, dtype=float) for each in (*w.torques, *w.limits, w.stiffness)),
+        at=w.at,
+        row=rows,
+        least_torque=w.torques[0],
+        most_torque=w.torques[1],
+        least_speed=w.limits[0],
+        most_speed=w.limits[1],
+        stiffness=w.stiffness,
     )
     fired = limits.pulses() if limits.pulses else Pulses([], limits.high, times.sample, times.dt)
-    figures, nothing = (fired.most, fired.least, fired.quantum), (np.zeros(len(fired.places)),) * 3
-    pulses = channel.Pulses._make(
-        (
-            *(np.array(fired.places, dtype=np.intp), np.array(fired.on_off, dtype=bool)),
-            *(np.array(each, dtype=float) for each in (*figures, *nothing)),
-            fired.time,
-        )
+    nothing = np.zeros(len(fired.places))
+    pulses = channel.Pulses(
+        at=fired.places,
+        on_off=fired.on_off,
+        most=fired.most,
+        least=fired.least,
+        quantum=fired.quantum,
+        left=nothing,
+        level=nothing,
+        end=nothing,
+        time=fired.time,
     )
     held: Array = np.minimum(np.maximum(plan.initial, limits.low), limits.high)
     # What would act after the end needs no place to wait in.
     waiting = min(times.delay, times.steps)
     slots = waiting // times.sample + 1 if times.sample else 1
     return channel.Channel(
-        np.array(limits.low),
-        np.array(limits.high),
-        held,
-        np.zeros(slots * len(held)),
-        slots,
-        times.sample,
-        *(np.array([float(times.delay)]), np.zeros(1)),
-        wheels,
-        pulses,
+        low=limits.low,
+        high=limits.high,
+        held=held,
+        pending=np.zeros(slots * len(held)),
+        slots=slots,
+        sample=times.sample,
+        delay=[float(times.delay)],
+        fresh=np.zeros(1),
+        wheels=wheels,
+        pulses=pulses,
     )

@@ -142,9 +142,10 @@ def simulate(
     progress : bool, optional
         Whether to show a progress bar on stderr; by default on a terminal, for long runs.
     engine : {"python", "compiled"}, optional
-        Engine that runs the loop; by default the compiled one if it is supported and faster. It
-        needs numba, no orbit, and no policy, event, callback or disturbance in Python. Both
-        engines agree to machine precision.
+        Engine that runs the loop: by default Python, and the compiled engine for a run of more
+        than 20,000 steps if its machine code exists already. The compiled engine needs numba, no
+        orbit, and no policy, event, callback or disturbance in Python. Both engines agree to
+        machine precision.
 
     Returns
     -------

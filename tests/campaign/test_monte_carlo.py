@@ -199,6 +199,7 @@ SCRIPT = """
 """
 
 
+@pytest.mark.compiled
 @pytest.mark.process
 def test_a_campaign_is_the_same_on_any_workers_and_after_a_kill(tmp_path):
     pytest.importorskip("h5py")

@@ -71,7 +71,7 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
     stop, ends = np.arange(LANES) % 3.0, []
     for cuts in ([0, STEPS], [0, 1, 33, STEPS]):
         plain = Tally(job.plan, state, home, LANES, job.steps)
-        lanes = LaneTally(job.plan, state, home, job.steps, way)
+        lanes = LaneTally(job.plan, job.plant, home, job.steps, way)
         for first, last in itertools.pairwise(cuts):
             some = [each[first:last] for each in (q, nu, u)]
             plain.add(first, some)

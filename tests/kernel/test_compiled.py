@@ -4,12 +4,17 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from threading import Barrier
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+import fflin
 from fflin.kernel import compiled as kernel_code
+from tests.support.policies import JETS, POLICIES, between_gains, plain
+from tests.support.robots import BUNDLED
 
 pytest.importorskip("numba")
 
@@ -45,7 +50,7 @@ def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_pat
     assert all(each.result() is compiled for each in found)
     assert not caplog.records
     compiled.compile("double")
-    (tmp_path / "factor.invert-1.nbi").write_bytes(b"")
+    (tmp_path / f"factor.invert-1.{kernel_code.VERSION}.nbi").write_bytes(b"")
     compiled.compile("long")
     assert signatures == ["double", "long"]
     assert [record.message for record in caplog.records] == [
@@ -56,7 +61,7 @@ def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_pat
 @pytest.mark.compiled
 @pytest.mark.parametrize("older", [False, True])
 def test_code_that_is_older_than_any_source_is_not_taken(compiled, caplog, tmp_path, older):
-    kept = tmp_path / "factor.invert-1.nbi"
+    kept = tmp_path / f"factor.invert-1.{kernel_code.VERSION}.nbi"
     kept.write_bytes(b"")
     newest = max(file.stat().st_mtime for file in kernel_code._sources())
     os.utime(kept, (newest, newest + (-1.0 if older else 1.0)))
@@ -80,21 +85,15 @@ def test_a_function_that_is_prepared_twice_does_not_wait_for_itself(
     assert not any("waiting" in record.message for record in caplog.records)
 
 
-@pytest.mark.parametrize("kept", [False, True])
-@pytest.mark.parametrize("loaded", [False, True])
-def test_a_short_run_waits_for_no_compiler(monkeypatch, tmp_path, kept, loaded):
+def test_machine_code_is_found_where_numba_keeps_it(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    there = SimpleNamespace(__spec__="numba")
-    monkeypatch.setattr(kernel_code.sys, "modules", {"numba": there} if loaded else {})
-    monkeypatch.setattr(kernel_code, "find_spec", lambda name: there)
-    if kept:
-        (tmp_path / "kernel_0").mkdir()
-        (tmp_path / "kernel_0" / "loop.advance-1.nbi").write_bytes(b"")
-    least = (100 if loaded else 4000) if kept else 20_000
-    assert not kernel_code.loop_pays(least - 1)
-    assert kernel_code.loop_pays(least)
-    monkeypatch.setattr(kernel_code, "find_spec", lambda name: None)
-    assert not kernel_code.loop_pays(10**6)
+    assert not kernel_code.is_kept("loop", "advance")
+    (tmp_path / "kernel_0").mkdir()
+    (tmp_path / "kernel_0" / f"loop.advance-1.{kernel_code.VERSION}.nbi").write_bytes(b"")
+    assert kernel_code.is_kept("loop", "advance")
+    assert not kernel_code.is_kept("loop", "another")
+    monkeypatch.setattr(kernel_code, "VERSION", "py39")
+    assert not kernel_code.is_kept("loop", "advance")
 
 
 WAITER = """
@@ -120,3 +119,29 @@ def test_processes_compile_one_at_a_time_and_a_killed_one_leaves_no_lock(tmp_pat
             assert "waiting for another process" in second.stdout.readline()
             first.kill()
             assert second.stdout.readline() == "held\n"
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("name", BUNDLED)
+def test_one_set_of_machine_code_serves_every_robot_policy_and_option(robots, name):
+    """Motions and campaigns under every policy, with limits, wheels, pulses, samples and faults."""
+    from fflin.kernel.loop import advance
+    from fflin.kernel.tally import take
+
+    for make in POLICIES:
+        if make is between_gains and not robots[name].n:
+            continue
+        robot, policy, options = make(plain(robots[name]))
+        options = {"dt": 0.05, "engine": "compiled"} | options | {"duration": 0.1, "linear": False}
+        for most in (None, 0.5):
+            fflin.simulate(robot, policy, **options, limits=most)
+    wheel = fflin.ReactionWheel((0, 0, 1), name="w", inertia=1e-4, max_speed=30.0, max=0.5)
+    jets = [replace(jet, on_off=True, max=0.3) for jet in JETS]
+    robot = robots[name].replace(inputs=[*jets, wheel], gravity=(0.0, 0.1, 0.0))
+    lin = fflin.linearize(robot)
+    law = fflin.StateFeedback(lin, np.zeros(lin.B.shape[::-1]))
+    given = {"*.mass": 0.1, "q_b.sensor": 1e-3, "*.noise": 1e-3, "delay": [0.0, 0.1]}
+    options = {"runs": 9, "duration": 0.4, "dt": 0.05, "sample": 0.1, "engine": "compiled"}
+    fflin.monte_carlo(robot, law, given, limits="urdf", **options, threads=1)
+    fflin.monte_carlo(robots[name], None, {"q_b": 0.1}, runs=1, duration=0.1, engine="compiled")
+    assert [len(each.signatures) for each in (advance, take)] == [1, 1]

@@ -2,7 +2,6 @@
 
 import itertools
 import warnings
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,12 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.simulation import compiled, packing
+from fflin.kernel.compiled import ENGINES
+from fflin.kernel.tree import batch_tree
+from fflin.simulation import compiled, packing, run
+from fflin.simulation.conservation import Conserved
+from fflin.simulation.plan import planned
+from fflin.simulation.plant import Plant
 from tests.support.measured import POSITIONS, designed
 from tests.support.motions import HOME, displaced
 from tests.support.motions import motion as trajectory
@@ -19,8 +23,7 @@ from tests.support.weights import unit_weights
 
 pytest.importorskip("numba")
 
-from fflin.kernel import tracking
-from fflin.kernel.loop import advance
+from fflin.kernel import arguments, channel
 
 pytestmark = pytest.mark.compiled
 
@@ -34,9 +37,9 @@ def both(robot, policy=None, tolerance=1e-10, rounding=2e-14, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fflin.FflinWarning)
         python, motion = (
-            fflin.simulate(robot, policy, **options, engine=engine) for engine in compiled.ENGINES
+            fflin.simulate(robot, policy, **options, engine=engine) for engine in ENGINES
         )
-    assert (python.engine, motion.engine) == compiled.ENGINES
+    assert (python.engine, motion.engine) == ENGINES
     assert motion.stopped == python.stopped
     for name in ("t", "q", "v", "x", "u", "energy", "momentum"):
         expected, found = getattr(python, name), getattr(motion, name)
@@ -271,74 +274,79 @@ def test_what_cannot_be_compiled_says_why(robots):
             fflin.simulate(robot, **options)
 
 
-def test_the_quicker_loop_is_taken_and_the_motion_says_which(robots, monkeypatch, tmp_path):
+def test_a_long_run_goes_compiled_if_its_machine_code_is_there(robots, monkeypatch, tmp_path):
     robot = robots["cubesat"]
-    for pays, engine in ((False, "python"), (True, "compiled")):
-        monkeypatch.setattr(compiled, "loop_pays", lambda steps, pays=pays: pays and steps == 10)
+    for kept, longest, engine in (
+        (True, 10, "python"),
+        (False, 9, "python"),
+        (True, 9, "compiled"),
+    ):
+        monkeypatch.setattr(compiled, "is_kept", lambda *_, kept=kept: kept)
+        monkeypatch.setattr(compiled, "LONG", longest)
         motion = fflin.simulate(robot, duration=0.1, dt=0.01)
         assert motion.engine == engine
         motion.save(tmp_path / "motion.npz")
         assert fflin.Motion.load(tmp_path / "motion.npz").engine == engine
-    monkeypatch.setattr(compiled, "_LARGEST_FACTOR", 0)
-    assert fflin.simulate(robot, duration=0.1, dt=0.01).engine == "python"
 
 
-# What is the same for all lanes.
-SHARED = {"turns", "slides", "factor", "axes", "armature", "share", "weights", "moments", "nodes"}
-SHARED |= {"values"}
-
-
-def in_lanes(runs):
-    """The parts of eight runs side by side."""
-    first = runs[0]
-    if isinstance(first, np.ndarray):
-        return np.column_stack(runs).copy() if first.dtype == float else first
-    if isinstance(first, tracking.Path):
-        return first._replace(e=in_lanes([each.e for each in runs]))
-    if not isinstance(first, tuple):
-        return first
-    names = getattr(first, "_fields", range(len(first)))
-    parts = [
-        own[0] if name in SHARED else in_lanes(own)
-        for name, own in zip(names, zip(*runs, strict=True), strict=True)
-    ]
-    return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)
-
-
-def test_eight_lanes_are_eight_runs(robots, monkeypatch):
-    """Each with a start, masses and gains of its own."""
+def test_eight_lanes_are_eight_runs(robots):
+    """Each with a start, masses and forces of its own."""
     jet = fflin.Thruster("link_2", (0.2, 0.1, 0.0), (1.0, 0.5, 0.2), "jet")
-    inputs = [*robots["ets_vii"].inputs, jet, STORING]
-    runs, motions, given = [], [], packing.packed
-
-    def packed(*arguments):
-        runs.append(given(*arguments))
-        return deepcopy(runs[-1])
-
-    monkeypatch.setattr(packing, "packed", packed)
-    for share in np.linspace(0.8, 1.2, 8):
-        model = robots["ets_vii"].model.copy()
+    robot = robots["ets_vii"].replace(inputs=[*robots["ets_vii"].inputs, jet, STORING])
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    starts, masses, gains = np.random.default_rng(6).uniform(0.8, 1.2, (3, 8))
+    plans = []
+    for share, mass, gain in zip(starts, masses, gains, strict=True):
+        model = robot.model.copy()
         for joint in range(1, model.njoints):
             model.inertias[joint] = pin.Inertia.FromDynamicParameters(
-                share * model.inertias[joint].toDynamicParameters()
+                mass * model.inertias[joint].toDynamicParameters()
             )
-        robot = fflin.from_model(model, inputs=inputs, stiffness={"joint_1": 10.0 * share})
-        lin = fflin.linearize(robot)
-        policy = fflin.StateFeedback(lin, share * fflin.lqr(lin).K)
-        options = {"x0": share * displaced(lin), "dt": 0.01, "linear": False}
-        motions.append(fflin.simulate(robot, policy, duration=2.0, **options, engine="compiled"))
-    parts = in_lanes(runs)
-    clock, width = np.zeros(1, dtype=np.intp), robot.nq + 6 + robot.n + len(lin.u0) + 9
-    rows, work = np.empty((21 * width, 8)), np.empty((parts[0].layout.size, 8))
-    advance(*parts, clock, 150, 10, rows, work)
-    advance(*parts, clock, 200, 10, rows[15 * width :], work)
-    for lane, motion in enumerate(motions):
-        found = rows[: 20 * width, lane].reshape(20, width)
-        np.testing.assert_allclose(found[:, : robot.nq], motion.q[:200:10], rtol=0, atol=1e-12)
-        u = found[:, robot.nq + 6 + robot.n : -9]
-        np.testing.assert_allclose(u, motion.u[:200:10], rtol=1e-11, atol=1e-11)
-        np.testing.assert_allclose(parts[6].q[:, lane], motion.q[-1], rtol=0, atol=1e-12)
-    assert np.ptp(parts[6].q[:7], axis=1).min() > 1e-4
+        own = fflin.from_model(model, inputs=robot.inputs)
+        options = {"x0": share * displaced(lin), "duration": 2.0, "dt": 0.01, "linear": False}
+        plan, plant = planned(own, policy, **options)
+        count = len(plant.drives.gain)
+        drives = plant.drives._replace(gain=np.full(count, gain))
+        plans.append((plan, Plant(plant.state, drives=drives)))
+    parts = [
+        packing.packed(plan, plant, Conserved(plant.robot, plan.q), batch_tree(plant.robot))
+        for plan, plant in plans
+    ]
+    together = packing.CompiledLoop(parts[0])
+    for lane, own in enumerate(parts):
+        for array, values in zip(in_lanes(together.parts), in_lanes(own), strict=True):
+            array[:, lane] = values
+    clock, rows = np.zeros(1, dtype=np.intp), together.rows(20)
+    together.advance(clock, 150, 10, rows)
+    together.advance(clock, 200, 10, rows[15 * together.width :])
+    q, _, u, _, _ = together.split(rows)
+    for lane, (plan, plant) in enumerate(plans):
+        motion = run.go(plan, plant, Conserved(plant.robot, plan.q))
+        np.testing.assert_allclose(q[:, lane], motion.q[:200:10], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(u[:, lane], motion.u[:200:10], rtol=1e-11, atol=1e-11)
+        at = together.parts.point.q[:, lane]
+        np.testing.assert_allclose(at, motion.q[-1], rtol=0, atol=1e-12)
+    assert np.ptp(together.parts.point.q[:7], axis=1).min() > 1e-4
+
+
+def in_lanes(parts):
+    """What differs between eight runs: start, inertias, inputs, and what is kept."""
+    robot, course, point = parts.robot, parts.course, parts.point
+    return (
+        *(robot.tree.bodies, *robot.drives),
+        *(course.start, course.weight, course.per_mass, point.q, point.nu),
+    )
+
+
+def test_arguments_are_laid_out_or_refused():
+    given = channel.Wheels(*(np.array([k]) for k in range(7)))
+    wheels = arguments.laid_out(given, channel.WHEELS)
+    assert wheels.at.dtype == np.intp and wheels.stiffness.dtype == float
+    words = arguments.words_of(wheels, channel.WHEELS)
+    assert len(words) == channel.WHEELS.size == 14 and words[1::2].tolist() == [1] * 7
+    with pytest.raises(AssertionError):
+        arguments.words_of(given, channel.WHEELS)
 
 
 def test_a_command_that_is_no_number_is_told(robots):
@@ -348,7 +356,7 @@ def test_a_command_that_is_no_number_is_told(robots):
     x0 = displaced(lin, offset=100.0)
     options = {"x0": x0, "sample": 0.01, "duration": 0.1, "linear": False}
     said = []
-    for engine in compiled.ENGINES:
+    for engine in ENGINES:
         with np.errstate(over="ignore"), pytest.raises(fflin.InputError) as caught:
             fflin.simulate(robot, policy, **options, engine=engine)
         said.append(str(caught.value))

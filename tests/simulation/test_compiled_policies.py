@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.simulation.compiled import ENGINES
+from fflin.kernel.compiled import ENGINES
 from tests.support.motions import displaced
 from tests.support.policies import POLICIES, between_gains, plain, shared
 from tests.support.robots import BUNDLED

@@ -13,7 +13,6 @@ fflin.monte_carlo(robot, law, spread, runs=8, duration=0.02, dt=0.01, engine="co
 """,
     """
 import numpy as np
-fflin.simulate(robot, duration=0.02, dt=0.01, engine="compiled")
 q, v = robot.neutral(), np.zeros(robot.nv)
 fflin.Linearizer(robot, engine="compiled")(q, v)
 rows = np.tile(q, (2000, 1))

@@ -26,6 +26,21 @@ JETS = [
 ]
 
 
+def coarse(values):
+    """Round to 2^-20 of the largest entry: what differs by rounding alone becomes the same.
+
+    Gains are of LAPACK, whose last digits depend on the processor; motions under them should not.
+    """
+    values = np.asarray(values)
+    unit = 2.0 ** (np.ceil(np.log2(np.abs(values).max())) - 20.0)
+    return np.round(values / unit) * unit
+
+
+def coarsened(made, *names):
+    """Return a design with some of its arrays rounded."""
+    return replace(made, **{name: coarse(getattr(made, name)) for name in names})
+
+
 def motors(robot):
     return [fflin.JointTorque(name) for name in robot.joint_names if name not in robot.passive]
 
@@ -47,7 +62,7 @@ def noise(t):
 
 def state(robot):
     lin = fflin.linearize(robot)
-    return robot, fflin.StateFeedback(lin, fflin.lqr(lin).K), {}
+    return robot, fflin.StateFeedback(lin, coarse(fflin.lqr(lin).K)), {}
 
 
 def between_gains(robot):
@@ -60,14 +75,15 @@ def between_gains(robot):
     gains = fflin.lqr_batch(batch, by.Q, by.R)
     # So that they differ more.
     sizes = 1.0 + 0.1 * np.arange(len(gains))[:, None, None]
-    return robot, fflin.ScheduledFeedback(lin, replace(gains, K=sizes * gains.K)), {}
+    return robot, fflin.ScheduledFeedback(lin, replace(gains, K=coarse(sizes * gains.K))), {}
 
 
 def compensated(robot, dt=SAMPLE):
     robot = seen(robot)
     lin = fflin.linearize(robot).discretize(dt)
     gain = fflin.lqr(lin)
-    return robot, lin, fflin.lqg(gain, fflin.kalman(lin, 1e-3, 1e-4))
+    by = fflin.lqg(gain, fflin.kalman(lin, 1e-3, 1e-4))
+    return robot, lin, coarsened(by, "A", "B", "C")
 
 
 def outputs(robot):
@@ -82,7 +98,7 @@ def controlled(robot):
     lin = fflin.linearize(robot)
     by = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-2))
     damping = -0.05 * np.linalg.pinv(lin.B) @ np.linalg.pinv(lin.C)
-    return robot, fflin.LinearController((by.A, by.B, by.C, damping), lin), {}
+    return robot, fflin.LinearController((*map(coarse, (by.A, by.B, by.C, damping)),), lin), {}
 
 
 def controlled_in_samples(robot):
@@ -102,7 +118,7 @@ def path(robot):
     if robot.n and robot.joints[0].unbounded:
         q = fflin.configuration(robot, {robot.joint_names[0]: -0.4})
         lin = fflin.linearize(robot, q)
-        policy, x0[6] = fflin.StateFeedback(lin, fflin.lqr(lin).K), 2.9
+        policy, x0[6] = fflin.StateFeedback(lin, coarse(fflin.lqr(lin).K)), 2.9
     flown = fflin.simulate(robot, policy, x0=x0, duration=8.0, dt=SAMPLE, engine="python")
     along = fflin.Trajectory(robot, flown.t, flown.q, flown.v, flown.u, frame="hybrid")
     start = {"x0": None, "q0": flown.q[3], "v0": flown.v[0], "linear": False}
@@ -111,14 +127,15 @@ def path(robot):
 
 def followed(robot):
     along, start = path(robot)
-    return robot, fflin.tvlqr(along), start
+    return robot, coarsened(fflin.tvlqr(along), "K", "P"), start
 
 
 def followed_outputs(robot):
     robot = seen(robot)
     along, start = path(robot)
-    gains = fflin.tvlqr(along, sample=SAMPLE)
+    gains = coarsened(fflin.tvlqr(along, sample=SAMPLE), "K", "P")
     by = fflin.tvkalman(along, 1e-3, 1e-4, P0=1e-4, sample=SAMPLE)
+    by = coarsened(by, "L", "P")
     size = len(by.output_names)
     return robot, fflin.TrajectoryOutputFeedback(along, gains, by, lambda t: noise(t)[:size]), start
 
