@@ -90,7 +90,12 @@ def _flown(robot, policy, engine, **options):
     rows = np.linspace(0, len(motion.t) - 1, _ROWS + 1).astype(int)[1:]
     found = {key: getattr(motion, key)[rows] for key in ("t", "q", "v", "x", "u", "momentum")}
     largest = np.abs(motion.u).max(axis=0)
-    return {**found, "rows": len(motion.t), "largest u": largest, "stopped": motion.stopped}
+    return {
+        **found,
+        "rows": len(motion.t),
+        "largest u": largest,
+        "stopped": motion.stopped.split(" at ")[0],
+    }
 
 
 def _policy(make, name, engine):
@@ -155,7 +160,7 @@ def _stops(engine):
         policy = fflin.StateFeedback(lin, gain)
         options = {"x0": start, "duration": 8.0, "dt": 0.01, "linear": False}
         motion = fflin.simulate(robot, policy, **options, engine=engine)
-        found |= {f"{name} stopped": motion.stopped, f"{name} rows": len(motion.t)}
+        found |= {f"{name} stopped": motion.stopped.split(" at ")[0], f"{name} rows": len(motion.t)}
     return found
 
 
