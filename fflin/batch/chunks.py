@@ -16,7 +16,6 @@ from fflin.base.validation import Array
 from fflin.batch.dispatch import ChunkResult
 from fflin.batch.rows import Points
 from fflin.dynamics.inertia import Inertia
-from fflin.kernel.compiled import pays
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
 
@@ -34,7 +33,7 @@ class ChunkJob:
     def __init__(self, robot: Robot, *, at_rest: bool, count: int, **options: Any) -> None:
         self._again = partial(type(self), robot, at_rest=at_rest, count=count, **options)
         self._count = count
-        self.linearizer = Linearizer(robot, **options, engine="python")
+        self.linearizer = Linearizer(robot, **options)
         prepared = self.linearizer.prepared
         # There every field of a model but B is known without computing it.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
@@ -108,8 +107,6 @@ class ChunkJob:
         """The kernel's equations where it pays and knows the robot; threads do them together."""
         from fflin.batch.equations import batch_equations
 
-        if not pays(self._count):
-            return None
         return batch_equations(self.linearizer.prepared, only_inertia=self.only_inertia)
 
     @cached_property

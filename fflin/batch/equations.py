@@ -1,4 +1,4 @@
-"""Linear models about many points at once, by the compiled kernel."""
+"""Linear models about many points at once, their accelerations by the compiled kernel."""
 
 from __future__ import annotations
 
@@ -11,27 +11,24 @@ from numpy.typing import NDArray
 
 from fflin.base.validation import Array
 from fflin.batch.rows import Points
-from fflin.dynamics.chart import SMALLEST_Q0
-from fflin.dynamics.inertia import Inertia
-from fflin.kernel.accelerations import inverse_inertias
-from fflin.kernel.points import PointKernel
-from fflin.kernel.tree import LANES, Tree, batch_tree
+from fflin.dynamics.chart import SMALLEST_Q0, Standing
+from fflin.dynamics.rnea import Rates
+from fflin.kernel.accelerations import Mask, RowRates
+from fflin.kernel.tree import LANES
 from fflin.linear.prepared import LARGEST, Prepared
-
-# Up to this angle the kernel's sines and cosines are exact to rounding [rad].
-_FARTHEST = 1e6
+from fflin.linear.state_equations import assemble, drift
 
 RowNumbers: TypeAlias = NDArray[np.integer[Any]]
-Mask: TypeAlias = NDArray[np.bool_]
+
+# Points that are done at a time, so that what is made of them stays in the cache.
+_BLOCK, _BLOCK_OF_INERTIAS = 256, 2**16
 
 
 class BatchEquations:
     """What differs from point to point of a robot's linear models, about many points."""
 
-    def __init__(self, prepared: Prepared, tree: Tree, kernel: PointKernel | None) -> None:
-        self._prepared, self._tree, self._kernel = prepared, tree, kernel
-        self._block = 1024 if kernel else 2**16  # points that are done at a time
-        self._least_coupling = 0.999 * (6 + prepared.robot.n)
+    def __init__(self, prepared: Prepared, kernel: RowRates, *, only_inertia: bool) -> None:
+        self._prepared, self._kernel, self._only_inertia = prepared, kernel, only_inertia
 
     def write(self, points: Points, out: Mapping[str, Array]) -> RowNumbers:
         """Write what differs from point to point, and return the rows that are left."""
@@ -43,51 +40,46 @@ class BatchEquations:
                 array[:] = more[key][:count]
             return left[left < count]
         good = np.zeros(count, dtype=bool)
-        for start in range(0, count, self._block):
+        block = _BLOCK_OF_INERTIAS if self._only_inertia else _BLOCK
+        for start in range(0, count, block):
             # The last block begins early enough to fill the lanes; some points are done twice.
-            rows = slice(min(start, count - LANES), start + self._block)
+            rows = slice(min(start, count - LANES), start + block)
             place = {key: array[rows] for key, array in out.items()}
             point = points.each(itemgetter(rows))
             with np.errstate(all="ignore"):
-                good[rows] = (
-                    self._anywhere(self._kernel, point, place)
-                    if self._kernel
-                    else self._at_rest(point.q, place["B_lower"])
-                )
+                if self._only_inertia:
+                    judged = self._kernel.write_inverse(point.q, place["B_lower"])
+                    good[rows] = self._kernel.sound(point.q, judged)
+                else:
+                    good[rows] = self._anywhere(point, place)
         return np.flatnonzero(~good)
 
-    def _regular(self, q: Array, couplings: Array) -> Mask:
-        """Return where M is far from singular, and the angles are such that their sines are."""
-        # NaN, from a pivot that is zero, compares false.
-        good = (self._least_coupling < couplings) & (couplings < Inertia.warning_coupling)
-        q_m = q[:, 7:]
-        if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:
-            return good
-        return good & (np.abs(q_m) < _FARTHEST).all(axis=1)
-
-    def _at_rest(self, q: Array, B: Array) -> Mask:
-        """Write M^-1 F at rest, where only u acts, through columns F that do not depend on q."""
-        nv, actuation = B.shape[1], self._prepared.actuation
-        inverse = B if actuation.default else np.empty((len(q), nv, nv))
-        couplings = inverse_inertias(self._tree, q, inverse)
-        if not actuation.default:
-            np.matmul(inverse, actuation.fixed, out=B)
-        return self._regular(q, couplings)
-
-    def _anywhere(self, kernel: PointKernel, points: Points, out: Mapping[str, Array]) -> Mask:
-        """Write A, B and f0 about any points."""
-        state, nu = self._prepared.map, len(self._prepared.actuation.names)
-        (q, v, u), nx = points, state.nx
-        v = np.zeros((len(q), state.robot.nv)) if v is None else v
-        u = np.zeros((len(q), nu)) if u is None else u
-        rate = "_drift" if self._prepared.moving else "f0"
-        shapes = {"A": (nx, nx), "B_lower": (nx // 2, nu), rate: (nx,), "_x0": (nx,)}
-        found = [out[key] if key in out else np.empty((len(q), *x)) for key, x in shapes.items()]
-        coupling, squares, q0 = kernel.many(q, v, u, found).T
-        if self._prepared.moving and "f0" in out:
-            out["f0"][:] = 0.0
+    def _anywhere(self, points: Points, out: Mapping[str, Array]) -> Mask:
+        """Write A, B, f0 and x0 about any points, and return where they are sound."""
+        ready, (q, v, u), A, B = self._prepared, points, out["A"], out["B_lower"]
+        state, actuation, count = ready.map, ready.actuation, len(q)
+        v = np.zeros((count, state.robot.nv)) if v is None else v
+        u = np.zeros((count, len(actuation.names))) if u is None else u
+        chart, r_b = Standing(count), np.zeros((count, 3))
+        if not ready.own_reference:
+            chart, r_b = state.charts(q), state.positions(q)
+        nu, q_m = state.velocities(v), state.joint_positions(q)
+        u = actuation.in_base_axes(chart, u)
+        nv = nu.shape[1]
+        A[:, :nv] = ready.rest["A"][:nv]
+        c, judged = self._kernel.write(q, nu, q_m, u, A, B)
+        rates = Rates(c, A[:, nv:], B, state.gravity(q))
+        f0 = assemble(state, actuation, chart, nu, u, rates, A, moving=ready.moving)
+        out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
+        out["f0"][:] = 0.0 if ready.moving else f0
+        if ready.moving:
+            out["_drift"][:] = drift(state, f0, rates.gravity)
         # NaN compares false.
-        return self._regular(q, coupling) & (squares < LARGEST) & (q0 >= SMALLEST_Q0)
+        good = self._kernel.sound(q, judged) & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
+        for array in (A, B, f0):
+            flat = array.reshape(count, -1)
+            good &= np.vecdot(flat, flat) < LARGEST
+        return good
 
 
 def _filled(rows: Array) -> Array:
@@ -97,8 +89,5 @@ def _filled(rows: Array) -> Array:
 
 def batch_equations(prepared: Prepared, *, only_inertia: bool) -> BatchEquations | None:
     """Return the equations of a robot, or None where the kernel does not know them."""
-    tree = batch_tree(prepared.robot)
-    if tree is None or prepared.sensing is not None:
-        return None
-    simple = only_inertia and not prepared.actuation.carried
-    return BatchEquations(prepared, tree, None if simple else prepared.kernel())
+    kernel = None if prepared.sensing is not None else prepared.kernel()
+    return kernel and BatchEquations(prepared, kernel, only_inertia=only_inertia)

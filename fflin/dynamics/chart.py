@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
-from fflin.base.rotation import skew
+from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
 from fflin.base.validation import Array
 
 # Where q0 is below the square root of the rounding unit, sqrt(1 - |q_b|^2) has no correct digit.
@@ -16,9 +17,20 @@ SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 class Chart:
     """The attitude chart at one base attitude, relative to the reference, or at many."""
 
+    standing: ClassVar[bool] = False  # whether the base is at the reference
+
     q_b: Array  # vector part (.., 3) of the quaternion of refMb
     q0: float | Array  # its scalar part (.., 1), positive
     R: Array  # refMb.rotation (.., 3, 3)
+
+    @classmethod
+    def of(cls, quaternion: Array) -> "Chart":
+        """Return the chart at unit quaternions (.., 4) of refMb, of either sign."""
+        if quaternion.ndim == 1:
+            quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
+            return cls(quaternion[:3], float(quaternion[3]), rotation_matrix(quaternion))
+        quaternion = quaternion * np.where(quaternion[..., 3:] < 0.0, -1.0, 1.0)
+        return cls(quaternion[..., :3], quaternion[..., 3:], rotation_matrices(quaternion))
 
     @cached_property
     def Q(self) -> Array:
@@ -58,20 +70,23 @@ class Chart:
         """Return slopes (.., k, 3) over turns of the base in its axes as slopes over q_b (1.3)."""
         return by_turn @ self.J
 
-    def to_reference(
-        self, parts: tuple[slice, ...], x: Array, *, out: Array | None = None
-    ) -> Array:
-        """Return x (.., m, k), or write to `out`, with parts of three rows turned by R."""
-        return _turned(self.R, parts, x, out)
+    def turn(self, parts: tuple[slice, ...], x: Array) -> None:
+        """Turn parts of x (.., m, k), three rows each, by R where they stand."""
+        _turn(self.R, parts, x)
+
+    def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
+        """Return x (.., m, k) with some parts, three rows each, turned by R."""
+        return _turned(self.R, parts, x)
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts, three rows each, turned to base axes by R^T."""
-        return _turned(self.R.mT, parts, x, None)
+        return _turned(self.R.mT, parts, x)
 
 
 class Standing(Chart):
     """That of a base at the reference, or of many: R = Q = E and J = 2 E cost nothing."""
 
+    standing = True
     N = 0.5 * np.eye(3)
 
     def __init__(self, *count: int) -> None:
@@ -93,11 +108,12 @@ class Standing(Chart):
         """Return twice the slopes."""
         return 2.0 * by_turn
 
-    def to_reference(
-        self, parts: tuple[slice, ...], x: Array, *, out: Array | None = None
-    ) -> Array:
-        """Return x itself, or write it to `out`."""
-        return _turned(self.R, (), x, out)
+    def turn(self, parts: tuple[slice, ...], x: Array) -> None:
+        """Leave x as it is."""
+
+    def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
+        """Return x itself."""
+        return x
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x itself."""
@@ -109,11 +125,14 @@ def times(matrices: Array, vectors: Array) -> Array:
     return (matrices @ vectors[..., None])[..., 0]
 
 
-def _turned(R: Array, parts: tuple[slice, ...], x: Array, out: Array | None) -> Array:
-    if out is None:
-        out = x.copy("K") if parts else x
-    else:
-        out[...] = x
+def _turned(R: Array, parts: tuple[slice, ...], x: Array) -> Array:
+    if not parts:
+        return x
+    turned = x.copy("K")
+    _turn(R, parts, turned)
+    return turned
+
+
+def _turn(R: Array, parts: tuple[slice, ...], x: Array) -> None:
     for rows in parts:
-        out[..., rows, :] = R @ x[..., rows, :]
-    return out
+        x[..., rows, :] = R @ x[..., rows, :]

@@ -138,22 +138,24 @@ class StateMap:
         return pin.XYZQUATToSE3(np.concatenate((self._position, self.origin_quaternion)))
 
     def chart(self, q: Array) -> Chart:
-        """Return the attitude chart at a valid configuration (nq,).
+        """Return the attitude chart at a valid configuration (nq,); see `charts` for rows.
 
         Raises
         ------
         ChartError
             If the base is turned by pi from the reference.
         """
-        quaternion = turning.quaternion_product(self.origin_quaternion, q[3:7])
-        quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
-        q0 = float(quaternion[3])
-        if q0 < SMALLEST_Q0:
+        chart = Chart.of(turning.quaternion_product(self.origin_quaternion, q[3:7]))
+        if chart.q0 < SMALLEST_Q0:
             raise ChartError(
                 "the base is turned by 180 deg from the reference, where the attitude chart "
                 "(quaternion vector part) is singular; give a reference nearer to the base"
             )
-        return Chart(quaternion[:3], q0, turning.rotation_matrix(quaternion))
+        return chart
+
+    def charts(self, q: Array) -> Chart:
+        """Return the attitude charts at rows of valid configurations (N, nq), at any turn."""
+        return Chart.of(q[:, 3:7] @ turning.product_matrix(self.origin_quaternion).T)
 
     def rotation(self, q: Array) -> Array:
         """Return refMb.rotation (3, 3) at a valid configuration, at any turn."""
@@ -161,8 +163,12 @@ class StateMap:
         return turned if self._aligned else self._rotation.dot(turned)
 
     def gravity(self, q: Array) -> Array:
-        """Return the robot's gravity (3,) [m/s^2] in base axes at a valid configuration."""
-        return turning.rotation_matrix(q[3:7]).T @ self._gravity if self._falls else self._gravity
+        """Return the robot's gravity (.., 3) [m/s^2] in base axes, q (.., nq) being valid."""
+        if not self._falls:
+            return self._gravity
+        turned = turning.rotation_matrix if q.ndim == 1 else turning.rotation_matrices
+        rotated: Array = self._gravity @ turned(q[..., 3:7])  # R^T g
+        return rotated
 
     def scalar(self, q: Array) -> float:
         """Return q0 at a valid configuration, with the sign of the quaternion in q."""

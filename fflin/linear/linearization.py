@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from math import hypot
 from threading import Lock
@@ -16,7 +15,7 @@ from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
 from fflin.dynamics.rnea import Accelerations
 from fflin.dynamics.state import Frame
-from fflin.kernel.compiled import POINT_BREAK_EVENS, checked_engine, point_pays
+from fflin.kernel.compiled import checked_engine
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
 from fflin.linear.prepared import LARGEST, prepare
@@ -24,13 +23,10 @@ from fflin.linear.state_equations import assemble, drift
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.kernel.points import PointKernel
+    from fflin.kernel.accelerations import RowOfOne
 
 # With velocities and inputs below this nothing overflows on the way to `LARGEST`.
 _MODERATE = 1e50
-
-# Size of M beyond which BLAS is quicker.
-_LARGEST_COMPILED = 96
 
 
 class Linearizer:
@@ -65,9 +61,8 @@ class Linearizer:
         dynamics: the error is q_b = vec(q*^-1 q), r_b = R*^T (p - p*), the frame is "local", and
         f0 is zero. For a trajectory, and for relative equilibria such as a steady spin.
     engine : {"python", "compiled"}, optional
-        What does points where something moves, pulls or pushes; both give the same to rounding. By
-        default it is the compiled kernel where its code is loaded already, and else from as many
-        calls on as pay for that.
+        What gives the accelerations where something moves, pulls or pushes: Python, which is the
+        default, or the compiled kernel of sweeps. Both agree to machine precision.
 
     Raises
     ------
@@ -114,21 +109,21 @@ class Linearizer:
     ) -> None:
         self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
         self.robot, self._engine = robot, checked_engine(engine)
-        if engine == "compiled":
-            ready.require_kernel()
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
+        self._source: Accelerations | RowOfOne = self._accelerations
+        if engine == "compiled":
+            from fflin.kernel.accelerations import RowOfOne
+
+            self._source = RowOfOne(ready.required_kernel(), self._accelerations)
         self._standing: Chart = Standing()
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         given = hypot(*robot.gravity, *np.concatenate(robot.springs).tolist())
         self._moderate = given < _MODERATE
-        self._calls = 0
-        self._kernel: PointKernel | None = None
-        self._one: Callable[..., bool] | None = None
         self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
-        # What stands for rest and no input; the kernel takes nothing that may not be written.
+        # What stands for rest and no input.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
         self._known = ready.free and ready.own_reference and ready.actuation.default
@@ -148,10 +143,6 @@ class Linearizer:
         with self._lock:
             if known:
                 return self._at_rest(q)
-            if self._one is not None or self._begins():
-                lin = self._by_kernel(q, v, u)
-                if lin is not None:
-                    return lin
             if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
             # An overflow is refused below, so NumPy need not warn of it. Not always done, since
@@ -170,36 +161,6 @@ class Linearizer:
         }
         return partial(type(self), **options, engine=self._engine), (self.robot,)
 
-    def _begins(self) -> bool:
-        """Whether the kernel takes over at this call, which then is there."""
-        self._calls += 1
-        if self._engine is None:
-            small = self._lower.start <= _LARGEST_COMPILED
-            if not (self._calls in POINT_BREAK_EVENS and small and point_pays(self._calls)):
-                return False
-        if self._engine != "python":
-            self._kernel = self.prepared.kernel()
-            self._one = None if self._kernel is None else self._kernel.one()
-        return self._one is not None
-
-    def _by_kernel(self, q: Array, v: Array, u: Array) -> LinearModel | None:
-        """Return the model by the kernel, or None where that cannot vouch for it."""
-        ready, nx = self.prepared, self._lower.stop
-        A, B = np.empty((nx, nx)), np.empty(self._shape_B)
-        rate, x0 = np.empty(nx), np.empty(nx)
-        assert self._one is not None
-        if not self._one(q, v, u, A, B, rate, x0):
-            return None
-        made: dict[str, Array] = {"A": A, "B": B, "x0": x0}
-        if ready.sensing is not None and self._kernel is not None:
-            state = ready.map
-            chart = self._standing if ready.own_reference else state.chart(q)
-            u_base = ready.actuation.in_base_axes(chart, u)
-            rates = self._kernel.rates(state.gravity(q))
-            point = q, v, state.velocities(v), u_base
-            made |= output_equations(ready, self._data, chart, rates, x0, point)
-        return self._model(q, v, u, rate, made)
-
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
         self._accelerations.invert(q, B[self._lower])
@@ -215,16 +176,13 @@ class Linearizer:
             chart, r_b = state.chart(q), state.positions(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
         u_base = ready.actuation.in_base_axes(chart, u)
-        rates = self._accelerations.rates(q, v, nu, q_m, u_base)
         A, B = ready.fields["A"].copy(), np.zeros(self._shape_B)
-        rate = assemble(
-            *(state, ready.actuation, chart, nu, u_base, rates, A, B[self._lower]),
-            moving=ready.moving,
-        )
         x0 = state.compose(chart, r_b, q_m, nu)
         made = {"A": A, "B": B, "x0": x0}
+        rates = self._source.rates(q, v, nu, q_m, u_base, A[self._lower], B[self._lower])
         if ready.sensing is not None:
             made |= output_equations(ready, self._data, chart, rates, x0, (q, v, nu, u_base))
+        rate = assemble(state, ready.actuation, chart, nu, u_base, rates, A, moving=ready.moving)
         for name, array in {**made, "f0": rate}.items():
             flat = array.ravel()
             if name != "x0" and not flat.dot(flat) < LARGEST:  # nor NaN
@@ -305,6 +263,4 @@ def linearize(
     >>> lin.is_equilibrium(1e-9)
     True
     """
-    # Preparing the kernel for one point does not pay; so the last bits are the same everywhere.
-    options: Any = {"reference": reference, "moving": moving, "engine": "python"}
-    return Linearizer(robot, frame=frame, **options)(q, v, u)
+    return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)

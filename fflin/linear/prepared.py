@@ -33,7 +33,7 @@ LARGEST = 1e200
 
 if TYPE_CHECKING:
     from fflin.dynamics.outputs import Sensing
-    from fflin.kernel.points import PointKernel
+    from fflin.kernel.accelerations import RowRates
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,21 +59,21 @@ class Prepared:
         other = {} if self.own_reference else {"_reference": self.reference}
         return {**self.common, **self.rest, "_when_asked": asked, **other}
 
-    def kernel(self) -> PointKernel | None:
-        """Return the compiled equations, or None where the kernel does not know a joint."""
-        from fflin.kernel.points import PointKernel
+    def kernel(self) -> RowRates | None:
+        """Return the compiled accelerations, or None where there are none of this robot."""
+        from fflin.kernel.accelerations import RowRates
         from fflin.kernel.tree import batch_tree
 
-        tree = batch_tree(self.robot)
-        options = {"own": self.own_reference, "moving": self.moving}
-        return tree and PointKernel(self.map, self.actuation, tree, LARGEST, **options)
+        tree = batch_tree(self.robot) if numba_is_there() else None
+        return tree and RowRates(self.map, self.actuation, tree)
 
-    def require_kernel(self) -> None:
-        """Raise `InputError` where there are no compiled equations."""
+    def required_kernel(self) -> RowRates:
+        """Return the compiled accelerations, or raise `InputError` where there are none."""
+        found = self.kernel()
+        if found is not None:
+            return found
         reason = "numba is not installed (pip install 'fflin[fast]')"
         if numba_is_there():
-            if self.kernel() is not None:
-                return
             kind = "is in orbit" if self.robot.orbit else "is of another kind"
             reason = f"{'' if self.robot.orbit else 'a joint of '}'{self.robot.name}' {kind}"
         raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")

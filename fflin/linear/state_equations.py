@@ -3,8 +3,6 @@
 Numbers of equations are those of docs/derivation.md.
 """
 
-from functools import partial
-
 import numpy as np
 
 from fflin.base.rotation import skew
@@ -32,25 +30,29 @@ def assemble(
     u: Array,
     rates: Rates,
     A: Array,
-    B_lower: Array,
     *,
     moving: bool,
 ) -> Array:
-    """Write A and the lower half of B, and return f0 (.., nx)."""
-    g, dot = state.groups, slice(state.nx // 2, state.nx)
+    """Write A (.., nx, nx) and the lower half of B about one point or many; return f0 (.., nx).
+
+    The rates' slopes are A's lower half itself, and their by_u that of B: both are carried from
+    base axes to the chart and frame where they stand. A's upper half is that of `at_rest`.
+    """
+    g, nv = state.groups, state.nx // 2
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
     W = skew(w)
-    by_turn = _over_turns(state, actuation, nu, u, rates)
+    by_turn, by_nu = rates.by_turn, rates.by_nu
+    _add_turns(state, actuation, u, rates, w, W)
     if state.orbit:  # (14.5)
         spin = chart.R.mT @ state.orbit[0]
         by_turn[..., ANGULAR, :] += W @ skew(spin)
-    F = partial(chart.to_reference, state.in_reference)
 
     # Attitude and position.
-    # Q R^T = Q^T.
-    A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
     by_q_b = chart.rate_over_q_b(w, W)
+    if not chart.standing:
+        # Q R^T = Q^T.
+        A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
     if omega_in_reference:
         by_q_b += chart.over_q_b(chart.N @ W)
     A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
@@ -63,41 +65,42 @@ def assemble(
         A[..., g.r_b, g.r_b] = -W  # (5.3)
 
     # Accelerations.
-    F(chart.over_q_b(by_turn), out=A[..., dot, g.q_b])  # (4.6)
-    F(rates.by_q_m, out=A[..., dot, g.q_m])
-    F(F(rates.by_nu.mT, out=A[..., dot, dot].mT).mT, out=A[..., dot, dot])
-    F(actuation.over_inputs(chart, rates.by_u, out=B_lower), out=B_lower)  # (4.7)
+    by_turn[...] = chart.over_q_b(by_turn)
+    chart.turn(state.in_reference, rates.slopes)  # (4.6)
+    chart.turn(state.in_reference, by_nu.mT)
+    chart.turn(state.in_reference, rates.by_u)  # (4.7)
+    actuation.turn_columns(chart, rates.by_u)
     a = rates.c.copy()
     a[..., LINEAR] += rates.gravity
     if state.orbit:  # (14.6)
         turn, pull = state.orbit
-        A[..., g.v_b, g.r_b], A[..., g.v_b, g.v_b] = pull, 0.0 - 2.0 * skew(turn)
-        A[..., g.omega_b, g.omega_b] -= skew(spin)
+        A[..., g.v_b, g.r_b], by_nu[..., LINEAR, LINEAR] = pull, 0.0 - 2.0 * skew(turn)
+        by_nu[..., ANGULAR, ANGULAR] -= skew(spin)
         a[..., ANGULAR] += times(W, spin)
         a[..., LINEAR] -= 2.0 * times(skew(spin), v)
     if not v_in_reference:
-        A[..., g.v_b, g.omega_b] += V  # (4.5)
-        A[..., g.v_b, g.v_b] -= W
+        by_nu[..., LINEAR, ANGULAR] += V  # (4.5)
+        by_nu[..., LINEAR, LINEAR] -= W
         a[..., LINEAR] -= times(W, v)  # (3.2)
+    chart.turn(state.in_reference, a[..., None])
+    return np.concatenate((chart.rate(w), chart.rotated(v), nu[..., 6:], a), -1)  # (4.8)
 
-    f0 = chart.rate(w), chart.rotated(v), nu[..., 6:], F(a[..., None])[..., 0]  # (4.8)
-    return np.concatenate(f0, -1)
 
-
-def _over_turns(state: StateMap, actuation: Actuation, nu: Array, u: Array, rates: Rates) -> Array:
-    """Return the slopes of the rates over turns of the base, Theta (.., 6 + n, 3) of (4.4)."""
+def _add_turns(
+    state: StateMap, actuation: Actuation, u: Array, rates: Rates, w: Array, W: Array
+) -> None:
+    """Make the slopes over turns of the base Theta (.., 6 + n, 3) of (4.4)."""
     omega_in_reference, v_in_reference = state.axes
-    by_turn = np.zeros((*nu.shape, 3)) + rates.by_turn
+    by_turn, c = rates.by_turn, rates.c
     for columns, _ in actuation.held:
         by_turn += rates.by_u[..., columns] @ skew(u[..., columns])
     if omega_in_reference:
-        by_turn += rates.by_nu[..., ANGULAR] @ skew(nu[..., ANGULAR])
-        by_turn[..., ANGULAR, :] -= skew(rates.c[..., ANGULAR])
+        by_turn += rates.by_nu[..., ANGULAR] @ W
+        by_turn[..., ANGULAR, :] -= skew(c[..., ANGULAR])
     if v_in_reference:
-        by_turn[..., LINEAR, :] -= skew(rates.c[..., LINEAR])
+        by_turn[..., LINEAR, :] -= skew(c[..., LINEAR])
     else:
         by_turn[..., LINEAR, :] += skew(rates.gravity)
-    return by_turn
 
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
