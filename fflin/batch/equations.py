@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from operator import itemgetter
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,9 +18,6 @@ from fflin.linear.prepared import LARGEST, Prepared
 from fflin.linear.state_equations import assemble, drift
 
 RowNumbers: TypeAlias = NDArray[np.integer[Any]]
-
-# Points that are done at a time, so that what is made of them stays in the cache.
-_BLOCK, _BLOCK_OF_INERTIAS = 256, 2**16
 
 
 class BatchEquations:
@@ -39,20 +35,11 @@ class BatchEquations:
             for key, array in out.items():
                 array[:] = more[key][:count]
             return left[left < count]
-        good = np.zeros(count, dtype=bool)
-        block = _BLOCK_OF_INERTIAS if self._only_inertia else _BLOCK
-        for start in range(0, count, block):
-            # The last block begins early enough to fill the lanes; some points are done twice.
-            rows = slice(min(start, count - LANES), start + block)
-            place = {key: array[rows] for key, array in out.items()}
-            point = points.each(itemgetter(rows))
-            with np.errstate(all="ignore"):
-                if self._only_inertia:
-                    judged = self._kernel.write_inverse(point.q, place["B_lower"])
-                    good[rows] = self._kernel.sound(point.q, judged)
-                else:
-                    good[rows] = self._anywhere(point, place)
-        return np.flatnonzero(~good)
+        with np.errstate(all="ignore"):
+            if self._only_inertia:
+                judged = self._kernel.write_inverse(points.q, out["B_lower"])
+                return np.flatnonzero(~self._kernel.sound(points.q, judged))
+            return np.flatnonzero(~self._anywhere(points, out))
 
     def _anywhere(self, points: Points, out: Mapping[str, Array]) -> Mask:
         """Write A, B, f0 and x0 about any points, and return where they are sound."""

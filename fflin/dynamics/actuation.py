@@ -112,7 +112,7 @@ class Actuation:
 
     def turn_columns(self, chart: Chart, by_u: Array) -> None:
         """Turn slopes (.., k, nu) over `in_base_axes` to slopes over u: F_u^T of (4.7)."""
-        chart.turn(self._held, by_u.mT)
+        chart.turn_columns(self._held, by_u)
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
         """Return the wrench of thrusters and wheels on every joint, in its frame, if any."""

@@ -47,6 +47,10 @@ class Chart:
         """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes (1.3)."""
         return 2.0 * (self._scalar - skew(self.q_b) + self._over_q0(self.q_b))
 
+    @cached_property
+    def _back(self) -> Array:
+        return np.ascontiguousarray(self.R.mT)
+
     @property
     def _scalar(self) -> Array:
         return np.asarray(self.q0)[..., None] * np.eye(3)
@@ -66,13 +70,18 @@ class Chart:
     def _over_q0(self, omega: Array) -> Array:
         return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
 
-    def over_q_b(self, by_turn: Array) -> Array:
+    def over_q_b(self, by_turn: Array, out: Array | None = None) -> Array:
         """Return slopes (.., k, 3) over turns of the base in its axes as slopes over q_b (1.3)."""
-        return by_turn @ self.J
+        return np.matmul(by_turn, self.J, out=out)
 
-    def turn(self, parts: tuple[slice, ...], x: Array) -> None:
+    def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
         """Turn parts of x (.., m, k), three rows each, by R where they stand."""
         _turn(self.R, parts, x)
+
+    def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
+        """Turn parts of x (.., k, m), three columns each, by R^T where they stand."""
+        for columns in parts:
+            x[..., columns] = x[..., columns] @ self._back
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts, three rows each, turned by R."""
@@ -80,7 +89,7 @@ class Chart:
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts, three rows each, turned to base axes by R^T."""
-        return _turned(self.R.mT, parts, x)
+        return _turned(self._back, parts, x)
 
 
 class Standing(Chart):
@@ -104,11 +113,14 @@ class Standing(Chart):
         """Return -[omega]x / 2."""
         return -0.5 * crossed
 
-    def over_q_b(self, by_turn: Array) -> Array:
+    def over_q_b(self, by_turn: Array, out: Array | None = None) -> Array:
         """Return twice the slopes."""
-        return 2.0 * by_turn
+        return np.multiply(2.0, by_turn, out=out)
 
-    def turn(self, parts: tuple[slice, ...], x: Array) -> None:
+    def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
+        """Leave x as it is."""
+
+    def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
         """Leave x as it is."""
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:

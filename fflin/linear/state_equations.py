@@ -38,60 +38,59 @@ def assemble(
     The rates' slopes are A's lower half itself, and their by_u that of B: both are carried from
     base axes to the chart and frame where they stand. A's upper half is that of `at_rest`.
     """
-    g, nv = state.groups, state.nx // 2
+    g, nv, lower = state.groups, state.nx // 2, rates.slopes
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
     W = skew(w)
-    by_turn, by_nu = rates.by_turn, rates.by_nu
-    _add_turns(state, actuation, u, rates, w, W)
+    by_turn = _over_turns(state, actuation, u, rates, w, W)
+    f0 = np.concatenate((chart.rate(w), chart.rotated(v), nu[..., 6:], rates.c), -1)  # (4.8)
     if state.orbit:  # (14.5)
         spin = chart.R.mT @ state.orbit[0]
         by_turn[..., ANGULAR, :] += W @ skew(spin)
 
-    # Attitude and position.
-    by_q_b = chart.rate_over_q_b(w, W)
+    # Attitude and position; `at_rest` is what does not change at the reference.
+    if moving:
+        A[..., g.q_b, g.q_b] = A[..., g.r_b, g.r_b] = -W  # (5.2), (5.3)
+    else:
+        by_q_b = chart.rate_over_q_b(w, W)
+        if omega_in_reference:
+            by_q_b += chart.over_q_b(chart.N @ W)
+        A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
     if not chart.standing:
         # Q R^T = Q^T.
         A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
-    if omega_in_reference:
-        by_q_b += chart.over_q_b(chart.N @ W)
-    A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
     if not v_in_reference:
         V = skew(v)
         A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.R @ V)  # (4.3)
         A[..., g.r_b, g.v_b] = chart.R
-    if moving:
-        A[..., g.q_b, g.q_b] = -W  # (5.2)
-        A[..., g.r_b, g.r_b] = -W  # (5.3)
 
     # Accelerations.
-    by_turn[...] = chart.over_q_b(by_turn)
-    chart.turn(state.in_reference, rates.slopes)  # (4.6)
-    chart.turn(state.in_reference, by_nu.mT)
-    chart.turn(state.in_reference, rates.by_u)  # (4.7)
+    chart.over_q_b(by_turn, out=lower[..., g.q_b])
+    chart.turn_rows(state.in_reference, lower)  # (4.6)
+    chart.turn_columns(state.in_reference, lower[..., nv:])
+    chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
     actuation.turn_columns(chart, rates.by_u)
-    a = rates.c.copy()
-    a[..., LINEAR] += rates.gravity
+    f0[..., g.v_b] += rates.gravity
     if state.orbit:  # (14.6)
         turn, pull = state.orbit
-        A[..., g.v_b, g.r_b], by_nu[..., LINEAR, LINEAR] = pull, 0.0 - 2.0 * skew(turn)
-        by_nu[..., ANGULAR, ANGULAR] -= skew(spin)
-        a[..., ANGULAR] += times(W, spin)
-        a[..., LINEAR] -= 2.0 * times(skew(spin), v)
+        A[..., g.v_b, g.r_b], A[..., g.v_b, g.v_b] = pull, 0.0 - 2.0 * skew(turn)
+        A[..., g.omega_b, g.omega_b] -= skew(spin)
+        f0[..., g.omega_b] += times(W, spin)
+        f0[..., g.v_b] -= 2.0 * times(skew(spin), v)
     if not v_in_reference:
-        by_nu[..., LINEAR, ANGULAR] += V  # (4.5)
-        by_nu[..., LINEAR, LINEAR] -= W
-        a[..., LINEAR] -= times(W, v)  # (3.2)
-    chart.turn(state.in_reference, a[..., None])
-    return np.concatenate((chart.rate(w), chart.rotated(v), nu[..., 6:], a), -1)  # (4.8)
+        A[..., g.v_b, g.omega_b] += V  # (4.5)
+        A[..., g.v_b, g.v_b] -= W
+        f0[..., g.v_b] -= times(W, v)  # (3.2)
+    chart.turn_rows(state.in_reference, f0[..., nv:, None])
+    return f0
 
 
-def _add_turns(
+def _over_turns(
     state: StateMap, actuation: Actuation, u: Array, rates: Rates, w: Array, W: Array
-) -> None:
-    """Make the slopes over turns of the base Theta (.., 6 + n, 3) of (4.4)."""
+) -> Array:
+    """Return the slopes of the rates over turns of the base, Theta (.., 6 + n, 3) of (4.4)."""
     omega_in_reference, v_in_reference = state.axes
-    by_turn, c = rates.by_turn, rates.c
+    by_turn, c = rates.by_turn.copy(), rates.c
     for columns, _ in actuation.held:
         by_turn += rates.by_u[..., columns] @ skew(u[..., columns])
     if omega_in_reference:
@@ -101,6 +100,7 @@ def _add_turns(
         by_turn[..., LINEAR, :] -= skew(c[..., LINEAR])
     else:
         by_turn[..., LINEAR, :] += skew(rates.gravity)
+    return by_turn
 
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
