@@ -12,7 +12,7 @@ from fflin.base.validation import Array
 from fflin.batch.rows import Points
 from fflin.dynamics.chart import SMALLEST_Q0, Standing
 from fflin.dynamics.rnea import Rates
-from fflin.kernel.accelerations import Mask, RowRates
+from fflin.kernel.accelerations import Mask
 from fflin.kernel.tree import LANES
 from fflin.linear.prepared import LARGEST, Prepared
 from fflin.linear.state_equations import assemble, drift
@@ -23,8 +23,9 @@ RowNumbers: TypeAlias = NDArray[np.integer[Any]]
 class BatchEquations:
     """What differs from point to point of a robot's linear models, about many points."""
 
-    def __init__(self, prepared: Prepared, kernel: RowRates, *, only_inertia: bool) -> None:
-        self._prepared, self._kernel, self._only_inertia = prepared, kernel, only_inertia
+    def __init__(self, prepared: Prepared, *, only_inertia: bool) -> None:
+        self._prepared, self._only_inertia = prepared, only_inertia
+        self._kernel = prepared.kernel()
 
     def write(self, points: Points, out: Mapping[str, Array]) -> RowNumbers:
         """Write what differs from point to point, and return the rows that are left."""
@@ -72,9 +73,3 @@ class BatchEquations:
 def _filled(rows: Array) -> Array:
     """Return as many rows as lanes, the last of them repeated."""
     return np.pad(rows, ((0, LANES - len(rows)), (0, 0)), mode="edge")
-
-
-def batch_equations(prepared: Prepared, *, only_inertia: bool) -> BatchEquations | None:
-    """Return the equations of a robot, or None where the kernel does not know them."""
-    kernel = None if prepared.sensing is not None else prepared.kernel()
-    return kernel and BatchEquations(prepared, kernel, only_inertia=only_inertia)

@@ -50,6 +50,7 @@ def sweep(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
     moving: bool = False,
+    engine: str | None = None,
     executor: Executor | None = None,
     workers: int | None = None,
     threads: int | None = None,
@@ -75,6 +76,8 @@ def sweep(
         Over the robot's inputs; zero by default.
     frame, reference, moving : optional
         See `Linearizer`. The reference is the base's own at each point by default.
+    engine : {"python", "compiled"}, optional
+        Compiled by default wherever numba is installed and the outputs are the state.
     executor : concurrent.futures.Executor, optional
         Whose workers do the chunks: processes, dask (``Client.get_executor()``), mpi4py.futures.
         The robot is sent to each worker once. It is not shut down.
@@ -100,7 +103,9 @@ def sweep(
     Raises
     ------
     InputError
-        If a size or value is wrong; a row is named.
+        If a size or value is wrong; a row is named. Or the compiled engine is asked for and cannot.
+    UnknownNameError
+        If there is no such engine.
     SweepError
         If there is no model about a point or a worker dies again and again; the chunk is named, and
         `SweepError.batch` or the file has the others.
@@ -124,7 +129,7 @@ def sweep(
     path = None if out is None else output_path(out)
     points = as_configurations(robot, q)
     options: Any = {"frame": frame, "reference": reference, "moving": moving}
-    job = ChunkJob(robot, at_rest=v is None and u is None, count=len(points), **options)
+    job = ChunkJob(robot, at_rest=v is None and u is None, engine=engine, **options)
     check_room(len(points), len(points) * _row_bytes(job), path)
     task = SweepTask(job, points, v, u)
     parallel = executor is not None or workers is not None
@@ -154,7 +159,7 @@ def planned_bytes(
 ) -> int:
     """Return how large the result of a sweep over so many points is [bytes]."""
     options: Any = {"frame": frame, "reference": reference, "moving": False}
-    return count * _row_bytes(ChunkJob(robot, at_rest=at_rest, count=count, **options))
+    return count * _row_bytes(ChunkJob(robot, at_rest=at_rest, **options))
 
 
 def _row_bytes(job: ChunkJob) -> int:

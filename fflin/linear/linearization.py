@@ -116,7 +116,7 @@ class Linearizer:
         if engine == "compiled":
             from fflin.kernel.accelerations import RowOfOne
 
-            self._source = RowOfOne(ready.required_kernel(), self._accelerations)
+            self._source = RowOfOne(ready.kernel(), self._accelerations)
         self._standing: Chart = Standing()
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)

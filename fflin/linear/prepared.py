@@ -59,24 +59,30 @@ class Prepared:
         other = {} if self.own_reference else {"_reference": self.reference}
         return {**self.common, **self.rest, "_when_asked": asked, **other}
 
-    def kernel(self) -> RowRates | None:
-        """Return the compiled accelerations, or None where there are none of this robot."""
+    def kernel(self) -> RowRates:
+        """Return the compiled accelerations; `InputError` where there are none of this robot."""
+        if reason := self.not_compilable:
+            raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
         from fflin.kernel.accelerations import RowRates
         from fflin.kernel.tree import batch_tree
 
-        tree = batch_tree(self.robot) if numba_is_there() else None
-        return tree and RowRates(self.map, self.actuation, tree)
+        return RowRates(self.map, self.actuation, batch_tree(self.robot))
 
-    def required_kernel(self) -> RowRates:
-        """Return the compiled accelerations, or raise `InputError` where there are none."""
-        found = self.kernel()
-        if found is not None:
-            return found
-        reason = "numba is not installed (pip install 'fflin[fast]')"
-        if numba_is_there():
-            kind = "is in orbit" if self.robot.orbit else "is of another kind"
-            reason = f"{'' if self.robot.orbit else 'a joint of '}'{self.robot.name}' {kind}"
-        raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
+    @property
+    def not_compilable(self) -> str:
+        """Why there are no compiled accelerations of this robot; empty where there are."""
+        from fflin.kernel.tree import batch_tree
+
+        name = self.robot.name
+        if not numba_is_there():
+            return "numba is not installed (pip install 'fflin[fast]')"
+        if batch_tree(self.robot) is None:
+            return (
+                f"'{name}' is in orbit"
+                if self.robot.orbit
+                else f"a joint of '{name}' is of another kind"
+            )
+        return ""
 
 
 def prepare(
