@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fflin.base.validation import Array
 from fflin.batch.rows import Points
-from fflin.dynamics.chart import SMALLEST_Q0, Standing
+from fflin.dynamics.chart import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.rnea import Rates
 from fflin.kernel.accelerations import Mask
 from fflin.kernel.tree import LANES
@@ -48,9 +48,9 @@ class BatchEquations:
         state, actuation, count = ready.map, ready.actuation, len(q)
         v = np.zeros((count, state.robot.nv)) if v is None else v
         u = np.zeros((count, len(actuation.names))) if u is None else u
-        chart, r_b = Standing(count), np.zeros((count, 3))
-        if not ready.own_reference:
-            chart, r_b = state.charts(q), state.positions(q)
+        own = ready.own_reference
+        chart: Chart = Standing(count) if own else state.charts(q)
+        r_b: Array = np.zeros((count, 3)) if own else state.positions(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
         u = actuation.in_base_axes(chart, u)
         nv = nu.shape[1]

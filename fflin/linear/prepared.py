@@ -61,12 +61,13 @@ class Prepared:
 
     def kernel(self) -> RowRates:
         """Return the compiled accelerations; `InputError` where there are none of this robot."""
-        if reason := self.not_compilable:
-            raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
         from fflin.kernel.accelerations import RowRates
         from fflin.kernel.tree import batch_tree
 
-        return RowRates(self.map, self.actuation, batch_tree(self.robot))
+        tree, reason = batch_tree(self.robot), self.not_compilable
+        if tree is None or reason:
+            raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
+        return RowRates(self.map, self.actuation, tree)
 
     @property
     def not_compilable(self) -> str:
@@ -76,13 +77,9 @@ class Prepared:
         name = self.robot.name
         if not numba_is_there():
             return "numba is not installed (pip install 'fflin[fast]')"
-        if batch_tree(self.robot) is None:
-            return (
-                f"'{name}' is in orbit"
-                if self.robot.orbit
-                else f"a joint of '{name}' is of another kind"
-            )
-        return ""
+        if self.robot.orbit:
+            return f"'{name}' is in orbit"
+        return "" if batch_tree(self.robot) else f"a joint of '{name}' is of another kind"
 
 
 def prepare(
