@@ -63,6 +63,10 @@ class Chart:
         """Return vectors (.., 3) in base axes in reference axes."""
         return times(self.R, vectors)
 
+    def turned(self, columns: Array) -> Array:
+        """Return columns (.., 3, k) in base axes in reference axes."""
+        return self.R @ columns
+
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return the slope (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
         return -0.5 * (crossed + self._over_q0(omega))
@@ -108,6 +112,10 @@ class Standing(Chart):
     def rotated(self, vectors: Array) -> Array:
         """Return the vectors themselves."""
         return vectors
+
+    def turned(self, columns: Array) -> Array:
+        """Return the columns themselves."""
+        return columns
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return -[omega]x / 2."""

@@ -66,6 +66,7 @@ class Accelerations:
         self._bias = np.zeros((self._nv, 2 * self._nv))  # slopes of the forces, over the same
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
         self._field = field_of(robot, state.frame)
+        self._still = np.zeros(robot.nq), np.zeros(robot.nv)
 
     def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
@@ -83,8 +84,8 @@ class Accelerations:
         # Without the base's position and linear velocity: nothing here depends on them, and
         # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
         # accelerates the base origin and nothing against it (equivalence).
-        q_still, v_still = q.copy(), v.copy()
-        q_still[:3] = v_still[:3] = 0.0
+        q_still, v_still = self._still
+        q_still[3:], v_still[3:] = q[3:], v[3:]
         if tide:
             v_still[PIN_ANGULAR] += tide.spin
             pull = tide.force(model, data, q_still)

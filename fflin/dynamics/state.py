@@ -107,7 +107,9 @@ class StateMap:
         self._cos = self._idx_q[self.unbounded]
         self._sin = self._cos + 1
         root = robot.model.jointPlacements[ROOT].rotation
-        self._gravity, self._falls = root.T @ np.array(robot.gravity), any(robot.gravity)
+        self._gravity, self._pulled = root.T @ np.array(robot.gravity), any(robot.gravity)
+        # Whether anything accelerates the base's origin against the reference.
+        self.falls = self._pulled or robot.orbit is not None
         self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
 
     def about(self, reference: pin.SE3) -> "StateMap":
@@ -164,7 +166,7 @@ class StateMap:
 
     def gravity(self, q: Array) -> Array:
         """Return the robot's gravity (.., 3) [m/s^2] in base axes, q (.., nq) being valid."""
-        if not self._falls:
+        if not self._pulled:
             return self._gravity
         turned = turning.rotation_matrix if q.ndim == 1 else turning.rotation_matrices
         rotated: Array = self._gravity @ turned(q[..., 3:7])  # R^T g
@@ -215,7 +217,9 @@ class StateMap:
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
         """Return the state (.., nx) of its parts, velocities nu (.., 6 + n) in base axes."""
-        in_frame = self.to_frame(chart, nu[..., None])[..., 0]
+        in_frame = nu
+        if not chart.standing:
+            in_frame = self.to_frame(chart, nu[..., None])[..., 0]
         return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
     def to_pinocchio(self, x: Array) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ Numbers of equations are those of docs/derivation.md.
 
 import numpy as np
 
-from fflin.base.rotation import skew
+from fflin.base.rotation import product, skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart, times
@@ -59,18 +59,21 @@ def assemble(
     if not chart.standing:
         # Q R^T = Q^T.
         A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
+        if not v_in_reference:
+            A[..., g.r_b, g.v_b] = chart.R
     if not v_in_reference:
         V = skew(v)
-        A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.R @ V)  # (4.3)
-        A[..., g.r_b, g.v_b] = chart.R
+        A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.turned(V))  # (4.3)
 
     # Accelerations.
     chart.over_q_b(by_turn, out=lower[..., g.q_b])
-    chart.turn_rows(state.in_reference, lower)  # (4.6)
-    chart.turn_columns(state.in_reference, lower[..., nv:])
-    chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
-    actuation.turn_columns(chart, rates.by_u)
-    f0[..., g.v_b] += rates.gravity
+    if not chart.standing:
+        chart.turn_rows(state.in_reference, lower)  # (4.6)
+        chart.turn_columns(state.in_reference, lower[..., nv:])
+        chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
+        actuation.turn_columns(chart, rates.by_u)
+    if state.falls:
+        f0[..., g.v_b] += rates.gravity
     if state.orbit:  # (14.6)
         turn, pull = state.orbit
         A[..., g.v_b, g.r_b], A[..., g.v_b, g.v_b] = pull, 0.0 - 2.0 * skew(turn)
@@ -81,7 +84,8 @@ def assemble(
         A[..., g.v_b, g.omega_b] += V  # (4.5)
         A[..., g.v_b, g.v_b] -= W
         f0[..., g.v_b] -= times(W, v)  # (3.2)
-    chart.turn_rows(state.in_reference, f0[..., nv:, None])
+    if not chart.standing:
+        chart.turn_rows(state.in_reference, f0[..., nv:, None])
     return f0
 
 
@@ -92,13 +96,13 @@ def _over_turns(
     omega_in_reference, v_in_reference = state.axes
     by_turn, c = rates.by_turn.copy(), rates.c
     for columns, _ in actuation.held:
-        by_turn += rates.by_u[..., columns] @ skew(u[..., columns])
+        by_turn += product(rates.by_u[..., columns], skew(u[..., columns]))
     if omega_in_reference:
-        by_turn += rates.by_nu[..., ANGULAR] @ W
+        by_turn += product(rates.by_nu[..., ANGULAR], W)
         by_turn[..., ANGULAR, :] -= skew(c[..., ANGULAR])
     if v_in_reference:
         by_turn[..., LINEAR, :] -= skew(c[..., LINEAR])
-    else:
+    elif state.falls:
         by_turn[..., LINEAR, :] += skew(rates.gravity)
     return by_turn
 
