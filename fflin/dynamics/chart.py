@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
+from fflin.base.rotation import product, rotation_matrices, rotation_matrix, skew
 from fflin.base.validation import Array
 
 # Where q0 is below the square root of the rounding unit, sqrt(1 - |q_b|^2) has no correct digit.
@@ -65,7 +65,7 @@ class Chart:
 
     def turned(self, columns: Array) -> Array:
         """Return columns (.., 3, k) in base axes in reference axes."""
-        return self.R @ columns
+        return product(self.R, columns)
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return the slope (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
@@ -85,7 +85,7 @@ class Chart:
     def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
         """Turn parts of x (.., k, m), three columns each, by R^T where they stand."""
         for columns in parts:
-            x[..., columns] = x[..., columns] @ self._back
+            x[..., columns] = product(x[..., columns], self._back)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts, three rows each, turned by R."""
@@ -155,4 +155,4 @@ def _turned(R: Array, parts: tuple[slice, ...], x: Array) -> Array:
 
 def _turn(R: Array, parts: tuple[slice, ...], x: Array) -> None:
     for rows in parts:
-        x[..., rows, :] = R @ x[..., rows, :]
+        x[..., rows, :] = product(R, x[..., rows, :])

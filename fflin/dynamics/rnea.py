@@ -63,7 +63,9 @@ class Accelerations:
         self._passive = robot.springs
         self._resists = any(values.any() for values in robot.springs)
         self._joints = np.arange(6, self._nv)
-        self._bias = np.zeros((self._nv, 2 * self._nv))  # slopes of the forces, over the same
+        # Slopes of the forces over the same as those of the accelerations.
+        self._bias = np.zeros((self._nv, 2 * self._nv))
+        self._bias_by_q, self._bias_by_nu = np.split(self._bias, 2, axis=1)
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
         self._field = field_of(robot, state.frame)
         self._still = np.zeros(robot.nq), np.zeros(robot.nv)
@@ -130,11 +132,11 @@ class Accelerations:
         )
         if gyroscopic:
             full_q, full_v = full_q - gyroscopic.by_q, full_v - gyroscopic.by_v
-        nv, joints = self._nv, self._joints
-        self._bias[:, :nv], self._bias[:, nv:] = state.project(full_q), state.project(full_v)
+        self._bias_by_q[:], self._bias_by_nu[:] = state.project(full_q), state.project(full_v)
         if self._resists:
-            self._bias[joints, joints] += self._passive.stiffness
-            self._bias[joints, nv + joints] += self._passive.damping
+            joints = self._joints
+            self._bias_by_q[joints, joints] += self._passive.stiffness
+            self._bias_by_nu[joints, joints] += self._passive.damping
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
         """Return the torques of stored momentum, their wrenches with those of the inputs."""

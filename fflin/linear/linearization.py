@@ -183,9 +183,9 @@ class Linearizer:
         if ready.sensing is not None:
             made |= output_equations(ready, self._data, chart, rates, x0, (q, v, nu, u_base))
         rate = assemble(state, ready.actuation, chart, nu, u_base, rates, A, moving=ready.moving)
-        for name, array in {**made, "f0": rate}.items():
+        for array in (rate, *made.values()):
             flat = array.ravel()
-            if name != "x0" and not flat.dot(flat) < LARGEST:  # nor NaN
+            if array is not x0 and not flat.dot(flat) < LARGEST:  # nor NaN
                 raise InputError("q, v or u is so large that the model is not finite")
         rate = drift(state, rate, rates.gravity) if ready.moving else rate
         return self._model(q, v, u, rate, made)

@@ -54,7 +54,7 @@ def assemble(
     else:
         by_q_b = chart.rate_over_q_b(w, W)
         if omega_in_reference:
-            by_q_b += chart.over_q_b(chart.N @ W)
+            by_q_b += chart.over_q_b(product(chart.N, W))
         A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
     if not chart.standing:
         # Q R^T = Q^T.
