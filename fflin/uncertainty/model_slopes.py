@@ -72,9 +72,7 @@ class ModelSlopes:
         ready, state, nu = self._ready, self._ready.map, self._ready.map.velocities(self.lin.v)
         count, nv = len(rates.c) + 1, len(nu)
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
-        with_none = Rates(
-            *(np.zeros((count, nv)), A[:, nv:], B[:, nv:], np.zeros((count, *rates.gravity.shape)))
-        )
+        with_none = Rates(*(np.zeros((count, nv)), A[:, nv:], B[:, nv:], np.zeros((count, 3))))
         for part, of_parameters in zip(with_none, rates, strict=True):
             part[:-1] = of_parameters
         f0 = assemble(
