@@ -118,9 +118,11 @@ class RowOfOne:
         self, q: Array, v: Array, nu: Array, q_m: Array, u: Array, slopes: Array, by_u: Array
     ) -> Rates:
         """Return the rates as `Accelerations.rates` does."""
-        lanes = [np.repeat(each[None], LANES, axis=0) for each in (q, nu, q_m, u)]
+        eight_q, eight_nu, eight_q_m, eight_u = (
+            np.repeat(each[None], LANES, axis=0) for each in (q, nu, q_m, u)
+        )
         all_slopes, all_by_u = (np.empty((LANES, *each.shape)) for each in (slopes, by_u))
-        c, judged = self._rows.write(*lanes, all_slopes, all_by_u)
+        c, judged = self._rows.write(eight_q, eight_nu, eight_q_m, eight_u, all_slopes, all_by_u)
         if not (self._rows.sound(q[None], judged[:1]).all() and judged[0, 1] < LARGEST_SHARE):
             return self._otherwise.rates(q, v, nu, q_m, u, slopes, by_u)
         slopes[:], by_u[:] = all_slopes[0], all_by_u[0]
