@@ -20,6 +20,12 @@ def skew(a: Array) -> Array:
     return (a @ _CROSS.T).reshape(*a.shape, 3)
 
 
+def product(a: Array, b: Array) -> Array:
+    """Return a b of matrices (..., i, j) and (..., j, k)."""
+    # `dot` takes half the time of `@` for two small matrices.
+    return a.dot(b) if a.ndim == b.ndim == 2 else a @ b
+
+
 def quaternion_product(a: Array, b: Array) -> Array:
     """Return the Hamilton product a b, (4,) in x, y, z, w, scaled to unit length."""
     ax, ay, az, aw = a.tolist()

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinError, FflinWarning
+from fflin.base.errors import FflinError, FflinWarning, InputError
 from fflin.base.validation import Array
 from fflin.batch.dispatch import ChunkResult
 from fflin.batch.rows import Points
 from fflin.dynamics.inertia import Inertia
-from fflin.kernel.compiled import pays
+from fflin.kernel.compiled import checked_engine
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
 
@@ -29,13 +29,22 @@ _TURN = Lock()
 
 
 class ChunkJob:
-    """Linearises chunks of `count` points, `at_rest` all, as `Linearizer` does."""
+    """Linearises chunks of points, `at_rest` all, as `Linearizer` does."""
 
-    def __init__(self, robot: Robot, *, at_rest: bool, count: int, **options: Any) -> None:
-        self._again = partial(type(self), robot, at_rest=at_rest, count=count, **options)
-        self._count = count
-        self.linearizer = Linearizer(robot, **options, engine="python")
+    def __init__(
+        self, robot: Robot, *, at_rest: bool, engine: str | None = None, **options: Any
+    ) -> None:
+        self._again = partial(type(self), robot, at_rest=at_rest, engine=engine, **options)
+        self._engine = checked_engine(engine)
+        self.linearizer = Linearizer(robot, **options)
         prepared = self.linearizer.prepared
+        if engine == "compiled":
+            if prepared.sensing is not None:
+                raise InputError(
+                    "engine='compiled' cannot run this: sweeps of other outputs than the state go "
+                    "point by point; leave it out"
+                )
+            prepared.kernel()  # which says where there is none
         # There every field of a model but B is known without computing it.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
 
@@ -105,12 +114,13 @@ class ChunkJob:
 
     @cached_property
     def compiled(self) -> BatchEquations | None:
-        """The kernel's equations where it pays and knows the robot; threads do them together."""
-        from fflin.batch.equations import batch_equations
-
-        if not pays(self._count):
+        """The kernel's equations, unless it does not know the robot; threads do them together."""
+        prepared = self.linearizer.prepared
+        if self._engine == "python" or prepared.sensing is not None or prepared.not_compilable:
             return None
-        return batch_equations(self.linearizer.prepared, only_inertia=self.only_inertia)
+        from fflin.batch.equations import BatchEquations
+
+        return BatchEquations(prepared, only_inertia=self.only_inertia)
 
     @cached_property
     def _inertia(self) -> tuple[Inertia, pin.Data]:

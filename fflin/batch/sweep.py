@@ -50,6 +50,7 @@ def sweep(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
     moving: bool = False,
+    engine: str | None = None,
     executor: Executor | None = None,
     workers: int | None = None,
     threads: int | None = None,
@@ -76,6 +77,8 @@ def sweep(
         Inputs of the robot; zero by default.
     frame, reference, moving : optional
         See `Linearizer`. By default the reference is the base pose at each point.
+    engine : {"python", "compiled"}, optional
+        Compiled by default if numba is installed and the outputs are the state.
     executor : concurrent.futures.Executor, optional
         Executor whose workers process the chunks: processes, dask (``Client.get_executor()``) or
         mpi4py.futures. The robot is sent to each worker once. The executor is not shut down.
@@ -101,7 +104,10 @@ def sweep(
     Raises
     ------
     InputError
-        If a size or value is wrong; the message names the row.
+        If a size or value is wrong; the message names the row. Also if the compiled engine is
+        requested and not available.
+    UnknownNameError
+        If the engine does not exist.
     SweepError
         If a point cannot be linearised, or a worker dies repeatedly. The message names the chunk;
         `SweepError.batch` or the file holds the other chunks.
@@ -125,7 +131,7 @@ def sweep(
     path = None if out is None else output_path(out)
     points = as_configurations(robot, q)
     options: Any = {"frame": frame, "reference": reference, "moving": moving}
-    job = ChunkJob(robot, at_rest=v is None and u is None, count=len(points), **options)
+    job = ChunkJob(robot, at_rest=v is None and u is None, engine=engine, **options)
     check_room(len(points), len(points) * _row_bytes(job), path)
     task = SweepTask(job, points, v, u)
     parallel = executor is not None or workers is not None
@@ -155,7 +161,7 @@ def planned_bytes(
 ) -> int:
     """Return how large the result of a sweep over so many points is [bytes]."""
     options: Any = {"frame": frame, "reference": reference, "moving": False}
-    return count * _row_bytes(ChunkJob(robot, at_rest=at_rest, count=count, **options))
+    return count * _row_bytes(ChunkJob(robot, at_rest=at_rest, **options))
 
 
 def _row_bytes(job: ChunkJob) -> int:

@@ -28,7 +28,7 @@ class Shooting:
         self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
         # Of one engine, so that a plan is the same to the last bit whatever ran before.
-        self._linearizer = Linearizer(robot, moving=True, engine="python")
+        self._linearizer = Linearizer(robot, moving=True)
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 

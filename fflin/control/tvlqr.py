@@ -190,7 +190,7 @@ def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
     v[spinning] = traj.v[end, spinning]
     held = equilibrium(robot, q, v=v)
-    return Linearizer(robot, moving=True, engine="python")(held.q, v, held.u)
+    return Linearizer(robot, moving=True)(held.q, v, held.u)
 
 
 def steady_regulator(

@@ -110,9 +110,9 @@ class Actuation:
         R = self._state.origin.rotation @ rotation_matrices(q[:, 3:7])
         return self.in_base_axes(Chart(q[:, 3:6], q[:, 6:7], R), u)
 
-    def over_inputs(self, chart: Chart, by_u: Array, *, out: Array | None = None) -> Array:
-        """Convert derivatives (.., k, nu) over `in_base_axes` to derivatives over u: (4.7)."""
-        return chart.to_reference(self._held, by_u.mT, out=None if out is None else out.mT).mT
+    def turn_columns(self, chart: Chart, by_u: Array) -> None:
+        """Convert derivatives (.., k, nu) over `in_base_axes` to those over u: F_u^T of (4.7)."""
+        chart.turn_columns(self._held, by_u)
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
         """Return the wrench of thrusters and wheels on every joint, in its frame, if any."""

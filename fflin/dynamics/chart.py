@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
-from fflin.base.rotation import skew
+from fflin.base.rotation import product, rotation_matrices, rotation_matrix, skew
 from fflin.base.validation import Array
 
 # Where q0 is below the square root of the rounding unit, sqrt(1 - |q_b|^2) has no correct digit.
@@ -16,9 +17,20 @@ SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 class Chart:
     """Attitude chart at one or many base attitudes relative to the reference."""
 
+    standing: ClassVar[bool] = False  # whether the base is at the reference
+
     q_b: Array  # vector part (.., 3) of the quaternion of refMb
     q0: float | Array  # its scalar part (.., 1), positive
     R: Array  # refMb.rotation (.., 3, 3)
+
+    @classmethod
+    def of(cls, quaternion: Array) -> "Chart":
+        """Return the chart at unit quaternions (.., 4) of refMb, of either sign."""
+        if quaternion.ndim == 1:
+            quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
+            return cls(quaternion[:3], float(quaternion[3]), rotation_matrix(quaternion))
+        quaternion = quaternion * np.where(quaternion[..., 3:] < 0.0, -1.0, 1.0)
+        return cls(quaternion[..., :3], quaternion[..., 3:], rotation_matrices(quaternion))
 
     @cached_property
     def Q(self) -> Array:
@@ -35,6 +47,10 @@ class Chart:
         """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes (1.3)."""
         return 2.0 * (self._scalar - skew(self.q_b) + self._over_q0(self.q_b))
 
+    @cached_property
+    def _back(self) -> Array:
+        return np.ascontiguousarray(self.R.mT)
+
     @property
     def _scalar(self) -> Array:
         return np.asarray(self.q0)[..., None] * np.eye(3)
@@ -47,6 +63,10 @@ class Chart:
         """Return vectors (.., 3) in base axes in reference axes."""
         return times(self.R, vectors)
 
+    def turned(self, columns: Array) -> Array:
+        """Return columns (.., 3, k) in base axes in reference axes."""
+        return product(self.R, columns)
+
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return the derivative (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
         return -0.5 * (crossed + self._over_q0(omega))
@@ -54,24 +74,32 @@ class Chart:
     def _over_q0(self, omega: Array) -> Array:
         return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
 
-    def over_q_b(self, by_turn: Array) -> Array:
+    def over_q_b(self, by_turn: Array, out: Array | None = None) -> Array:
         """Return derivatives (.., k, 3) over base rotations as derivatives over q_b (1.3)."""
-        return by_turn @ self.J
+        return np.matmul(by_turn, self.J, out=out)
 
-    def to_reference(
-        self, parts: tuple[slice, ...], x: Array, *, out: Array | None = None
-    ) -> Array:
-        """Return x (.., m, k), or write to `out`, with parts of three rows turned by R."""
-        return _turned(self.R, parts, x, out)
+    def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
+        """Turn parts of x (.., m, k), three rows each, by R where they stand."""
+        _turn(self.R, parts, x)
+
+    def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
+        """Turn parts of x (.., k, m), three columns each, by R^T where they stand."""
+        for columns in parts:
+            x[..., columns] = product(x[..., columns], self._back)
+
+    def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
+        """Return x (.., m, k) with some parts, three rows each, turned by R."""
+        return _turned(self.R, parts, x)
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts, three rows each, turned to base axes by R^T."""
-        return _turned(self.R.mT, parts, x, None)
+        return _turned(self._back, parts, x)
 
 
 class Standing(Chart):
     """Chart of one or many bases at the reference: R = Q = E and J = 2 E cost nothing."""
 
+    standing = True
     N = 0.5 * np.eye(3)
 
     def __init__(self, *count: int) -> None:
@@ -85,19 +113,27 @@ class Standing(Chart):
         """Return the vectors themselves."""
         return vectors
 
+    def turned(self, columns: Array) -> Array:
+        """Return the columns themselves."""
+        return columns
+
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return -[omega]x / 2."""
         return -0.5 * crossed
 
-    def over_q_b(self, by_turn: Array) -> Array:
+    def over_q_b(self, by_turn: Array, out: Array | None = None) -> Array:
         """Return twice the derivatives."""
-        return 2.0 * by_turn
+        return np.multiply(2.0, by_turn, out=out)
 
-    def to_reference(
-        self, parts: tuple[slice, ...], x: Array, *, out: Array | None = None
-    ) -> Array:
-        """Return x itself, or write it to `out`."""
-        return _turned(self.R, (), x, out)
+    def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
+        """Leave x as it is."""
+
+    def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
+        """Leave x as it is."""
+
+    def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
+        """Return x itself."""
+        return x
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x itself."""
@@ -109,11 +145,14 @@ def times(matrices: Array, vectors: Array) -> Array:
     return (matrices @ vectors[..., None])[..., 0]
 
 
-def _turned(R: Array, parts: tuple[slice, ...], x: Array, out: Array | None) -> Array:
-    if out is None:
-        out = x.copy("K") if parts else x
-    else:
-        out[...] = x
+def _turned(R: Array, parts: tuple[slice, ...], x: Array) -> Array:
+    if not parts:
+        return x
+    turned = x.copy("K")
+    _turn(R, parts, turned)
+    return turned
+
+
+def _turn(R: Array, parts: tuple[slice, ...], x: Array) -> None:
     for rows in parts:
-        out[..., rows, :] = R @ x[..., rows, :]
-    return out
+        x[..., rows, :] = product(R, x[..., rows, :])

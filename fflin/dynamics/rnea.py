@@ -16,14 +16,30 @@ from fflin.dynamics.tidal import Tide
 
 
 class Rates(NamedTuple):
-    """Acceleration of the base origin and the joints, in base axes, and its derivatives."""
+    """Accelerations of the base origin and the joints, in base axes, and their derivatives.
 
-    c: Array  # (6 + n,) of (3.1): without gravity and omega x v_b
-    by_q_m: Array  # D_m (6 + n, n) of (3.3)
-    by_nu: Array  # D_nu (6 + n, 6 + n) of (3.3), zero over the base's linear velocity
-    by_u: Array  # D_u (6 + n, nu) of (3.3), u held in base axes
-    gravity: Array  # (3,) in base axes
-    by_turn: Array  # (6 + n, 3) slopes of c over a turn of the base in an orbit (14.5), else zero
+    At one point, or with leading axes at many.
+    """
+
+    c: Array  # (.., 6 + n) of (3.1): without gravity and omega x v_b
+    slopes: Array  # (.., 6 + n, 12 + 2 n) over the state's displacements in base axes, see below
+    by_u: Array  # D_u (.., 6 + n, nu) of (3.3), u held in base axes
+    gravity: Array  # (.., 3) in base axes
+
+    @property
+    def by_turn(self) -> Array:
+        """Slopes (.., 6 + n, 3) over a turn of the base: in an orbit (14.5), else zero."""
+        return self.slopes[..., :3]
+
+    @property
+    def by_q_m(self) -> Array:
+        """D_m (.., 6 + n, n) of (3.3)."""
+        return self.slopes[..., 6 : self.c.shape[-1]]
+
+    @property
+    def by_nu(self) -> Array:
+        """D_nu (.., 6 + n, 6 + n) of (3.3), zero over the base's linear velocity."""
+        return self.slopes[..., self.c.shape[-1] :]
 
 
 class Gyroscopic(NamedTuple):
@@ -47,26 +63,36 @@ class Accelerations:
         self._passive = robot.springs
         self._resists = any(values.any() for values in robot.springs)
         self._joints = np.arange(6, self._nv)
+        # Slopes of the forces over the same as those of the accelerations.
+        self._bias = np.zeros((self._nv, 2 * self._nv))
+        self._bias_by_q, self._bias_by_nu = np.split(self._bias, 2, axis=1)
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
-        self._field, self._none = field_of(robot, state.frame), np.zeros((self._nv, 3))
+        self._field = field_of(robot, state.frame)
+        self._still = np.zeros(robot.nq), np.zeros(robot.nv)
 
     def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
         self._inertia.invert(q, out, quick=True)
 
-    def rates(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
-        """Return the rates at q, v and u in base axes, v being `nu` and q_m in state order."""
+    def rates(
+        self, q: Array, v: Array, nu: Array, q_m: Array, u: Array, slopes: Array, by_u: Array
+    ) -> Rates:
+        """Return the rates at q, v and u in base axes, v being `nu` and q_m in state order.
+
+        Their slopes and by_u are the C-contiguous arrays of their shapes that are given.
+        """
         model, data, state = self._model, self._data, self._state
         tide = self._field and Tide.at(self._field, q)
         # Without the base's position and linear velocity: nothing here depends on them, and
         # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
         # accelerates the base origin and nothing against it (equivalence).
-        q_still, v_still = q.copy(), v.copy()
-        q_still[:3] = v_still[:3] = 0.0
+        q_still, v_still = self._still
+        q_still[3:], v_still[3:] = q[3:], v[3:]
         if tide:
             v_still[PIN_ANGULAR] += tide.spin
             pull = tide.force(model, data, q_still)
-        inverse = np.empty((self._nv, self._nv))
+        default = self._actuation.default
+        inverse = by_u if default else np.empty((self._nv, self._nv))
         self._inertia.invert(q_still, inverse)
         columns = self._actuation.columns(data, q_still)
         bias = pin.nonLinearEffects(model, data, q_still, v_still)
@@ -75,29 +101,28 @@ class Accelerations:
             bias = bias - gyroscopic.force
         if tide:
             bias = bias - pull
-        force = (u if self._actuation.default else columns.dot(u)) - state.forces(bias)
+        force = (u if default else columns.dot(u)) - state.forces(bias)
         if self._resists:
-            stiffness, damping, rest = self._passive
-            force[6:] -= stiffness * (q_m - rest) + damping * nu[6:]
+            force[6:] += self._passive.force(q_m, nu[6:])
         c = inverse.dot(force)
-        by_q, by_v = self._bias_slopes(q_still, v_still, c, u, gyroscopic)
-        negative = -inverse
-        by_nu = negative.dot(by_v)
-        by_nu[:, LINEAR] = 0.0
-        by_u = inverse if self._actuation.default else inverse.dot(columns)
-        by_q_m, gravity, by_turn = negative.dot(by_q), state.gravity(q), self._none
+        rates = Rates(c, slopes, by_u, tide.fall if tide else state.gravity(q))
+        self._write_bias_slopes(q_still, v_still, c, u, gyroscopic)
+        if not default:
+            np.dot(inverse, columns, out=by_u)
+        np.dot(-inverse, self._bias, out=slopes)
+        slopes[:, :6] = 0.0
+        rates.by_nu[:, LINEAR] = 0.0
         if tide:
             pull_by_q, pull_by_turn = tide.slopes(model, data, q_still)
-            by_q_m += inverse.dot(state.project(pull_by_q)[:, 6:])
-            by_turn = inverse.dot(state.forces(pull_by_turn))
-            by_turn += by_nu[:, ANGULAR].dot(skew(tide.spin))
-            gravity = tide.fall
-        return Rates(c, by_q_m, by_nu, by_u, gravity, by_turn)
+            rates.by_q_m[:] += inverse.dot(state.project(pull_by_q)[:, 6:])
+            rates.by_turn[:] = inverse.dot(state.forces(pull_by_turn))
+            rates.by_turn[:] += rates.by_nu[:, ANGULAR].dot(skew(tide.spin))
+        return rates
 
-    def _bias_slopes(
+    def _write_bias_slopes(
         self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None
-    ) -> tuple[Array, Array]:
-        """Return the derivatives of M a + b - B u + passive forces over q_m and nu (3.3), (7.1)."""
+    ) -> None:
+        """Write the derivatives of M a + b - B u + passive forces over q_m and nu (3.3), (7.1)."""
         model, data, state = self._model, self._data, self._state
         # Constant in the frames of their links, so that RNEA's derivatives hold -d(B u)/dq.
         wrenches = gyroscopic.wrenches if gyroscopic else self._actuation.wrenches(u)
@@ -107,11 +132,11 @@ class Accelerations:
         )
         if gyroscopic:
             full_q, full_v = full_q - gyroscopic.by_q, full_v - gyroscopic.by_v
-        by_q, by_v = state.project(full_q)[:, 6:], state.project(full_v)
+        self._bias_by_q[:], self._bias_by_nu[:] = state.project(full_q), state.project(full_v)
         if self._resists:
-            by_q[self._joints, self._joints - 6] += self._passive.stiffness
-            by_v[self._joints, self._joints] += self._passive.damping
-        return by_q, by_v
+            joints = self._joints
+            self._bias_by_q[joints, joints] += self._passive.stiffness
+            self._bias_by_nu[joints, joints] += self._passive.damping
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
         """Return the torques of stored momentum; the wrenches include the inputs'."""

@@ -113,7 +113,9 @@ class StateMap:
         self._cos = self._idx_q[self.unbounded]
         self._sin = self._cos + 1
         root = robot.model.jointPlacements[ROOT].rotation
-        self._gravity, self._falls = root.T @ np.array(robot.gravity), any(robot.gravity)
+        self._gravity, self._pulled = root.T @ np.array(robot.gravity), any(robot.gravity)
+        # Whether anything accelerates the base's origin against the reference.
+        self.falls = self._pulled or robot.orbit is not None
         self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
 
     def about(self, reference: pin.SE3) -> "StateMap":
@@ -144,22 +146,24 @@ class StateMap:
         return pin.XYZQUATToSE3(np.concatenate((self._position, self.origin_quaternion)))
 
     def chart(self, q: Array) -> Chart:
-        """Return the attitude chart at a valid configuration (nq,).
+        """Return the attitude chart at a valid configuration (nq,); see `charts` for rows.
 
         Raises
         ------
         ChartError
             If the base is rotated by pi from the reference.
         """
-        quaternion = turning.quaternion_product(self.origin_quaternion, q[3:7])
-        quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
-        q0 = float(quaternion[3])
-        if q0 < SMALLEST_Q0:
+        chart = Chart.of(turning.quaternion_product(self.origin_quaternion, q[3:7]))
+        if chart.q0 < SMALLEST_Q0:
             raise ChartError(
                 "the base is rotated by 180 deg from the reference, where the attitude chart "
                 "(quaternion vector part) is singular; give a reference nearer to the base"
             )
-        return Chart(quaternion[:3], q0, turning.rotation_matrix(quaternion))
+        return chart
+
+    def charts(self, q: Array) -> Chart:
+        """Return the attitude charts at rows of valid configurations (N, nq), at any turn."""
+        return Chart.of(q[:, 3:7] @ turning.product_matrix(self.origin_quaternion).T)
 
     def rotation(self, q: Array) -> Array:
         """Return the rotation matrix (3, 3) of refMb at a valid configuration, for any attitude."""
@@ -167,8 +171,12 @@ class StateMap:
         return turned if self._aligned else self._rotation.dot(turned)
 
     def gravity(self, q: Array) -> Array:
-        """Return the robot's gravity (3,) [m/s^2] in base axes at a valid configuration."""
-        return turning.rotation_matrix(q[3:7]).T @ self._gravity if self._falls else self._gravity
+        """Return the robot's gravity (.., 3) [m/s^2] in base axes, q (.., nq) being valid."""
+        if not self._pulled:
+            return self._gravity
+        turned = turning.rotation_matrix if q.ndim == 1 else turning.rotation_matrices
+        rotated: Array = self._gravity @ turned(q[..., 3:7])  # R^T g
+        return rotated
 
     def scalar(self, q: Array) -> float:
         """Return the quaternion's scalar part q0 at a valid q, with the sign it has in q."""
@@ -216,7 +224,9 @@ class StateMap:
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
         """Return the state (.., nx) from its parts, with velocities nu (.., 6 + n) in base axes."""
-        in_frame = self.to_frame(chart, nu[..., None])[..., 0]
+        in_frame = nu
+        if not chart.standing:
+            in_frame = self.to_frame(chart, nu[..., None])[..., 0]
         return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
     def to_pinocchio(self, x: Array) -> tuple[Array, Array]:

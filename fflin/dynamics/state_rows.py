@@ -9,7 +9,6 @@ import pinocchio as pin
 
 from fflin.base import rotation as turning
 from fflin.base.validation import Array
-from fflin.dynamics.chart import Chart
 from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR
 from fflin.dynamics.state import StateMap
 
@@ -21,10 +20,7 @@ _TURN = 2.0 * np.pi
 
 def states_of(state: StateMap, q: Array, nu: Array) -> Array:
     """Return the states (N, nx) of rows of valid q (N, nq) and nu (N, 6 + n) in base axes."""
-    quaternion = q[:, 3:7] @ turning.product_matrix(state.origin_quaternion).T
-    quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
-    chart = Chart(quaternion[:, :3], quaternion[:, 3:], turning.rotation_matrices(quaternion))
-    return state.compose(chart, state.positions(q), state.joint_positions(q), nu)
+    return state.compose(state.charts(q), state.positions(q), state.joint_positions(q), nu)
 
 
 def state_history(

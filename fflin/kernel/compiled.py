@@ -17,13 +17,6 @@ from typing import Any
 
 from fflin.base.errors import unknown
 
-# Fewest points for which the kernel is quicker than the loop, where numba is loaded and where it is
-# not. To load it takes half a second, which a sweep of that size does not win back but the next
-# ones do: sweeps are seldom alone.
-_BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
-# Fewest points, one by one, for which their kernel is, of these three.
-POINT_BREAK_EVENS = 1, 20_000, 200_000
-
 # Files in which Linux tells a container's quota of computing time and its period [us], of version 2
 # and of version 1 of its control groups.
 _QUOTAS = (
@@ -41,7 +34,6 @@ _SILENCE, _LONGEST_WAIT = 2.0, 600.0
 
 _log = logging.getLogger("fflin")
 _TURN = Lock()
-_FOUND: set[str] = set()  # what was found on disk once
 
 
 def available_cores() -> int:
@@ -59,13 +51,6 @@ def available_cores() -> int:
     return max(cores, 1)
 
 
-def pays(count: int) -> bool:
-    """Whether the kernel is there and beats the loop over so many points."""
-    if not numba_is_there():
-        return False
-    return count >= (_BREAK_EVEN if "numba" in sys.modules else _BREAK_EVEN_UNLOADED)
-
-
 def numba_is_there() -> bool:
     """Whether the kernel can be compiled."""
     return find_spec("numba") is not None
@@ -76,14 +61,6 @@ def checked_engine(engine: Any) -> str | None:
     if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
         raise unknown("engine", str(engine), list(ENGINES))
     return engine
-
-
-def point_pays(calls: int) -> bool:
-    """Whether the kernel of single points is there and pays for so many of them."""
-    loaded = "fflin.kernel.lanes" in sys.modules
-    if calls < POINT_BREAK_EVENS[not loaded] or not numba_is_there():
-        return False
-    return calls >= POINT_BREAK_EVENS[2] or _point_is_kept()
 
 
 def kernel(module: str, name: str, what: str = "the batch kernel") -> Any:
@@ -145,12 +122,6 @@ def is_kept(module: str, name: str) -> bool:
     chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
     return any(_kept(folder, module, name) for folder in folders)
-
-
-def _point_is_kept() -> bool:
-    if not _FOUND and is_kept("linearise", "linearise_one"):
-        _FOUND.add("linearise_one")
-    return bool(_FOUND)
 
 
 def _kept(folder: Path, module: str, name: str) -> list[Path]:

@@ -1,4 +1,4 @@
-"""A sparse factorisation of M, and M^-1 of many configurations, eight to an instruction.
+"""A sparse factorisation of M and its inverse, and points lane beside lane.
 
 References
 ----------
@@ -7,8 +7,7 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 6.5.
 
 from __future__ import annotations
 
-from fflin.kernel.crba import inwards, outwards
-from fflin.kernel.lanes import compiled, inlined, load, splat, store, transpose
+from fflin.kernel.lanes import inlined, load, splat, store, transpose
 from fflin.kernel.tree import LANES
 
 
@@ -113,23 +112,3 @@ def unpack(work, start, entries, out, first, offset):
     for entry in range(whole, entries):
         for lane in range(LANES):
             out[first + lane, offset + entry] = work[start + entry, lane]
-
-
-@compiled
-def invert(tree, q, out, couplings, lanes, work):
-    """Write M^-1 of each configuration."""
-    count, entries = out.shape
-    for block in range(0, count, LANES):
-        # The last block begins early enough to fill the lanes; some points are done twice.
-        first = min(block, count - LANES)
-        pack(q, first, lanes)
-        outwards(work, tree, lanes)
-        inwards(work, tree)
-        keep_diagonal(work, tree)
-        factorise(work, tree)
-        invert_factor(work, tree)
-        # The diagonal is not needed any more.
-        multiply(work, tree, tree.diagonal)
-        unpack(work, tree.square, entries, out, first, 0)
-        for lane in range(LANES):
-            couplings[first + lane] = work[tree.diagonal, lane]

@@ -160,7 +160,7 @@ def equilibrium(
     if robot.orbit:  # its own placement, so that there too forces and inputs are in base axes
         own = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
         axes = {"frame": frame, "reference": own}
-    linearizer = Linearizer(robot, **axes, engine="python")
+    linearizer = Linearizer(robot, **axes)
     actuation, pushes = Actuation(state), forces_of(robot)
     free = {f"tau_m.{name}" for name, k in robot.stiffness.items() if k} - set(actuation.names)
     soft = np.array([name in free for name in pushes])

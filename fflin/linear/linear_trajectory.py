@@ -103,7 +103,7 @@ class LinearTrajectory(Trajectory):
 
     @cached_property
     def _linearizer(self) -> Linearizer:
-        return Linearizer(self.robot, moving=True, engine="python")
+        return Linearizer(self.robot, moving=True)
 
     def matrices(self, t: float) -> tuple[Array, Array]:
         """Return A (nx, nx) and B (nx, nu) at a time t [s], between knots evaluated at `point`."""
@@ -228,7 +228,7 @@ def linearize_trajectory(
 
 def along(motion: Trajectory) -> LinearTrajectory:
     """Return the linear models along a motion."""
-    linearizer = Linearizer(motion.robot, moving=True, engine="python")
+    linearizer = Linearizer(motion.robot, moving=True)
     models = [linearizer(*each) for each in zip(motion.q, motion.v, motion.u_base, strict=True)]
     values = motion._given | {name: np.array([getattr(x, name) for x in models]) for name in "ABCD"}
     names = ("state_names", "input_names", "output_names")

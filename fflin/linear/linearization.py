@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from math import hypot
 from threading import Lock
@@ -16,7 +15,7 @@ from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
 from fflin.dynamics.rnea import Accelerations
 from fflin.dynamics.state import Frame
-from fflin.kernel.compiled import POINT_BREAK_EVENS, checked_engine, point_pays
+from fflin.kernel.compiled import checked_engine
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
 from fflin.linear.prepared import LARGEST, prepare
@@ -24,13 +23,10 @@ from fflin.linear.state_equations import assemble, drift
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.kernel.points import PointKernel
+    from fflin.kernel.accelerations import RowOfOne
 
 # With velocities and inputs below this nothing overflows on the way to `LARGEST`.
 _MODERATE = 1e50
-
-# Size of M beyond which BLAS is quicker.
-_LARGEST_COMPILED = 96
 
 
 class Linearizer:
@@ -68,9 +64,8 @@ class Linearizer:
         "local", and f0 is zero. Use it for trajectories, and for relative equilibria such as a
         steady spin.
     engine : {"python", "compiled"}, optional
-        Engine for points with velocity, springs or forces. Both engines agree to machine
-        precision. By default the compiled kernel is used if its code is already loaded, or once
-        the number of calls is large enough to pay for loading it.
+        Engine for the accelerations of points with velocity, springs or forces: Python by
+        default, or the compiled kernel of sweeps. Both engines agree to machine precision.
 
     Raises
     ------
@@ -121,21 +116,21 @@ class Linearizer:
     ) -> None:
         self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
         self.robot, self._engine = robot, checked_engine(engine)
-        if engine == "compiled":
-            ready.require_kernel()
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
+        self._source: Accelerations | RowOfOne = self._accelerations
+        if engine == "compiled":
+            from fflin.kernel.accelerations import RowOfOne
+
+            self._source = RowOfOne(ready.kernel(), self._accelerations)
         self._standing: Chart = Standing()
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         given = hypot(*robot.gravity, *np.concatenate(robot.springs).tolist())
         self._moderate = given < _MODERATE
-        self._calls = 0
-        self._kernel: PointKernel | None = None
-        self._one: Callable[..., bool] | None = None
         self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
-        # What stands for rest and no input; the kernel takes nothing that may not be written.
+        # What stands for rest and no input.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
         self._known = ready.free and ready.own_reference and ready.actuation.default
@@ -155,10 +150,6 @@ class Linearizer:
         with self._lock:
             if known:
                 return self._at_rest(q)
-            if self._one is not None or self._begins():
-                lin = self._by_kernel(q, v, u)
-                if lin is not None:
-                    return lin
             if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
             # An overflow is refused below, so NumPy need not warn of it. Not always done, since
@@ -177,36 +168,6 @@ class Linearizer:
         }
         return partial(type(self), **options, engine=self._engine), (self.robot,)
 
-    def _begins(self) -> bool:
-        """Return whether the kernel takes over at this call; if so, it is loaded."""
-        self._calls += 1
-        if self._engine is None:
-            small = self._lower.start <= _LARGEST_COMPILED
-            if not (self._calls in POINT_BREAK_EVENS and small and point_pays(self._calls)):
-                return False
-        if self._engine != "python":
-            self._kernel = self.prepared.kernel()
-            self._one = None if self._kernel is None else self._kernel.one()
-        return self._one is not None
-
-    def _by_kernel(self, q: Array, v: Array, u: Array) -> LinearModel | None:
-        """Return the model by the kernel, or None if the kernel cannot guarantee its accuracy."""
-        ready, nx = self.prepared, self._lower.stop
-        A, B = np.empty((nx, nx)), np.empty(self._shape_B)
-        rate, x0 = np.empty(nx), np.empty(nx)
-        assert self._one is not None
-        if not self._one(q, v, u, A, B, rate, x0):
-            return None
-        made: dict[str, Array] = {"A": A, "B": B, "x0": x0}
-        if ready.sensing is not None and self._kernel is not None:
-            state = ready.map
-            chart = self._standing if ready.own_reference else state.chart(q)
-            u_base = ready.actuation.in_base_axes(chart, u)
-            rates = self._kernel.rates(state.gravity(q))
-            point = q, v, state.velocities(v), u_base
-            made |= output_equations(ready, self._data, chart, rates, x0, point)
-        return self._model(q, v, u, rate, made)
-
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
         self._accelerations.invert(q, B[self._lower])
@@ -222,19 +183,16 @@ class Linearizer:
             chart, r_b = state.chart(q), state.positions(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
         u_base = ready.actuation.in_base_axes(chart, u)
-        rates = self._accelerations.rates(q, v, nu, q_m, u_base)
         A, B = ready.fields["A"].copy(), np.zeros(self._shape_B)
-        rate = assemble(
-            *(state, ready.actuation, chart, nu, u_base, rates, A, B[self._lower]),
-            moving=ready.moving,
-        )
         x0 = state.compose(chart, r_b, q_m, nu)
         made = {"A": A, "B": B, "x0": x0}
+        rates = self._source.rates(q, v, nu, q_m, u_base, A[self._lower], B[self._lower])
         if ready.sensing is not None:
             made |= output_equations(ready, self._data, chart, rates, x0, (q, v, nu, u_base))
-        for name, array in {**made, "f0": rate}.items():
+        rate = assemble(state, ready.actuation, chart, nu, u_base, rates, A, moving=ready.moving)
+        for array in (rate, *made.values()):
             flat = array.ravel()
-            if name != "x0" and not flat.dot(flat) < LARGEST:  # nor NaN
+            if array is not x0 and not flat.dot(flat) < LARGEST:  # nor NaN
                 raise InputError(
                     "the model is not finite, because q, v or u is too large; check their units"
                 )
@@ -311,6 +269,4 @@ def linearize(
     >>> lin.is_equilibrium(1e-9)
     True
     """
-    # Preparing the kernel for one point does not pay; so the last bits are the same everywhere.
-    options: Any = {"reference": reference, "moving": moving, "engine": "python"}
-    return Linearizer(robot, frame=frame, **options)(q, v, u)
+    return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)

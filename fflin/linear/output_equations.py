@@ -43,7 +43,8 @@ def output_equations(
         by_u = by_rate.dot(rates.by_u)
         for columns, _ in actuation.held:
             turn += by_u[:, columns].dot(skew(u[columns]))
-        D[:] = actuation.over_inputs(chart, by_u)  # (8.3)
+        actuation.turn_columns(chart, by_u)
+        D[:] = by_u  # (8.3)
     for turned, part in zip(state.axes, (ANGULAR, LINEAR), strict=True):
         if turned:
             turn += by_nu[:, part].dot(skew(nu[part]))

@@ -33,7 +33,7 @@ LARGEST = 1e200
 
 if TYPE_CHECKING:
     from fflin.dynamics.outputs import Sensing
-    from fflin.kernel.points import PointKernel
+    from fflin.kernel.accelerations import RowRates
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,24 +59,27 @@ class Prepared:
         other = {} if self.own_reference else {"_reference": self.reference}
         return {**self.common, **self.rest, "_when_asked": asked, **other}
 
-    def kernel(self) -> PointKernel | None:
-        """Return the compiled equations, or None if the kernel does not support the robot."""
-        from fflin.kernel.points import PointKernel
+    def kernel(self) -> RowRates:
+        """Return the compiled accelerations; `InputError` if the robot has none."""
+        from fflin.kernel.accelerations import RowRates
         from fflin.kernel.tree import batch_tree
 
-        tree = batch_tree(self.robot)
-        options = {"own": self.own_reference, "moving": self.moving}
-        return tree and PointKernel(self.map, self.actuation, tree, LARGEST, **options)
+        tree, reason = batch_tree(self.robot), self.not_compilable
+        if tree is None or reason:
+            raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
+        return RowRates(self.map, self.actuation, tree)
 
-    def require_kernel(self) -> None:
-        """Raise `InputError` if the compiled equations are not available."""
-        reason = "numba is not installed (pip install 'fflin[fast]')"
-        if numba_is_there():
-            if self.kernel() is not None:
-                return
-            kind = "is in orbit" if self.robot.orbit else "has a type that it does not support"
-            reason = f"{'' if self.robot.orbit else 'a joint of '}'{self.robot.name}' {kind}"
-        raise InputError(f"engine='compiled' is not available: {reason}; leave engine out")
+    @property
+    def not_compilable(self) -> str:
+        """Reason why the robot has no compiled accelerations; empty if it has."""
+        from fflin.kernel.tree import batch_tree
+
+        name = self.robot.name
+        if not numba_is_there():
+            return "numba is not installed (pip install 'fflin[fast]')"
+        if self.robot.orbit:
+            return f"'{name}' is in orbit"
+        return "" if batch_tree(self.robot) else f"a joint of '{name}' has an unsupported type"
 
 
 def prepare(

@@ -3,11 +3,9 @@
 Equation numbers refer to docs/derivation.md.
 """
 
-from functools import partial
-
 import numpy as np
 
-from fflin.base.rotation import skew
+from fflin.base.rotation import product, skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart, times
@@ -32,70 +30,79 @@ def assemble(
     u: Array,
     rates: Rates,
     A: Array,
-    B_lower: Array,
     *,
     moving: bool,
 ) -> Array:
-    """Write A and the lower half of B, and return f0 (.., nx)."""
-    g, dot = state.groups, slice(state.nx // 2, state.nx)
+    """Write A (.., nx, nx) and the lower half of B about one point or many; return f0 (.., nx).
+
+    The rates' slopes are A's lower half itself, and their by_u that of B: both are carried from
+    base axes to the chart and frame where they stand. A's upper half is that of `at_rest`.
+    """
+    g, nv, lower = state.groups, state.nx // 2, rates.slopes
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
     W = skew(w)
-    by_turn = _over_turns(state, actuation, nu, u, rates)
+    by_turn = _over_turns(state, actuation, u, rates, w, W)
+    f0 = np.concatenate((chart.rate(w), chart.rotated(v), nu[..., 6:], rates.c), -1)  # (4.8)
     if state.orbit:  # (14.5)
         spin = chart.R.mT @ state.orbit[0]
         by_turn[..., ANGULAR, :] += W @ skew(spin)
-    F = partial(chart.to_reference, state.in_reference)
 
-    # Attitude and position.
-    # Q R^T = Q^T.
-    A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
-    by_q_b = chart.rate_over_q_b(w, W)
-    if omega_in_reference:
-        by_q_b += chart.over_q_b(chart.N @ W)
-    A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
+    # Attitude and position; `at_rest` is what does not change at the reference.
+    if moving:
+        A[..., g.q_b, g.q_b] = A[..., g.r_b, g.r_b] = -W  # (5.2), (5.3)
+    else:
+        by_q_b = chart.rate_over_q_b(w, W)
+        if omega_in_reference:
+            by_q_b += chart.over_q_b(product(chart.N, W))
+        A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
+    if not chart.standing:
+        # Q R^T = Q^T.
+        A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
+        if not v_in_reference:
+            A[..., g.r_b, g.v_b] = chart.R
     if not v_in_reference:
         V = skew(v)
-        A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.R @ V)  # (4.3)
-        A[..., g.r_b, g.v_b] = chart.R
-    if moving:
-        A[..., g.q_b, g.q_b] = -W  # (5.2)
-        A[..., g.r_b, g.r_b] = -W  # (5.3)
+        A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.turned(V))  # (4.3)
 
     # Accelerations.
-    F(chart.over_q_b(by_turn), out=A[..., dot, g.q_b])  # (4.6)
-    F(rates.by_q_m, out=A[..., dot, g.q_m])
-    F(F(rates.by_nu.mT, out=A[..., dot, dot].mT).mT, out=A[..., dot, dot])
-    F(actuation.over_inputs(chart, rates.by_u, out=B_lower), out=B_lower)  # (4.7)
-    a = rates.c.copy()
-    a[..., LINEAR] += rates.gravity
+    chart.over_q_b(by_turn, out=lower[..., g.q_b])
+    if not chart.standing:
+        chart.turn_rows(state.in_reference, lower)  # (4.6)
+        chart.turn_columns(state.in_reference, lower[..., nv:])
+        chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
+        actuation.turn_columns(chart, rates.by_u)
+    if state.falls:
+        f0[..., g.v_b] += rates.gravity
     if state.orbit:  # (14.6)
         turn, pull = state.orbit
         A[..., g.v_b, g.r_b], A[..., g.v_b, g.v_b] = pull, 0.0 - 2.0 * skew(turn)
         A[..., g.omega_b, g.omega_b] -= skew(spin)
-        a[..., ANGULAR] += times(W, spin)
-        a[..., LINEAR] -= 2.0 * times(skew(spin), v)
+        f0[..., g.omega_b] += times(W, spin)
+        f0[..., g.v_b] -= 2.0 * times(skew(spin), v)
     if not v_in_reference:
         A[..., g.v_b, g.omega_b] += V  # (4.5)
         A[..., g.v_b, g.v_b] -= W
-        a[..., LINEAR] -= times(W, v)  # (3.2)
+        f0[..., g.v_b] -= times(W, v)  # (3.2)
+    if not chart.standing:
+        chart.turn_rows(state.in_reference, f0[..., nv:, None])
+    return f0
 
-    f0 = chart.rate(w), chart.rotated(v), nu[..., 6:], F(a[..., None])[..., 0]  # (4.8)
-    return np.concatenate(f0, -1)
 
-
-def _over_turns(state: StateMap, actuation: Actuation, nu: Array, u: Array, rates: Rates) -> Array:
+def _over_turns(
+    state: StateMap, actuation: Actuation, u: Array, rates: Rates, w: Array, W: Array
+) -> Array:
     """Return the derivatives of the rates over base rotations, Theta (.., 6 + n, 3) of (4.4)."""
     omega_in_reference, v_in_reference = state.axes
-    by_turn = np.zeros((*nu.shape, 3)) + rates.by_turn
+    by_turn, c = rates.by_turn.copy(), rates.c
     for columns, _ in actuation.held:
-        by_turn += rates.by_u[..., columns] @ skew(u[..., columns])
+        by_turn += product(rates.by_u[..., columns], skew(u[..., columns]))
     if omega_in_reference:
-        by_turn += rates.by_nu[..., ANGULAR] @ skew(nu[..., ANGULAR])
-        by_turn[..., ANGULAR, :] -= skew(rates.c[..., ANGULAR])
+        by_turn += product(rates.by_nu[..., ANGULAR], W)
+        by_turn[..., ANGULAR, :] -= skew(c[..., ANGULAR])
     if v_in_reference:
-        by_turn[..., LINEAR, :] -= skew(rates.c[..., LINEAR])
-    else:
+        by_turn[..., LINEAR, :] -= skew(c[..., LINEAR])
+    elif state.falls:
         by_turn[..., LINEAR, :] += skew(rates.gravity)
     return by_turn
 

@@ -30,6 +30,10 @@ class Springs(NamedTuple):
     damping: Array
     rest: Array
 
+    def force(self, q_m: Array, rates: Array) -> Array:
+        """Return the force (.., n) on joints at q_m (.., n) that move at rates (.., n)."""
+        return self.stiffness * (self.rest - q_m) - self.damping * rates
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot(Coordinates):

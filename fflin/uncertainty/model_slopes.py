@@ -51,7 +51,9 @@ class ModelSlopes:
         self._u = ready.actuation.in_base_axes(self._chart, lin.u0)
         nu, q_m = state.velocities(lin.v), state.joint_positions(lin.q)
         self._rates = Accelerations(state, ready.actuation, data).rates(
-            lin.q, lin.v, nu, q_m, self._u
+            *(lin.q, lin.v, nu, q_m, self._u),
+            np.empty((len(nu), state.nx)),
+            np.empty((len(nu), len(self._u))),
         )
         inverse = np.empty((len(nu), len(nu)))
         still = lin.q.copy()
@@ -67,16 +69,17 @@ class ModelSlopes:
         """Return dA, dB, dC, dD, df0 and dy0 (P, ..)."""
         rates = slopes_of(parameters, self.bodies, self._of_bodies, self._u)
         # All is affine in the rates: what no parameter changes is that of none.
-        with_none = Rates(*(np.concatenate((part, np.zeros_like(part[:1]))) for part in rates))
         ready, state, nu = self._ready, self._ready.map, self._ready.map.velocities(self.lin.v)
-        count = len(rates.c) + 1
-        A, lower = np.zeros((count, state.nx, state.nx)), np.zeros((count, len(nu), len(self._u)))
+        count, nv = len(rates.c) + 1, len(nu)
+        A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
+        with_none = Rates(*(np.zeros((count, nv)), A[:, nv:], B[:, nv:], np.zeros((count, 3))))
+        for part, of_parameters in zip(with_none, rates, strict=True):
+            part[:-1] = of_parameters
         f0 = assemble(
-            *(state, ready.actuation, self._chart, np.broadcast_to(nu, (count, len(nu)))),
-            *(np.broadcast_to(self._u, (count, len(self._u))), with_none, A, lower),
+            *(state, ready.actuation, self._chart, np.broadcast_to(nu, (count, nv))),
+            *(np.broadcast_to(self._u, (count, len(self._u))), with_none, A),
             moving=ready.moving,
         )
-        B = np.concatenate((np.zeros_like(lower), lower), axis=1)
         A, B, f0 = (each[:-1] - each[-1] for each in (A, B, f0))
         if self.lin.dt:
             driven, h = np.column_stack((self._source.B, self._source.f0)), self.lin.dt

@@ -64,21 +64,19 @@ class BodySlopes:
     def all(self) -> Rates:
         """Return them as rates, (bodies * 10, ..), of the joints in Pinocchio's order."""
         rates, size = self.rates, len(self.inverse)
-        parts = (rates.by_u, rates.by_q_m, rates.by_nu, rates.by_turn)
-        given = np.concatenate(parts, axis=1)
+        given = np.concatenate((rates.by_u, rates.slopes), axis=1)
         moved = self._by_inertia(given).reshape(-1, size, given.shape[1])
-        ends = np.cumsum([part.shape[1] for part in parts[:-1]])
-        by_u, by_q_m, by_nu, by_turn = np.split(moved, ends, axis=2)
-        c = np.zeros((len(moved), size))
+        by_u, slopes = np.split(moved, rates.by_u.shape[1:], axis=2)
+        found = Rates(np.zeros((len(moved), size)), slopes, by_u, np.zeros((len(moved), 3)))
         if self.v.any() or rates.c.any():
             F, F_q, F_nu, F_turn = self._forces()
-            c = -F @ self.inverse
-            F_q += [self._slope(self.model, np.zeros_like(self.v), each)[1] for each in c]
-            by_q_m = by_q_m - self.inverse @ F_q
-            by_nu = by_nu - self.inverse @ F_nu
-            by_turn = by_turn - self.inverse @ F_turn
-        by_nu[..., LINEAR] = 0.0
-        return Rates(c, by_q_m, by_nu, by_u, np.zeros((len(moved), 3)), by_turn)
+            found.c[:] = -F @ self.inverse
+            F_q += [self._slope(self.model, np.zeros_like(self.v), each)[1] for each in found.c]
+            found.by_q_m[:] -= self.inverse @ F_q
+            found.by_nu[:] -= self.inverse @ F_nu
+            found.by_turn[:] -= self.inverse @ F_turn
+        found.by_nu[..., LINEAR] = 0.0
+        return found
 
     def share(self, changes: Mapping[int, Array]) -> float:
         """Return how much of M a change of bodies is at the most: the radius of M^-1 M_p."""
@@ -178,8 +176,8 @@ def _of_force(parameter: Parameter, at: BodySlopes, u: Array) -> Rates:
             still = np.zeros_like(at.v)
             by_q = pin.computeRNEADerivatives(at.model, at.data, at.q, still, still, pushed)[0]
             F_q = state.project(by_q)[:, 6:]
-    c = -at.inverse @ F
-    if c.any():
-        F_q = F_q + at._slope(at.model, np.zeros_like(at.v), c)[1]
-    of_turn = np.zeros((size, 3))
-    return Rates(c, -at.inverse @ F_q, -at.inverse @ F_nu, at.inverse @ B, np.zeros(3), of_turn)
+    found = Rates(-at.inverse @ F, np.zeros((size, 2 * size)), at.inverse @ B, np.zeros(3))
+    if found.c.any():
+        F_q = F_q + at._slope(at.model, np.zeros_like(at.v), found.c)[1]
+    found.by_q_m[:], found.by_nu[:] = -at.inverse @ F_q, -at.inverse @ F_nu
+    return found

@@ -7,8 +7,10 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.batch.equations import batch_equations
+from fflin.batch.equations import BatchEquations
 from fflin.batch.rows import Points
+from fflin.kernel.compiled import kernel
+from fflin.linear import prepared
 from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 pytest.importorskip("numba")
@@ -39,7 +41,7 @@ def operating_points(robot, count, seed=0):
 
 def agreement(robot, count=11, **options):
     """Largest difference of kernel, of many and of one, and loop, over the largest and cond(M)."""
-    linearizer = fflin.Linearizer(robot, engine="python", **options)
+    linearizer = fflin.Linearizer(robot, **options)
     single = fflin.Linearizer(robot, engine="compiled", **options)
     q, v, u = operating_points(robot, count)
     nv, nx, nu = 6 + robot.n, 12 + 2 * robot.n, u.shape[1]
@@ -47,7 +49,7 @@ def agreement(robot, count=11, **options):
     if options.get("moving"):
         shapes["_drift"] = (nx,)
     out = {key: np.full((count, *shape), np.nan) for key, shape in shapes.items()}
-    equations = batch_equations(linearizer.prepared, only_inertia=False)
+    equations = BatchEquations(linearizer.prepared, only_inertia=False)
     assert not len(equations.write(Points(q, v, u), out))
     worst = 0.0
     for row in range(count):
@@ -56,7 +58,6 @@ def agreement(robot, count=11, **options):
         expected = {"A": lin.A, "B_lower": lin.B[nv:], "f0": lin.f0, "_x0": lin.x0}
         expected["_drift"] = lin.drift
         one = single(q[row], v[row], u[row])
-        assert single._one is not None
         for key, array in out.items():
             scale = max(1e-3, np.abs(expected[key]).max(initial=0.0)) * condition
             alone = one.B[nv:] if key == "B_lower" else getattr(one, key.replace("_x0", "x0"))
@@ -176,14 +177,47 @@ def test_angles_beyond_the_kernels_sines_are_left(robots):
     nv, nx = 6 + robot.n, 12 + 2 * robot.n
     out = {"A": (nx, nx), "B_lower": (nv, u.shape[1]), "f0": (nx,), "_x0": (nx,)}
     arrays = {key: np.zeros((20, *shape)) for key, shape in out.items()}
-    equations = batch_equations(fflin.Linearizer(robot).prepared, only_inertia=False)
+    equations = BatchEquations(fflin.Linearizer(robot).prepared, only_inertia=False)
     assert equations.write(Points(q, v, u), arrays).tolist() == [3]
 
 
 def test_outputs_are_left_to_the_linearizer(robots):
     robot = robots["servicer_7dof"].replace(outputs=[fflin.FramePose("tool")])
-    assert batch_equations(fflin.Linearizer(robot).prepared, only_inertia=False) is None
     q, v, u = operating_points(robot, 20)
     batch = fflin.sweep(robot, q, v, u)
     expected = fflin.linearize(robot, q[4], v[4], u[4])
-    assert (batch[4].C == expected.C).all()
+    assert (batch[4].C == expected.C).all() and (batch[4].A == expected.A).all()
+    with pytest.raises(fflin.InputError, match=r"'compiled'.*outputs"):
+        fflin.sweep(robot, q, v, u, engine="compiled")
+
+
+def test_an_engine_may_be_chosen(robots, monkeypatch):
+    robot = robots["planar_detumble"]
+    q, v, u = operating_points(robot, 20)
+    by_python = fflin.sweep(robot, q, v, u, engine="python")
+    expected = fflin.linearize(robot, q[4], v[4], u[4])
+    assert (by_python.A[4] == expected.A).all() and (by_python.B_lower[4] == expected.B[9:]).all()
+    compiled = fflin.sweep(robot, q, v, u, engine="compiled")
+    assert compiled.A == pytest.approx(by_python.A, rel=1e-9, abs=1e-9)
+    with pytest.raises(fflin.UnknownNameError, match="'fast'"):
+        fflin.sweep(robot, q, engine="fast")
+    monkeypatch.setattr(prepared, "numba_is_there", lambda: False)
+    assert (fflin.sweep(robot, q, v, u).A == by_python.A).all()
+    with pytest.raises(fflin.InputError, match=r"'compiled'.*fflin\[fast"):
+        fflin.sweep(robot, q, engine="compiled")
+
+
+def test_one_set_of_machine_code_serves_every_robot_and_option(robots):
+    derive = kernel("derivatives", "derive")
+    thrusters = [fflin.Thruster("base", (0.1, 0.2, 0.3), (0.3, 0.5, 1.0)), fflin.BaseTorque()]
+    for name in BUNDLED:
+        robot = robots[name]
+        variants = [robot, robot.replace(gravity=(0.0, 0.0, -9.81), stiffness=0.5, damping=0.1)]
+        if name == "servicer_7dof":
+            variants.append(robot.replace(inputs=thrusters))
+        for each in variants:
+            for case in CASES.values():
+                q, v, u = operating_points(each, 9)
+                for point in ((q,), (q, v), (q, None, u), (q[:3], v[:3], u[:3])):
+                    fflin.sweep(each, *point, **case)
+    assert len(derive.signatures) == 1

@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.batch.equations import batch_equations
+from fflin.batch.equations import BatchEquations
 from fflin.batch.rows import Points
 from fflin.dynamics.inertia import Inertia
 from fflin.linear.certificate import inertia_matrix
@@ -32,7 +32,7 @@ def agreement(robot, q):
     size = 6 + robot.n
     kernel, loop = np.empty((2, len(q), size, size))
     prepared = fflin.Linearizer(robot).prepared
-    equations = batch_equations(prepared, only_inertia=True)
+    equations = BatchEquations(prepared, only_inertia=True)
     assert not len(equations.write(Points(q, None, None), {"B_lower": kernel}))
     inertia = Inertia(prepared.map, robot.create_data())
     for point, inverse in zip(q, loop, strict=True):

@@ -28,10 +28,10 @@ def signatures():
 @pytest.fixture
 def compiled(monkeypatch, tmp_path, signatures):
     """A function of the kernel that keeps its code in a folder of its own."""
-    from fflin.kernel import factor as batch_kernel
+    from fflin.kernel import derivatives as batch_kernel
 
     new = SimpleNamespace(stats=SimpleNamespace(cache_path=tmp_path), compile=signatures.append)
-    monkeypatch.setattr(batch_kernel, "invert", new)
+    monkeypatch.setattr(batch_kernel, "derive", new)
     kernel_code._prepared.cache_clear()
     yield new
     kernel_code._prepared.cache_clear()
@@ -43,14 +43,14 @@ def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_pat
 
     def ask():
         ready.wait()
-        return kernel_code.kernel("factor", "invert")
+        return kernel_code.kernel("derivatives", "derive")
 
     with ThreadPoolExecutor(4) as threads:
         found = [threads.submit(ask) for _ in range(4)]
     assert all(each.result() is compiled for each in found)
     assert not caplog.records
     compiled.compile("double")
-    (tmp_path / f"factor.invert-1.{kernel_code.VERSION}.nbi").write_bytes(b"")
+    (tmp_path / f"derivatives.derive-1.{kernel_code.VERSION}.nbi").write_bytes(b"")
     compiled.compile("long")
     assert signatures == ["double", "long"]
     assert [record.message for record in caplog.records] == [
@@ -61,11 +61,11 @@ def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_pat
 @pytest.mark.compiled
 @pytest.mark.parametrize("older", [False, True])
 def test_code_that_is_older_than_any_source_is_not_taken(compiled, caplog, tmp_path, older):
-    kept = tmp_path / f"factor.invert-1.{kernel_code.VERSION}.nbi"
+    kept = tmp_path / f"derivatives.derive-1.{kernel_code.VERSION}.nbi"
     kept.write_bytes(b"")
     newest = max(file.stat().st_mtime for file in kernel_code._sources())
     os.utime(kept, (newest, newest + (-1.0 if older else 1.0)))
-    kernel_code.kernel("factor", "invert").compile("double")
+    kernel_code.kernel("derivatives", "derive").compile("double")
     assert kept.exists() is not older
     assert bool(caplog.records) is older
 

@@ -1,21 +1,17 @@
-"""A linearizer whose points the compiled kernel does, against one whose points it does not."""
+"""A linearizer whose accelerations the compiled kernel gives, against one by Python."""
 
 import pickle
-import sys
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.kernel import compiled
-from fflin.linear import linearization, prepared
+from fflin.linear import prepared
 from tests.batch.test_equations import TILTED, operating_points
 from tests.support.robots import random_point
 
 pytest.importorskip("numba")
-pytestmark = pytest.mark.compiled
-
 pytestmark = pytest.mark.compiled
 
 FIELDS = ("A", "B", "C", "D", "f0", "x0", "u0", "y0", "q", "v", "placement")
@@ -43,7 +39,6 @@ def test_every_field_is_that_of_the_other_route_to_rounding(robots, outputs, opt
     (q,), (v,), (u,) = operating_points(robot, 1)
     for point in ((q, v, u), (q, v), (q, None, u), (q,), (list(q), list(v), list(u))):
         lin, expected = quick(*point), slow(*point)
-        assert quick._one is not None and slow._one is None
         for key in FIELDS:
             found, true = getattr(lin, key), getattr(expected, key)
             assert not found.flags.writeable, key
@@ -88,25 +83,13 @@ def test_what_the_kernel_cannot_vouch_for_is_refused_in_the_same_words(robots):
     assert (quick(q, v, u).A == slow(q, v, u).A).all()
 
 
-def test_it_takes_over_where_its_code_is_loaded_or_pays(robots, monkeypatch):
+def test_one_point_goes_by_python_unless_asked_otherwise(robots):
     robot = robots["planar_detumble"]
     (q,), (v,), (u,) = operating_points(robot, 1)
-    for quick in both(robot):
-        quick(q, v, u)  # so that it is kept on disk
-    linearizer = fflin.Linearizer(robot)
-    linearizer(q, v, u)
-    assert linearizer._one is not None
-    monkeypatch.delitem(sys.modules, "fflin.kernel.lanes")
-    assert not compiled.point_pays(19_999)
-    assert compiled.point_pays(20_000)
-    monkeypatch.setattr(compiled, "_point_is_kept", lambda: False)
-    assert not compiled.point_pays(199_999)
-    assert compiled.point_pays(200_000)
-    monkeypatch.setattr(linearization, "point_pays", lambda calls: True)
-    never = fflin.Linearizer(robot, engine="python")
-    never(q, v, u)
-    assert never._one is None
-    assert pickle.loads(pickle.dumps(never))._engine == "python"
+    quick, plain = both(robot)
+    assert (fflin.Linearizer(robot)(q, v, u).A == plain(q, v, u).A).all()
+    again = pickle.loads(pickle.dumps(quick))
+    assert (again(q, v, u).A == quick(q, v, u).A).all()
 
 
 def test_an_engine_that_cannot_is_refused(robots, monkeypatch):
@@ -116,9 +99,9 @@ def test_an_engine_that_cannot_is_refused(robots, monkeypatch):
     with pytest.raises(fflin.InputError, match=r"'compiled'.*fflin\[fast"):
         fflin.Linearizer(robots["cubesat"], engine="compiled")
     monkeypatch.undo()
-    monkeypatch.setattr(prepared.Prepared, "kernel", lambda self: None)
-    with pytest.raises(fflin.InputError, match="'cubesat'"):
-        fflin.Linearizer(robots["cubesat"], engine="compiled")
+    orbiting = robots["cubesat"].replace(orbit=fflin.CircularOrbit(500e3))
+    with pytest.raises(fflin.InputError, match=r"'cubesat'.*orbit"):
+        fflin.Linearizer(orbiting, engine="compiled")
 
 
 def test_one_model_is_the_same_to_the_last_bit_where_the_kernel_is_loaded(robots):

@@ -12,12 +12,7 @@ spread = {"*.mass": 0.05, "q_b": 0.02}
 fflin.monte_carlo(robot, law, spread, runs=8, duration=0.02, dt=0.01, engine="compiled")
 """,
     """
-import numpy as np
-q, v = robot.neutral(), np.zeros(robot.nv)
-fflin.Linearizer(robot, engine="compiled")(q, v)
-rows = np.tile(q, (2000, 1))
-fflin.sweep(robot, rows)
-fflin.sweep(robot, rows, np.full((2000, robot.nv), 0.1))
+fflin.sweep(robot, [robot.neutral()])
 """,
 )
 _BEFORE = "import fflin; robot = fflin.load('planar_detumble'); lin = fflin.linearize(robot)"
