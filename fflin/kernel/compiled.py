@@ -12,7 +12,7 @@ from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from threading import Lock
+from threading import Lock, RLock
 from typing import Any
 
 from fflin.base.errors import unknown
@@ -33,7 +33,7 @@ VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 _SILENCE, _LONGEST_WAIT = 2.0, 600.0
 
 _log = logging.getLogger("fflin")
-_TURN = Lock()
+_TURN, _COMPILING = Lock(), RLock()
 
 
 def available_cores() -> int:
@@ -86,7 +86,8 @@ def _compile_alone(
     compile: Callable[[Any], Any], folder: Path, module: str, name: str, what: str, signature: Any
 ) -> Any:
     """Compile for a signature, or load the code that another process has compiled meanwhile."""
-    with _between_processes(folder / f"{module}.{name}.lock"):
+    # Threads wait for one another here, and so never for a lock that this process holds.
+    with _COMPILING, _between_processes(folder / f"{module}.{name}.lock"):
         if not _kept(folder, module, name):
             _log.warning("fflin: compiling %s once; the code is stored in %s", what, folder)
         return compile(signature)

@@ -4,8 +4,9 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as StillWaits
 from dataclasses import replace
-from threading import Barrier
+from threading import Barrier, Event
 from types import SimpleNamespace
 
 import numpy as np
@@ -56,6 +57,30 @@ def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_pat
     assert [record.message for record in caplog.records] == [
         f"fflin: compiling the batch kernel once; the code is stored in {tmp_path}"
     ]
+
+
+@pytest.mark.compiled
+def test_a_thread_that_waits_for_another_names_no_process(compiled, caplog, tmp_path, monkeypatch):
+    began, told, asked = Event(), Event(), []
+
+    def compile(signature):
+        asked.append(signature)
+        began.set()
+        assert told.wait(5.0)
+
+    monkeypatch.setattr(kernel_code, "_SILENCE", 0.01)
+    compiled.compile = compile
+    made = kernel_code.kernel("factor", "invert")
+    with ThreadPoolExecutor(2) as threads:
+        first = threads.submit(made.compile, "double")
+        assert began.wait(5.0)
+        second = threads.submit(made.compile, "long")
+        with pytest.raises(StillWaits):
+            second.result(0.2)
+        told.set()
+        first.result(), second.result()
+    assert asked == ["double", "long"]
+    assert not any("waiting" in record.message for record in caplog.records)
 
 
 @pytest.mark.compiled
