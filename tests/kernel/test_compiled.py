@@ -70,7 +70,7 @@ def test_a_thread_that_waits_for_another_names_no_process(compiled, caplog, tmp_
 
     monkeypatch.setattr(kernel_code, "_SILENCE", 0.01)
     compiled.compile = compile
-    made = kernel_code.kernel("factor", "invert")
+    made = kernel_code.kernel("derivatives", "derive")
     with ThreadPoolExecutor(2) as threads:
         first = threads.submit(made.compile, "double")
         assert began.wait(5.0)
@@ -103,7 +103,7 @@ def test_a_function_that_is_prepared_twice_does_not_wait_for_itself(
     monkeypatch.setattr(kernel_code, "_SILENCE", 0.05)
     monkeypatch.setattr(kernel_code, "_LONGEST_WAIT", 0.05)
     for what in ("a kernel", "another use of it"):
-        kernel_code.kernel("factor", "invert", what)
+        kernel_code.kernel("derivatives", "derive", what)
         kernel_code._prepared.cache_clear()
     compiled.compile("double")
     assert signatures == ["double"]
