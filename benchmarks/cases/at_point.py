@@ -10,8 +10,9 @@ def run() -> Table:
     return compare(
         "at_point",
         "One linearisation at an operating point",
-        "Random joint positions, velocities and inputs. The column fflin is its time with the "
-        "compiled kernel; the columns of the peers are their times divided by fflin's.",
+        "Random joint positions, velocities and inputs. The column fflin shows its time with "
+        "the compiled kernel. The other columns show the times of the other tools divided by the "
+        "time of fflin.",
         (random_point(load(name)) for name in NAMES),
         fflin_call,
         in_readme=True,

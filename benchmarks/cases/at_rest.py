@@ -10,10 +10,10 @@ def run() -> Table:
     return compare(
         "at_rest",
         "One linearisation at rest",
-        "The columns are fflin's time, its ratio to its lower bound (crba, dpotrf and dpotri "
-        "called by hand), and the times of the peers divided by fflin's. Above 1, fflin is "
-        "faster. MuJoCo by hand is kinematics, inertia, factorisation, solution and B, without "
-        "checks, names or units.",
+        "The columns show the time of fflin, the ratio of this time to a lower bound (crba, dpotrf "
+        "and dpotri called by hand), and the times of the other tools divided by the time of "
+        "fflin. If such a ratio is above 1, fflin is faster. MuJoCo by hand consists of "
+        "kinematics, inertia, factorisation, solution and B, without checks, names or units.",
         (random_point(load(name)) for name in NAMES),
         fflin_call,
         in_readme=True,

@@ -41,8 +41,9 @@ def run() -> Table:
     return Table(
         "Batch at operating points",
         f"A sweep of {COUNT:,} random configurations, velocities and inputs on one thread. The "
-        "columns are fflin's time per point, and the time per call of the others divided by it. "
-        "The others have no batch function.",
+        "column fflin shows its time per point. The other columns show the time per call "
+        "of each tool divided by the time of fflin per point. The other tools have no batch "
+        "function.",
         ("robot", "n", "fflin [us a point]", *columns),
         tuple(
             (name, str(n), time, *(row.get(key, figure(None)) for key in columns))
