@@ -3,7 +3,6 @@
 ORDER = (
     "at_rest",
     "at_point",
-    "at_point_compiled",
     "equipped",
     "growth",
     "number",

@@ -10,9 +10,8 @@ def run() -> Table:
     return compare(
         "at_point",
         "One linearisation at an operating point",
-        "Random joint positions, velocities and inputs. The column fflin shows its time with "
-        "the compiled kernel. The other columns show the times of the other tools divided by the "
-        "time of fflin.",
+        "Random joint positions, velocities and inputs. The column fflin shows its time. The other "
+        "columns show the times of the other tools divided by the time of fflin.",
         (random_point(load(name)) for name in NAMES),
         fflin_call,
         in_readme=True,
@@ -20,7 +19,7 @@ def run() -> Table:
 
 
 def fflin_call(point: Point) -> Call:
-    linearizer = fflin.Linearizer(point.robot, engine="compiled")
+    linearizer = fflin.Linearizer(point.robot)
     q, v, u = point.q, point.v, point.u
 
     def call() -> None:

@@ -26,7 +26,7 @@ def run() -> Table:
     model, data = robot.model, robot.create_data()
     q = pin.integrate(model, pin.neutral(model), rng.normal(size=model.nv))
     v, u = rng.normal(size=model.nv), rng.normal(size=len(robot.inputs))
-    linearizer = fflin.Linearizer(robot, engine="compiled")
+    linearizer = fflin.Linearizer(robot)
     if not fflin.check(robot, linearizer(q, v, u)).ok:
         raise WrongResultError(f"fflin on {ROBOT} with thrusters and wheels: check fails")
     a, wrenches = np.zeros(model.nv), pin.StdVec_Force(model.njoints, pin.Force.Zero())
