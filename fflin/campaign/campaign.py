@@ -40,8 +40,8 @@ class Campaign(FrozenArrays):
       ``rates`` (of the joints): final error of this kind.
     - The name of a state or input: its final value, with sign.
     - ``worst NAME``: largest value over the whole run; for a state, its largest error.
-    - ``settle KIND`` [s]: settling time of this kind of error, after which the error stays within 2
-      % of its largest value. ``settle`` [s]: the longest of these settling times.
+    - ``settle KIND`` [s]: settling time of this error, after which it stays within 2 % of its
+      largest value. ``settle`` [s]: the longest of these settling times.
     - ``end`` [s]: end of the run.
     - ``drawn NAME``: value drawn for the dispersed parameter NAME.
 
