@@ -46,9 +46,9 @@ def add_commands(commands: Commands) -> None:
     add_figure(modes, "plot frequencies, damping and shapes")
     add_options(modes, "--html >FILE: write a page that plays the mode shapes")
     validity = command(
-        *(commands, "validity", _validity), "measure up to which displacements the linear model is
-        accurate and its regulator settles", "fflin validity ets_vii --attitude 120 --samples 200
-        --jobs 2",
+        *(commands, "validity", _validity),
+        "measure up to which displacements the linear model is accurate and its regulator settles",
+        "fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
     )
     add_point(validity)
     add_weights(validity)
@@ -61,7 +61,8 @@ def add_commands(commands: Commands) -> None:
         --samples N = 100: number of random runs; 100 by default
         --seed S = 0: random seed of the runs; 0 by default
         --jobs N = 1: number of processes, at most one for each core; 1 by default
-        --limits urdf|none = none: saturate the inputs at the limits of the robot (urdf), or never (none, default)""",
+        --limits urdf|none = none: saturate the inputs at the limits of the robot (urdf), or never
+            (none, default)""",
     )
     frames = """--frames hybrid|local|world: also test the loop with base velocities and inputs in
         these axes"""
@@ -71,8 +72,10 @@ def add_commands(commands: Commands) -> None:
         *(commands, "sensitivity", _sensitivity),
         "show or save the derivatives of A and B with respect to masses, springs, thrusters ...",
         "fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
-    ) add_point(sensitivity) add_options(sensitivity, "--dt H: differentiate the sampled model, with
-    inputs held for H [s]") add_options(
+    )
+    add_point(sensitivity)
+    add_options(sensitivity, "--dt H: differentiate the sampled model, with inputs held for H [s]")
+    add_options(
         sensitivity, "--top N = 15: show the N parameters with the largest effect; 15 by default"
     )
     add_options(sensitivity, "--only NAME: show these parameters only: mass, link_3, *.density")
@@ -82,16 +85,19 @@ def add_commands(commands: Commands) -> None:
         "Sensitivity",
     )
     uncertain = command(
-        *(commands, "uncertain", _uncertain), "show or save the exact linear-fractional model (LFT)
-        at rest for uncertain parameters", "fflin uncertain servicer_7dof --vary base.mass=0.2
-        --vary panel_left.stiffness=80:120 " "-o uncertain.mat",
+        *(commands, "uncertain", _uncertain),
+        "show or save the exact linear-fractional model (LFT) at rest for uncertain parameters",
+        "fflin uncertain servicer_7dof --vary base.mass=0.2 --vary panel_left.stiffness=80:120 "
+        "-o uncertain.mat",
     )
     add_robot(uncertain)
     add_options(
         uncertain, "--joint NAME=VALUE*: position of a joint [rad|m]; others are at neutral"
     )
     add_system(uncertain, axes=False)
-    vary = """--vary NAME=RANGE*: range of a parameter named by `fflin sensitivity`, or of all parameters that match a pattern: a fraction of the nominal value, such as 0.2, or LEAST:LARGEST. With RANGE,tied all parameters of the pattern share one delta"""
+    vary = """--vary NAME=RANGE*: range of a parameter named by `fflin sensitivity`, or of all
+        parameters that match a pattern: a fraction of the nominal value, such as 0.2, or
+        LEAST:LARGEST. With RANGE,tied all parameters of the pattern share one delta"""
     add_options(uncertain, vary, type=_range, required=True)
     add_output_file(
         uncertain, "save A, B1 .. D22 and the blocks to FILE: .npz, .mat or .json", "LFT"

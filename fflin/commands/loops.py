@@ -65,14 +65,17 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
     add_options(
         start,
         """
-        --offset NAME=VALUE*: initial error relative to the start of the trajectory, in base axes. NAME is a state, group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]""",
+        --offset NAME=VALUE*: initial error relative to the start of the trajectory, in base axes.
+            NAME is a state, group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw
+            [deg]""",
     )
     add_options(
         goal,
         """
         --target-joint NAME=VALUE*: target position of a joint [rad|m]; the other joints go to
             their neutral position, the base to the world's origin
-        --target-velocity NAME=VALUE*: target velocity, such as the speed of a wheel. It is also the initial velocity unless --velocity is given""",
+        --target-velocity NAME=VALUE*: target velocity, such as the speed of a wheel. It is also the
+            initial velocity unless --velocity is given""",
     )
     add_inputs_there(goal)
     add_trajectory(goal)
@@ -81,12 +84,14 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
         law,
         """
         --schedule FILE: follow the trajectory with gains saved by tvlqr; without this option, gains
-        are designed --gain FILE: regulate with a gain saved by lqr, about the operating point for
-        which it was designed --controller FILE: use a linear controller K with positive feedback, u
-        - u0 = K (y - y0) about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it
-        is sampled; --output selects y --negative-feedback: the controller assumes negative
-        feedback, u - u0 = -K (y - y0) --[no-]allocate: design with torque and force on the base,
-        and allocate the nearest wrench
+            are designed
+        --gain FILE: regulate with a gain saved by lqr, about the operating point for which it was
+            designed
+        --controller FILE: use a linear controller K with positive feedback, u - u0 = K (y - y0)
+            about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled;
+            --output selects y
+        --negative-feedback: the controller assumes negative feedback, u - u0 = -K (y - y0)
+        --[no-]allocate: design with torque and force on the base, and allocate the nearest wrench
             to the thrusters, which cannot pull. This is the default if the thrusters can push in
             every direction. With --no-allocate, negative thrust is set to zero
         --free: simulate without a regulator and without inputs

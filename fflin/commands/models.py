@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 
 def add_commands(commands: Commands) -> None:
     """Add robots, info, linearize and check."""
-    command(commands, "robots", _robots, "list the robots that can be loaded by name", "fflin
-    robots") info = command(
+    command(
+        commands, "robots", _robots, "list the robots that can be loaded by name", "fflin robots"
+    )
+    info = command(
         commands,
         "info",
         _info,
@@ -66,8 +68,8 @@ def add_commands(commands: Commands) -> None:
     add_point(check)
     add_trajectory(check)
     add_options(
-        check, "--tolerance X: relative tolerance of all comparisons; by default, each comparison
-        has its own"
+        check,
+        "--tolerance X: relative tolerance of all comparisons; by default each has its own",
     )
     add_figure(check, "plot the errors and their tolerances")
 

@@ -45,19 +45,19 @@ def add_weights(command: Container) -> None:
         command,
         """
         --weights urdf|identity: rule that sets all weights not given by --q, --r or --bryson.
-        `urdf` (default) keeps
-            the inputs within the limits of the URDF for displacements of 30 deg of the base and 0.3
-            rad of the joints; `identity` sets every weight to 1
+            `urdf` (default) keeps the inputs within the limits of the URDF for displacements of 30
+            deg of the base and 0.3 rad of the joints; `identity` sets every weight to 1
         --q NAME=W*: weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b,
             q_m.hinge_*
         --r NAME=W*: weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*
         --bryson NAME=VALUE*: largest acceptable value of a state, an input or a group, which gets
-        the weight 1/VALUE^2. The other weights, from the rule, are scaled to match --dt H: design
-        for inputs held for H [s]; the continuous-time cost is still minimised --reduce: if momentum
-        is conserved, regulate only the states that the inputs can control --[no-]wheel-speeds:
-        whether to return the speeds of reaction wheels to their values at the operating point. By
-        default, they are returned if thrusters or a base torque can absorb the wheel torque.
-        --wheel-speeds adds speeds that the wheels alone can change without rotating the robot""",
+            the weight 1/VALUE^2. The other weights, from the rule, are scaled to match
+        --dt H: design for inputs held for H [s]; the continuous-time cost is still minimised
+        --reduce: if momentum is conserved, regulate only the states that the inputs can control
+        --[no-]wheel-speeds: whether to return the speeds of reaction wheels to their values at the
+            operating point. By default, they are returned if thrusters or a base torque can absorb
+            the wheel torque. --wheel-speeds adds speeds that the wheels alone can change without
+            rotating the robot""",
     )
 
 

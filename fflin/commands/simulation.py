@@ -30,9 +30,13 @@ def add_commands(commands: Commands) -> None:
         *(commands, "simulate", _simulate),
         "simulate the nonlinear robot with a regulator to a target or along a trajectory",
         "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png",
-    ) run, shown = add_loop(simulate), simulate.add_argument_group("output of the simulation")
-    add_options(run, "--every N: number of steps from one saved row to the next; chosen
-    automatically for long runs") add_options(
+    )
+    run, shown = add_loop(simulate), simulate.add_argument_group("output of the simulation")
+    add_options(
+        run,
+        "--every N: steps from one saved row to the next; chosen automatically for long runs",
+    )
+    add_options(
         shown,
         """
         --plot >FILE: plot the nonlinear and the linear motion to FILE: .png, .pdf or .svg

@@ -63,8 +63,13 @@ def add_commands(commands: Commands) -> None:
         --configurations FILE.npz: q (N, nq) in Pinocchio's order, saved by numpy.savez, and
             optionally v (N, nv) and u (N, nu)
         --seed S = 0: random seed of --random; 0 by default""",
-    ) ranges = "--range JOINT=LO:HI*: with --random: range of a joint, which replaces the joint
-    limits" add_options(points, ranges, type=_range) add_pose(sweep) add_options(
+    )
+    ranges = (
+        "--range JOINT=LO:HI*: with --random: range of a joint, which replaces the joint limits"
+    )
+    add_options(points, ranges, type=_range)
+    add_pose(sweep)
+    add_options(
         sweep,
         "--effort NAME=VALUE*: input at all points, by its name in u, such as tau_m.joint_1",
     )

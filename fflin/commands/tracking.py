@@ -38,22 +38,24 @@ def add_commands(commands: Commands) -> None:
     add_trajectory(tvlqr, required=True)
     add_weights(tvlqr)
     add_options(
-        tvlqr, "--qf NAME=VALUE*: weight on the final error; by default the infinite-horizon cost
-        about the end point",
+        tvlqr,
+        "--qf NAME=VALUE*: weight on the final error; by default the cost to go about the end point",
     )
     add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json", "GainSchedule")
 
 
 def add_trajectory(parser: Container, *, required: bool = False) -> None:
     """Add --trajectory, --hold and --strict; the file then sets the default of --frame."""
-    trajectory = """--trajectory FILE: use the trajectory in FILE: .npz, .mat, .json, or .csv with named columns, as fflin.Trajectory.load reads it. --frame gives the axes of the data; by default the frame in the file, else local"""
+    trajectory = """--trajectory FILE: use the trajectory in FILE: .npz, .mat, .json, or .csv with
+        named columns, as fflin.Trajectory.load reads it. --frame gives the axes of the data; by
+        default the frame in the file, else local"""
     add_options(parser, trajectory, required=required)
     add_options(
         parser,
         """
         --hold linear|previous: inputs between the knots of FILE: interpolated linearly, or held at
-        the value of the previous knot. By default the setting in the file, else linear --strict:
-        refuse a FILE that does not satisfy the dynamics of the robot""",
+            the value of the previous knot. By default the setting in the file, else linear
+        --strict: refuse a FILE that does not satisfy the dynamics of the robot""",
     )
     parser.set_defaults(frame=None)
 

@@ -122,7 +122,7 @@ class TrajectoryFeedback:
 
     @property
     def ahead(self) -> float:
-        """Time [s] into a sample at which a changing input is closest to its mean over the sample."""
+        """Time [s] into a sample at which a changing input is closest to the sample mean."""
         return 0.5 * self.schedule.dt if self.trajectory.hold == "linear" else 0.0
 
     def commanded(self, t: float) -> tuple[Array, Array, Array]:
