@@ -88,8 +88,8 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
         --gain FILE: regulate with a gain saved by lqr, about the operating point for which it was
             designed
         --controller FILE: use a linear controller K with positive feedback, u - u0 = K (y - y0)
-            about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled;
-            --output selects y
+            about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled. The
+            outputs y are set by --output
         --negative-feedback: the controller assumes negative feedback, u - u0 = -K (y - y0)
         --[no-]allocate: design with torque and force on the base, and allocate the nearest wrench
             to the thrusters, which cannot pull. This is the default if the thrusters can push in
