@@ -181,9 +181,7 @@ def generalized_inertia(lin: LinearModel) -> Array:
     lin = checked(lin)
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
     if len(lin.A) != 12 + 2 * joints:
-        raise InputError(
-            "the model lacks the states of the base; give the model before its reduction"
-        )
+        raise InputError("the model lacks the states of the base; give the unreduced model")
     inertia = floating_inertia(lin.M, range(6, 6 + joints), range(6))
     return (inertia + inertia.T) / 2.0
 

@@ -180,14 +180,16 @@ def _momentum(lin: LinearModel) -> str:
         count, left = len(reduced.momenta), len(reduced.A)
         wheels = ", the wheels" * (len(lin.A) > left + 2 * count)
         field = "orbit's field, the " * bool(lin.mean_motion)
-        text = f"none is conserved: the {field}inputs, springs and dampers act on all of them"
+        text = (
+            f"no momentum is conserved: the {field}inputs, springs and dampers act on all momenta"
+        )
         if count:
             text = (
-                f"{count} momenta are conserved whatever the inputs do; without them{wheels} and "
-                f"what they drive {left} states are left"
+                f"{count} momenta are conserved for all inputs; without these momenta{wheels} and "
+                f"the coordinates that they drive, {left} states remain"
             )
         elif not lin.is_equilibrium():
-            text = "none can be split off: the model is one of a point that moves on"
+            text = "no momentum can be removed: the operating point is not an equilibrium"
         text = "\n".join((text, *(f"note: {note}" for note in reduced.notes)))
     return folded(text.splitlines())
 

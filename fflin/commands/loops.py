@@ -42,7 +42,7 @@ class Loop(NamedTuple):
 def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
     """Refuse options that have no effect with others."""
     if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
-        raise InputError(f"{', '.join(given)}: {why}; leave it out")
+        raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 
 def refuse_law(arguments: argparse.Namespace) -> None:
@@ -88,8 +88,8 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
         --gain FILE: regulate with a gain saved by lqr, about the operating point for which it was
             designed
         --controller FILE: use a linear controller K with positive feedback, u - u0 = K (y - y0)
-            about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled. The
-            outputs y are set by --output
+            about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled.
+            y is set by --output
         --negative-feedback: the controller assumes negative feedback, u - u0 = -K (y - y0)
         --[no-]allocate: design with torque and force on the base, and allocate the nearest wrench
             to the thrusters, which cannot pull. This is the default if the thrusters can push in
@@ -125,7 +125,7 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         "duration": arguments.duration,
     }
     if not arguments.controller:
-        _refuse(arguments, ("negative_feedback",), "it needs a --controller")
+        _refuse(arguments, ("negative_feedback",), "only a --controller has a feedback sign")
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
         return Loop(policy, options | start)

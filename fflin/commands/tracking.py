@@ -39,7 +39,7 @@ def add_commands(commands: Commands) -> None:
     add_weights(tvlqr)
     add_options(
         tvlqr,
-        "--qf NAME=VALUE*: weight on the final error; by default the cost to go about the end point",
+        "--qf NAME=VALUE*: weight on the final error; by default the steady cost at the end",
     )
     add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json", "GainSchedule")
 
@@ -101,8 +101,8 @@ def check_along(arguments: argparse.Namespace) -> int:
 def _tvlqr(arguments: argparse.Namespace) -> int:
     if arguments.reduce:
         raise InputError(
-            "--reduce does not apply along a trajectory, since its cost over a finite time always "
-            "exists; leave it out"
+            "--reduce does not apply along a trajectory, because the finite-horizon cost always "
+            "exists; remove --reduce"
         )
     along = models_along(arguments)
     schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")

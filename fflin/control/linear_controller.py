@@ -226,9 +226,7 @@ class LinearController:
         dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
         dt = lin.dt or dt if dt < 0.0 else dt
         if dt < 0.0:
-            raise InputError(
-                "the controller is sampled, but states no sampling time; give its dt [s]"
-            )
+            raise InputError("the controller is sampled, but has no sampling time; give its dt [s]")
         if lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt:
             times = (
                 f"sampled at dt = {each:g} s" if each else "continuous" for each in (dt, lin.dt)
@@ -312,9 +310,10 @@ def growing(policy: Any) -> tuple[str, ...]:
             poles = np.linalg.eigvals(LinearController(by.system, by.lin, sign=-1.0).loop)
             if what == "linear loop" and ((np.abs(poles) < 1) if by.dt else (poles.real < 0)).all():
                 said[-1] += (
-                    "; it is stable with the other sign: set sign=-1 (--negative-feedback), "
+                    "; the loop is stable with the opposite sign: "
+                    "set sign=-1 (--negative-feedback), "
                 )
-                said[-1] += "or remove it if it is set"
+                said[-1] += "or remove this option if it is set"
     return tuple(said)
 
 

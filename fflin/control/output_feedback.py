@@ -68,7 +68,7 @@ class OutputFeedback(LinearController):
             )
         if not lin.dt or lin.moving:
             raise InputError(
-                "the model must be sampled and about a fixed point; take lin.discretize(dt), and "
+                "the model must be sampled and about a fixed point; use lin.discretize(dt), and "
                 "design the gain and the estimator for it"
             )
         signals = (compensator.input_names, compensator.output_names, compensator.dt)

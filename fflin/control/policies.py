@@ -205,7 +205,7 @@ class Clock:
         if self._last >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
             raise InputError(
                 f"the controller is called {apart:g} s after its last sample, expected "
-                f"{self._dt:g} s; leave out `sample`, or give it this value"
+                f"{self._dt:g} s; leave out `sample`, or set `sample` to the expected value"
             )
         self._last = t
 

@@ -236,9 +236,7 @@ def sampled_cost(
     0.1
     """
     if not isinstance(lin, LinearModel) or lin.dt:
-        raise InputError(
-            "lin must be a continuous LinearModel; give the model from before discretize"
-        )
+        raise InputError("lin must be a continuous LinearModel; give the model that was sampled")
     h = number("dt", dt)
     if h <= 0.0:
         raise InputError(f"dt is {h:g} s, expected a positive sampling time")

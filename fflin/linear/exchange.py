@@ -268,7 +268,7 @@ def _step(tool: str, dt: Any) -> float:
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(
-            f"dt is {h:g} s for {tool}; expected a positive time step below 1000 s, for mujoco only"
+            f"dt is {h:g} s for {tool}; only mujoco takes dt, a positive time step below 1000 s"
         )
     return h
 

@@ -130,7 +130,7 @@ class CircularOrbit:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
             above, said = altitude - ground, ""
             if altitude < _BARE.get(self.body, _AIR):
-                said = "altitudes are in metres: write 400 km as 400e3"
+                said = "altitudes are in metres; write 400 km as 400e3"
             elif self.body == "earth" and _LOW_ORBITS[0] <= above <= _LOW_ORBITS[1]:
                 said = f"if you mean the orbit's radius, the altitude is {above:.8g} m"
             if said and self.mu is None:  # not of an asteroid, nor of an orbit that was saved
