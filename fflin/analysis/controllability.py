@@ -38,7 +38,8 @@ class Controllability(FrozenArrays):
     dimension : int
         Dimension of the controllable subspace.
     controllable : tuple of str
-        ``dimension`` states that the inputs can set independently; `basis` gives the other states.
+        ``dimension`` states that the inputs can set independently. The other states then follow
+        from `basis`.
     uncontrollable : tuple of str
         Names of the uncontrollable combinations of states.
     rows : ndarray (nx - dimension, nx)
@@ -47,7 +48,8 @@ class Controllability(FrozenArrays):
         Basis of the controllable subspace. Column i changes ``controllable[i]`` by 1, and no other
         state in `controllable`.
     fixed_poles : ndarray (nx - dimension,)
-        Poles that no feedback can move: [1/s], or poles of the sampled model.
+        Poles that no feedback can move: [1/s] for a continuous model, discrete-time poles z for a
+        sampled one.
     stabilizable : bool
         Whether all fixed poles are stable.
     reach : dict
@@ -56,8 +58,9 @@ class Controllability(FrozenArrays):
     method : str
         Method that determined the dimension: "closed form", "modes" or "eigenvalues".
     margin : Margin
-        Distance of the rank decisions from doubt: singular values relative to their tolerance. A
-        clear decision has values far above 1 and far below 1.
+        Certainty of the rank decisions: the smallest singular value counted as nonzero and the
+        largest counted as zero, each divided by its tolerance. If they are far above and far below
+        1, the decision is clear.
     notes : tuple of str
         Remarks on the result, such as undecided ranks.
 
@@ -100,22 +103,22 @@ class Controllability(FrozenArrays):
 def controllability(lin: LinearModel) -> Controllability:
     r"""Determine the controllable subspace from the structure of the model.
 
-    - At rest, the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved. They, and the
-      coordinates :math:`W M N^{-1} x_1` that they drive, are split off exactly. Without springs and
-      dampers this completes the result: the dimension is 2 rank(B).
-    - With symmetric springs and dampers, the second-order form :math:`M a + D v + K s = S u`
-      decides on the remaining part: the rank of :math:`[p^2 M + p D + K, S]` at each pole p.
+    - At rest, the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved. These momenta,
+      and the coordinates :math:`W M N^{-1} x_1` that they drive, are separated exactly. Without
+      springs and dampers nothing else is uncontrollable, and the dimension is 2 rank(B).
+    - With symmetric springs and dampers, the remaining part is tested in second-order form,
+      :math:`M a + D v + K s = S u`, by the rank of :math:`[p^2 M + p D + K, S]` at each pole p.
       Entries within rounding error are set to zero, and each row is scaled by its entries.
-    - At nonzero velocity, the Popov-Belevitch-Hautus test decides: the singular values of
-      :math:`[A - p E, B]`, in units of energy. The same holds if springs or dampers are not
-      symmetric.
+    - At nonzero velocity, or if springs or dampers are not symmetric, the Popov-Belevitch-Hautus
+      test is applied: the rank of :math:`[A - p E, B]` is found from its singular values, with
+      states scaled to units of energy.
 
     A sampled model has the structure of its continuous model. The exception is a vibration whose
-    period divides the sample time: sampling makes it uncontrollable. A file contains the sampled
-    matrices alone, which are analysed as they are.
+    period divides the sample time: sampling makes it uncontrollable. If a sampled model is loaded
+    from a file, only its sampled matrices are known, and these are analysed.
 
-    Every tolerance is a small multiple of the rounding error. `margin` gives the distance of the
-    decisions from it, and `notes` lists decisions within rounding error.
+    Every tolerance is a small multiple of the rounding error. `margin` compares the decisions with
+    their tolerances, and `notes` lists decisions within rounding error.
 
     Parameters
     ----------

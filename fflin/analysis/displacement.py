@@ -16,8 +16,8 @@ def checked_displacement(
     given = {key: number(key, value) for key, value in given.items()}
     if not 0.0 <= given["attitude"] < 175.0 or min(given.values()) < 0.0:
         raise InputError(
-            f"the displacements are {shown(given)}; expected none negative, and an attitude "
-            "below 175 deg, since the chart ends at 180 deg"
+            f"the displacements are {shown(given)}; expected values of 0 or more, and an "
+            "attitude below 175 deg, because the chart ends at 180 deg"
         )
     if max(given.values()) > _FARTHEST:
         raise InputError(

@@ -27,7 +27,8 @@ _ROUNDING = 1e-14
 class EffectiveMasses(FrozenArrays):
     """Effective masses of the vibration modes with the base clamped; prints as a table.
 
-    All are about the base frame's origin and in the base's axes, translation before rotation.
+    All quantities are about the origin of the base frame and in its axes, translation before
+    rotation.
 
     Attributes
     ----------
@@ -102,16 +103,18 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
         K \phi_i = \omega_i^2 \tilde M_{mm} \phi_i, \qquad \phi_i^T \tilde M_{mm} \phi_i = 1,
         \qquad L_i = \tilde M_{bm} \phi_i.
 
-    If the base is shaken along or about axis d, mode i reacts like a mass on a spring. This is its
-    effective mass :math:`L_{di}^2` [kg], or its effective inertia [kg m^2]. The sum over all modes,
-    the part of the free joints and the residual is the inertia of the rigid robot,
+    If the base is shaken along axis d, mode i reacts like a mass on a spring: its effective mass
+    :math:`L_{di}^2` [kg]. If the base is shaken about d, this is its effective inertia [kg m^2].
+    The sum over all modes, the part of the free joints and the residual is the inertia of the rigid
+    robot,
 
     .. math::
         \textstyle\sum_i L_i L_i^T + M_{free} + M_{res} = M_{bb}, \qquad
         M_{res} = M_{bb} - M_{bm} M_{mm}^{-1} M_{mb}.
 
-    `modes` lists the frequencies of the floating robot, which are higher. If modes share a
-    frequency, only the sum of their masses is unique; the first takes the largest possible mass.
+    The floating robot has higher frequencies, which `modes` lists. If several modes have the same
+    frequency, only the sum of their masses is unique; the first of them is given the largest
+    possible mass.
 
     Parameters
     ----------

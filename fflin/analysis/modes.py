@@ -32,13 +32,13 @@ class Mode(FrozenArrays):
     shape : ndarray (nx,) of complex
         Eigenvector in the units of the state, scaled so that the largest position entry is 1.
     unstable : bool
-        Whether the mode grows, by more than the rounding error.
+        Whether the real part of the pole is positive by more than its rounding error.
     margin : float
         Real part of the pole as a multiple of its rounding error; infinite if that error is zero.
     energy : mapping of str to float
         Fraction of the mode's kinetic energy in each body, the largest first. The fractions are
-        nonnegative and sum to 1. The name of a body is the joint that carries it, or "base" for the
-        root. Empty for a model from a file, which lacks the bodies.
+        nonnegative and sum to 1. A body is named after the joint that carries it; the root body is
+        "base". Empty for a model loaded from a file, which lacks the bodies.
 
     Notes
     -----
@@ -106,14 +106,14 @@ class Modes:
         Largest ``|A x - pole x|`` relative to ``|A| |x|``. The states are scaled to unit inertias
         and to the time of the fastest motion.
     equilibrium : bool
-        Whether the operating point is an equilibrium or a relative equilibrium. Otherwise the
-        eigenvalues belong to a frozen model and do not show stability.
+        Whether the operating point is an equilibrium or a relative equilibrium. If False, the
+        eigenvalues describe the model frozen at this point and do not decide its stability.
     state_names, state_units : tuple of str
         Names and units of the entries of the shapes.
     robot : str
         Name of the robot.
     lin : LinearModel
-        Model whose modes these are.
+        The analysed model.
 
     Examples
     --------
@@ -151,12 +151,12 @@ class Modes:
 
     @property
     def unstable(self) -> tuple[Mode, ...]:
-        """The modes that grow."""
+        """The unstable modes."""
         return tuple(mode for mode in self.modes if mode.unstable)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks: modes whose stability is within rounding error, and missing data."""
+        """Remarks on missing data, and on modes whose stability rounding error leaves undecided."""
         undecided = tuple(
             f"undecided: whether the mode at {mode.frequency:.4g} rad/s grows or decays; its real "
             f"part is {mode.margin:.1g} times its rounding error"
@@ -214,7 +214,8 @@ class Modes:
 def modes(lin: LinearModel) -> Modes:
     r"""Compute the natural modes of a linear model.
 
-    At rest, with a symmetric stiffness alone, these are the modes of the free-floating structure:
+    At rest, if a symmetric stiffness is the only force, these are the modes of the free-floating
+    structure:
 
     .. math::
         K \phi = \omega^2 M^* \phi, \qquad M^* = ((M^{-1})_{EE})^{-1},

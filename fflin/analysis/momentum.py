@@ -28,8 +28,9 @@ _DRIFT = 1e-9
 class ReducedModel(LinearModel):
     """Linear model reduced to the coordinates on which inputs, springs and dampers act.
 
-    With the reduced state z and the full state x, always ``z = S x``. For motions with zero
-    conserved momenta, ``x - x0 = T (z - z0)``. Files contain the model without these maps.
+    Let z be the reduced state and x the full state; then ``z = S x`` for all motions. For motions
+    with zero conserved momenta, ``x - x0 = T (z - z0)``. A saved file contains the model, but not
+    the maps T and S.
 
     Attributes
     ----------
@@ -40,10 +41,9 @@ class ReducedModel(LinearModel):
     momenta : ndarray (k, nx)
         Rows L1 of the conserved momenta, which are zero in the reduced model.
     coordinates : ndarray (k, nx)
-        Rows L2 of the coordinates that drift at the rate of L1; they are zero in the reduced model.
+        Rows L2 of the coordinates whose rates are the momenta; they are zero in the reduced model.
     margin : Margin
-        Distance from doubt of the rank decision on the conserved momenta: far above 1 and far
-        below 1 is clear.
+        Certainty of the rank decision on the conserved momenta, as in `Controllability`.
     notes : tuple of str
         Undecided ranks.
 
@@ -77,16 +77,16 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
         \nu_b = G \dot q_m, \quad M^* \ddot q_m = \tau_m - K q_m - D \dot q_m, \quad
         M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}.
 
-    Equations (9.2) and (9.3) of docs/derivation.md.
+    These are equations (9.2) and (9.3) of docs/derivation.md.
 
     If attitude or position is actuated too, its states are kept. Without springs the result is
-    minimal; with springs it may contain vibrations that no input drives. From inputs to joint
-    states it has the transfer function of the full model.
+    minimal; with springs it may contain vibrations that no input drives. Its transfer function from
+    inputs to joint states equals the full model's.
 
     Reaction wheels are removed as well, whatever their momentum (9.4), while the attitude that they
     control is kept. Three kinds of wheels are kept with their angles:
 
-    - wheels whose speeds are to be controlled, (9.5);
+    - wheels whose speeds are to be controlled (9.5);
     - wheels on a carrier that rotates at the operating point;
     - wheels with friction.
 
@@ -155,7 +155,7 @@ def generalized_inertia(lin: LinearModel) -> Array:
 
     .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
 
-    After Umetani and Yoshida, see `momentum_reduction`.
+    The definition is by Umetani and Yoshida, see `momentum_reduction`.
 
     Parameters
     ----------
@@ -181,21 +181,19 @@ def generalized_inertia(lin: LinearModel) -> Array:
     lin = checked(lin)
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
     if len(lin.A) != 12 + 2 * joints:
-        raise InputError(
-            "the model lacks the states of the base; give the model before its reduction"
-        )
+        raise InputError("the model lacks the states of the base; give the unreduced model")
     inertia = floating_inertia(lin.M, range(6, 6 + joints), range(6))
     return (inertia + inertia.T) / 2.0
 
 
 def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") -> Array:
-    r"""Return the generalized Jacobian from joint rates to a frame's velocity, free base (9.3).
+    r"""Return the generalized Jacobian from joint rates to a frame's velocity (9.3).
 
-    The momentum of the robot is zero.
+    The base is free, and the momentum of the robot is zero.
 
     .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
 
-    After Umetani and Yoshida, see `momentum_reduction`.
+    The definition is by Umetani and Yoshida, see `momentum_reduction`.
 
     Parameters
     ----------

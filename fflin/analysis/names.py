@@ -85,9 +85,9 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
 def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[str, ...]:
     """Say what is decided within rounding, and the two answers: `count` states, or others."""
     return tuple(
-        f"undecided: {shape(lin, at)} is taken as {'' if change < 0 else 'not '}{what}, at "
-        f"{ratio:.1g} times its rounding error; {count} or {count + change} of {len(lin.A)} "
-        f"states are {what}"
+        f"undecided: {shape(lin, at)} is taken as {'' if change < 0 else 'not '}{what}; "
+        f"the test value is {ratio:.1g} times its rounding error; "
+        f"{count} or {count + change} of {len(lin.A)} states are {what}"
         for ratio, at, change in margin.doubts
     )
 
@@ -95,8 +95,8 @@ def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[
 def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
     """Say where rounding decides whether the slowest motion decays."""
     return tuple(
-        f"undecided: whether {shape(lin, at)} decays by itself, at {ratio:.1g} times its "
-        f"rounding error; the model is {what} or not {what}"
+        f"undecided: whether {shape(lin, at)} decays by itself; its decay rate "
+        f"is {ratio:.1g} times its rounding error; the model is {what} or not {what}"
         for ratio, at, _ in settling.doubts
     )
 

@@ -25,21 +25,20 @@ class Observability(FrozenArrays):
     dimension : int
         nx minus the dimension of the unobservable subspace.
     unobservable : tuple of str
-        Names of the unobservable motions: a state, or a combination of states.
+        Names of the unobservable motions; each is a state or a combination of states.
     basis : ndarray (nx, nx - dimension)
         Unobservable motions, one column each.
     rows : ndarray (dimension, nx)
         Observable combinations of states: the unobservable subspace is ``rows @ x = 0``.
     fixed_poles : ndarray (nx - dimension,)
-        Poles of the estimation error that no observer can move: [1/s], or poles of the sampled
-        model.
+        Poles of the estimation error that no observer can move: [1/s] for a continuous model,
+        discrete-time poles z for a sampled one.
     detectable : bool
         Whether all fixed poles are stable.
     method : str
         Method that determined the dimension: "closed form" or "eigenvalues".
     margin : Margin
-        Distance of the rank decisions from doubt: singular values relative to their tolerance. A
-        clear decision has values far above 1 and far below 1.
+        Certainty of the rank decisions, as in `Controllability`.
     notes : tuple of str
         Undecided ranks.
 
@@ -75,11 +74,11 @@ class Observability(FrozenArrays):
 def observability(lin: LinearModel) -> Observability:
     r"""Determine the observable subspace from C and the structure of A.
 
-    At rest the second-order form :math:`M a + D v + K s = 0` decides, by the null space of
-    :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. The pole p = 0 is a single decision. At
-    nonzero velocity the dual pair :math:`(A^T, C^T)` decides, in units of energy, as in
-    `controllability`. The unobservable subspace is the orthogonal complement of its controllable
-    subspace.
+    At rest, observability is tested in second-order form, :math:`M a + D v + K s = 0`, by the null
+    space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. All poles p = 0 are tested
+    together. At nonzero velocity, observability is tested as the controllability of the dual pair
+    :math:`(A^T, C^T)`, with states scaled to units of energy, as in `controllability`. The
+    unobservable subspace is the orthogonal complement of the controllable subspace of this pair.
 
     Parameters
     ----------

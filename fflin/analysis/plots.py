@@ -28,7 +28,7 @@ _LEAST = 0.005
 
 
 def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
-    """Draw the entries of A and B above rounding error, and their magnitudes, by groups.
+    """Draw which entries of A and B exceed rounding error, and their magnitudes, by state groups.
 
     Parameters
     ----------

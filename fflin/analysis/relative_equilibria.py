@@ -63,7 +63,7 @@ class RelativeEquilibrium(FrozenArrays):
 
 
 class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
-    """Tuple of the 24 relative equilibria, most stable first; prints as a table of six kinds.
+    """Tuple of the 24 relative equilibria, most stable first; prints as a table, four per row.
 
     Examples
     --------
@@ -91,8 +91,9 @@ def relative_equilibria(
 ) -> RelativeEquilibria:
     r"""List the attitudes in which a robot with fixed joints stays at rest in its orbital frame.
 
-    There the principal axes of inertia are parallel to the axes of the frame, in 24 ways. With the
-    moments :math:`I_r, I_a, I_n` about the radial axis, the along-track axis and the orbit normal,
+    In these attitudes the principal axes of inertia are parallel to the axes of the frame, which is
+    possible in 24 ways. With the moments :math:`I_r, I_a, I_n` about the radial axis, the
+    along-track axis and the orbit normal,
 
     .. math::
         \lambda^2 = -3 n^2 (I_a - I_r)/I_n, \qquad

@@ -119,8 +119,8 @@ def _check_reach(
         margin &= decision
     doubts = tuple(
         f"undecided: {_dominant(at[None], lin.state_names)} is taken as "
-        f"{'' if change < 0 else 'not '}{what}, at {ratio:.2g} times its rounding error; "
-        "another machine may decide otherwise"
+        f"{'' if change < 0 else 'not '}{what}; the test value is "
+        f"{ratio:.2g} times its rounding error; another machine may decide otherwise"
         for ratio, at, change in margin.doubts
     )
     words = complaint.format(_dominant(np.array(missed), lin.state_names)) if missed else ""

@@ -133,7 +133,7 @@ class ChartError(FflinError, ValueError):
 
 
 class EquilibriumError(FflinError, ValueError):
-    """Error for a point that is not the required fixed point, or that no input can hold.
+    """Error for a point that must be a fixed point and is not, or that no inputs can hold.
 
     Examples
     --------
@@ -146,12 +146,12 @@ class EquilibriumError(FflinError, ValueError):
 
 
 class StabilizabilityError(FflinError, ValueError):
-    """Error for modes that do not decay by themselves and that the inputs cannot control.
+    """Error for modes that neither decay by themselves nor can be controlled by the inputs.
 
     Attributes
     ----------
     margin : Margin or None
-        How far the rank decisions behind the error are from doubt; None if none was made.
+        Certainty of the rank decisions that led to the error; None if no rank was decided.
 
     Examples
     --------
@@ -166,12 +166,12 @@ class StabilizabilityError(FflinError, ValueError):
 
 
 class DetectabilityError(FflinError, ValueError):
-    """Error for modes that do not decay by themselves and that the outputs do not observe.
+    """Error for modes that neither decay by themselves nor are observed by the outputs.
 
     Attributes
     ----------
     margin : Margin or None
-        How far the rank decisions behind the error are from doubt; None if none was made.
+        Certainty of the rank decisions that led to the error; None if no rank was decided.
 
     Examples
     --------
@@ -226,7 +226,7 @@ class SweepError(FflinError, RuntimeError):
 
 
 class FflinWarning(UserWarning):
-    """Warning about something that the user should know and that is not an error.
+    """Warning about a condition that may affect a result but does not prevent it.
 
     Examples
     --------

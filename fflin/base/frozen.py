@@ -9,7 +9,7 @@ from fflin.base.validation import Array
 
 
 class FrozenArrays:
-    """Of a frozen dataclass: its arrays are made read-only, and copied if they could be written."""
+    """Mixin of frozen dataclasses: makes their arrays read-only, and copies writable ones."""
 
     def __post_init__(self) -> None:
         this: Any = self

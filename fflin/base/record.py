@@ -245,8 +245,8 @@ class Design(FrozenArrays):
     Attributes
     ----------
     verified : bool
-        True for a result of this session, or read from a file with a valid SHA-256 digest. False
-        for a file without a digest, and for every result made from its data.
+        True for a result computed in this session, or read from a file with a valid SHA-256 digest.
+        False for a result read from a file without a digest, and for every result derived from it.
     """
 
     # Names of the arrays of one dimension, which Matlab does not know.

@@ -81,7 +81,7 @@ def asked_of(common: Mapping[str, Any]) -> dict[str, Any]:
 
 def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:
     raise InputError(
-        f"the {what} is not in the file and needs the robot; load the batch with "
+        f"the {what} is not in the file and is computed from the robot; load the batch with "
         f"LinearBatch.load(path, robot), with the unchanged robot '{name}'"
     )
 

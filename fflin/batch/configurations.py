@@ -39,7 +39,7 @@ class Grid:
     axes : mapping
         {joint: values (k,) [rad|m]}.
     start : ndarray (nq,)
-        Configuration of the base and of the joints that are not on the grid.
+        Configuration that fixes the base and the joints that the grid does not vary.
 
     Examples
     --------

@@ -100,7 +100,8 @@ class GainBatch(Design):
         Raises
         ------
         InputError
-            If the positions are not n finite numbers; otherwise as for `grid`.
+            If the positions are not n finite numbers, or the points are not on a grid or are all
+            the same.
         """
         return self._between(vector("joints", joints, len(self.joint_names), "the joint positions"))
 
@@ -163,7 +164,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
        the closed loop. Inputs u and states x of the modes give :math:`K = -u\,x^{-1}`.
     3. Refine each solution by Newton's method, and compute the residual of its Riccati equation.
 
-    `lqr` computes the gains of other models, and those whose residual is too large.
+    `lqr` computes the gains of all other models, and recomputes gains whose residual is too large.
 
     Parameters
     ----------
@@ -240,8 +241,8 @@ class ScheduledFeedback:
     lin : LinearModel
         Model about the target.
     gains : GainBatch
-        Gains on a grid of the same robot. The robot may also have captured or released an object
-        since: `line_up` then matches states and inputs.
+        Gains on a grid of the same robot. If the robot has captured or released an object since,
+        `line_up` matches states and inputs.
 
     Raises
     ------

@@ -63,7 +63,8 @@ class LinearBatch(FrozenArrays):
     locked : tuple of str
         Names of the locked joints.
     columns : tuple of (int, int)
-        Indices of each joint in q: (index, -1), or the indices of its (cos, sin).
+        Indices of each joint's entries in q: (index, -1) for one angle or length, or the indices of
+        cos and sin for a continuous joint.
     verified : bool
         Whether the data is known to be unchanged. False for a file without a checksum, or if the
         checksum was not verified.
@@ -168,7 +169,7 @@ class LinearBatch(FrozenArrays):
 
     @property
     def x0(self) -> Array:
-        """States at the points (N, nx); at rest, computed at each access."""
+        """States at the points (N, nx); computed at each access if the points are at rest."""
         return self._states_at_rest(self.q) if self._x0 is None else self._x0
 
     @property
@@ -207,7 +208,7 @@ class LinearBatch(FrozenArrays):
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
-        """Return the models whose joints have a value [rad|m] or lie in a range (low, high).
+        """Return the models whose named joints have given values or lie in ranges [rad|m].
 
         Raises
         ------
@@ -239,7 +240,8 @@ class LinearBatch(FrozenArrays):
         Parameters
         ----------
         path : str or Path
-            File ending in .npz or .h5. An HDF5 file can be read later without fitting in memory.
+            File ending in .npz or .h5. An HDF5 file can later be read even if it does not fit in
+            memory.
 
         Raises
         ------

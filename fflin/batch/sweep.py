@@ -83,8 +83,8 @@ def sweep(
         Executor whose workers process the chunks: processes, dask (``Client.get_executor()``) or
         mpi4py.futures. The robot is sent to each worker once. The executor is not shut down.
     workers : int, optional
-        Number of worker processes to start, at most one per core. A process that dies is
-        replaced. Call `sweep` under ``if __name__ == "__main__":`` then.
+        Number of worker processes to start, at most one per core. A process that dies is replaced.
+        With workers, call `sweep` under ``if __name__ == "__main__":``.
     threads : int, optional
         Threads of the kernel in this process; by default all available cores.
     chunk : int, optional
@@ -117,7 +117,7 @@ def sweep(
     Warns
     -----
     FflinWarning
-        If M is ill-conditioned; one warning states the number of points.
+        If M is ill-conditioned; one warning states at how many points.
 
     Examples
     --------

@@ -34,20 +34,20 @@ NOT_RUN = -1.0  # where `stop` is this, a file has no run
 class Campaign(FrozenArrays):
     """Result of a Monte Carlo campaign with N runs, as `monte_carlo` returns it.
 
-    Statistics and conditions name the figures of a run:
+    Statistics and conditions refer to the figures of a run by these names:
 
     - ``attitude`` [deg], ``position`` [m], ``joints``, ``turning`` (omega_b), ``moving`` (v_b) and
-      ``rates``: final error of that kind.
+      ``rates`` (of the joints): final error of this kind.
     - The name of a state or input: its final value, with sign.
     - ``worst NAME``: largest value over the whole run; for a state, its largest error.
-    - ``settle`` [s] or ``settle KIND``: settling time, after which the error stays within 2 % of
-      its largest value.
+    - ``settle KIND`` [s]: settling time of this error, after which it stays within 2 % of its
+      largest value. ``settle`` [s]: the longest of these settling times.
     - ``end`` [s]: end of the run.
-    - ``drawn NAME``: dispersed value.
+    - ``drawn NAME``: value drawn for the dispersed parameter NAME.
 
-    An error of a kind is its largest entry, relative to the target, or to the start if there is no
-    target. A run that was stopped early violates every bound: its errors, worst values and settling
-    times are infinite, and it meets no condition.
+    The error of a kind is the largest deviation of its states from the target. Without a target, it
+    is the largest deviation from the initial state. A run that was stopped early violates every
+    bound: its errors, worst values and settling times are infinite, and it meets no condition.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Campaign(FrozenArrays):
         Outcome (0 completed, 1 diverged, 2 left the chart, 3 stopped otherwise) and end time [s] of
         each run.
     asked : int
-        Requested number of runs; it exceeds N if `until` was met earlier.
+        Requested number of runs. N is smaller if the condition `until` ended the campaign early.
     goals : tuple of str
         Conditions whose success rates appear in the report and the figure.
 
@@ -137,23 +137,24 @@ class Campaign(FrozenArrays):
     def about(self) -> str:
         """Default figure of `worst` and `sensitivity`.
 
-        It is the figure that the first goal bounds from above. Without such a goal, it is the
-        worst error of the first kind that the policy controls.
+        It is the figure of the first comparison ``<`` or ``<=`` in the goals. If there is none, it
+        is ``worst KIND`` for the first kind of error, in the order ``attitude``, ``position``,
+        ``joints``, ..., that the policy controls.
         """
         bounded = [each.name for each in self.bounds if each.sign[0] == "<"]
         return [*bounded, f"worst {(self.judged or tuple(KINDS))[0]}"][0]
 
     @property
     def bounds(self) -> list[Bound]:
-        """Comparisons in the goals."""
+        """Comparisons of a figure with a number in the goals."""
         return [each for goal in self.goals for each in bounds_of(goal, self.figure)]
 
     def values(self, name: str) -> Array:
-        """Return a figure of each run (N,) by its name, in SI units, attitude in deg."""
+        """Return the named figure of every run (N,), in SI units; attitude errors are in deg."""
         return self.figure(name)[0]
 
     def figure(self, name: str) -> tuple[Array, str]:
-        """Return a figure of each run (N,) by its name, and its unit."""
+        """Return the named figure of every run (N,), and its unit."""
         if name == "end":
             return self.end, "s"
         if name == "settle":
@@ -190,8 +191,9 @@ class Campaign(FrozenArrays):
         Parameters
         ----------
         condition : str or array_like of bool (N,)
-            Text ``NAME < NUMBER UNIT`` with <, <=, > or >=; ``and`` joins several. Without UNIT
-            the figure's own unit applies. A run that was stopped early meets no such text.
+            Text ``NAME < NUMBER UNIT`` with <, <=, > or >=; ``and`` joins several comparisons. If
+            UNIT is omitted, NUMBER is in the unit of the figure. A run that was stopped early never
+            meets a condition given as text.
         """
         if not isinstance(condition, str):
             found = np.asarray(condition if isinstance(condition, np.ndarray | list) else None)
@@ -214,8 +216,8 @@ class Campaign(FrozenArrays):
     def quantile(self, name: str, p: float, *, confidence: float = 0.95) -> Estimate:
         """Return the p-quantile of a figure over the runs, with its confidence interval.
 
-        The interval uses order statistics and holds for any distribution. A final state or input is
-        signed, and its quantile is taken over the completed runs only.
+        The interval is computed from order statistics and is valid for any distribution. Final
+        states and inputs have a sign; their quantiles include only the completed runs.
         """
         values = self.values(name)
         if name in (*self.state_names, *self.input_names):
@@ -239,9 +241,9 @@ class Campaign(FrozenArrays):
         return intervals.mean(values, share("confidence", confidence))
 
     def worst(self, k: int = 5, name: str | None = None) -> list[int]:
-        """Return the indices of the k runs with the largest figure, `about` by default.
+        """Return the indices of the k runs in which a figure, by default `about`, is largest.
 
-        Runs that were stopped early come first, in the order of their ends.
+        Runs that were stopped early come first, sorted by their end times.
         """
         order = np.lexsort(
             (-self.values(name or self.about), np.where(self.stopped, self.end, np.inf))
@@ -249,12 +251,12 @@ class Campaign(FrozenArrays):
         return [int(run) for run in order[: whole("k", k, 1)]]
 
     def sensitivity(self, name: str | None = None) -> dict[str, float]:
-        """Return Spearman's rank correlations {name: value} of the dispersed values with a figure.
+        """Return Spearman's rank correlations {name: value} between dispersed values and a figure.
 
-        The correlation with the largest magnitude comes first. If the distance of a value from its
-        median correlates more strongly than the value itself, that correlation is returned, under
-        ``|NAME|``: an attitude error, for example, may grow to both sides. The figure is `about` by
-        default.
+        The correlation with the largest magnitude comes first. If the figure correlates more
+        strongly with the distance of a value from its median than with the value itself, the
+        correlation with the distance is returned under ``|NAME|``. For example, a figure may grow
+        with an initial attitude error of either sign. The default figure is `about`.
         """
         figure = self.values(name or self.about)
         apart = np.abs(self.drawn - np.median(self.drawn, axis=0))
@@ -281,7 +283,7 @@ class Campaign(FrozenArrays):
         return self._flown().replay(np.array(self.drawn[at]))
 
     def courses(self, runs: Sequence[int], most: int) -> list[Array]:
-        """Return at most `most` + 1 evenly spaced configurations (.., nq) of each of some runs."""
+        """Return up to `most` + 1 evenly spaced configurations (.., nq) of each given run."""
         return self._flown().courses(np.array(self.drawn[list(runs)]), most)
 
     def _flown(self) -> CampaignJob:
@@ -322,7 +324,7 @@ class Campaign(FrozenArrays):
 
     @classmethod
     def of(cls, arrays: Mapping[str, Array], header: Any, job: Any = None) -> Campaign:
-        """Return a campaign from its arrays, without the rows of runs not made, and its header."""
+        """Return a campaign from its header and arrays, without rows of missing runs."""
         run = np.asarray(arrays["stop"]) != NOT_RUN
         values: dict[str, Any] = {
             key: arrays[key] if run.all() else arrays[key][run] for key in _ARRAYS

@@ -112,7 +112,9 @@ class Dispersions:
         for column, _, at in self._densities():
             if at in heavier:
                 one, other = heavier[at], self.names[column]
-                raise InputError(f"'{one}' and '{other}' disperse the same mass; give one")
+                raise InputError(
+                    f"'{one}' and '{other}' disperse the same mass; give only one of them"
+                )
 
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:

@@ -146,11 +146,11 @@ def funnel(
 ) -> Funnel:
     r"""Estimate the errors from which the tracking loop along a trajectory reaches a goal.
 
-    At each knot errors are drawn from an ellipsoid :math:`e^T P(t)\,e \le \rho` of the schedule's
-    cost to go: uniformly in direction, and evenly over the square root of the level. The nonlinear
-    robot is simulated from each error to the end of the trajectory. The largest level tried is the
-    level at which about one start in sixteen fails, or the attitude error reaches 170 deg. The
-    result is a statistical estimate, not a proof.
+    At each knot, errors are drawn from an ellipsoid :math:`e^T P(t)\,e \le \rho` of the schedule's
+    cost to go. Their directions are uniformly distributed, and the square roots of their levels are
+    evenly spread. The nonlinear robot is simulated from each error to the end of the trajectory.
+    The largest level tried is the level at which about one run in sixteen fails, or at which the
+    attitude error reaches 170 deg. The result is a statistical estimate, not a proof.
 
     Parameters
     ----------
@@ -162,11 +162,11 @@ def funnel(
         "rates" [rad/s|m/s]: largest final error}, with the kinds of `Campaign`; or the largest
         final value of ``e' P e``.
     within : mapping, optional
-        Largest errors along the way, with the kinds of `goal`.
+        Largest errors allowed at any time of a run, with the kinds of `goal`.
     knots : int or sequence of float
-        Number of knots of the trajectory, or times [s]; the knots nearest to them are taken.
+        Number of knots to test, or times [s], of which the nearest knots are tested.
     samples : int
-        Runs from each knot.
+        Number of runs from each knot.
     seed : int
         Random seed. The same seed gives the same result for any executor or number of workers.
     confidence : float

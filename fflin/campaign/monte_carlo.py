@@ -72,7 +72,7 @@ def monte_carlo(
     r"""Run a Monte Carlo campaign: simulate a policy many times with dispersed parameters.
 
     Each run is a call of `simulate`. With numba the compiled loop computes eight runs at a time.
-    The record of a run has a fixed size, and `Campaign.replay` simulates any run again.
+    For each run, a record of fixed size is kept. `Campaign.replay` simulates any run again in full.
 
     Parameters
     ----------

@@ -34,10 +34,10 @@ _DECADES, _BARS, _BINS = 6, 10, 48
 def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: int = 3) -> Figure:
     """Draw the error histories, final errors, inputs and rank correlations of a campaign.
 
-    Bands contain all, 90 % and 50 % of the runs. The worst runs by `Campaign.about` are drawn over
-    them. After a run is stopped early, it counts as worse than all others. Dashed lines mark the
-    bounds of the goals and the limits of the inputs. Without histories, the figure shows only
-    the histograms and the correlations.
+    The bands contain 100 %, 90 % and 50 % of the runs. The worst runs, ranked by `Campaign.about`,
+    are drawn over the bands. From the moment a run is stopped early, it ranks as worse than all
+    other runs. Dashed lines mark the bounds of the goals and the limits of the inputs. Without
+    histories, the figure shows only the histograms and the correlations.
 
     Parameters
     ----------

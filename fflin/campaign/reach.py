@@ -36,33 +36,35 @@ def spread(P: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Funnel(Design):
-    """Ellipsoids ``e' P(t) e <= rho`` of errors from a trajectory; prints as a table.
+    """Ellipsoids ``e' P(t) e <= rho`` of errors relative to a trajectory; prints as a table.
 
-    Errors are defined as in `linearize_trajectory`; P is the schedule's cost to go. Directions of
-    zero weight in P are not tested.
+    Errors are defined as in `linearize_trajectory`; P is the schedule's cost to go. Errors in
+    directions to which P gives no weight are not tested.
 
     Attributes
     ----------
     t : ndarray (m,)
         Times [s] of the knots.
     tried : ndarray (m,)
-        Largest level rho of the starts, which are spread evenly over its square root.
+        Largest level rho of the initial errors. The square roots of their levels are evenly spread.
     outcomes : ndarray (m, N)
-        Outcome of each run, in ascending order of level: 0 it reached the goal, 1 it was stopped
-        early, 2 it exceeded `within`, 3 it missed the goal.
+        Outcome of each run, sorted by ascending level: 0 if it reached the goal, 1 if it was
+        stopped early, 2 if it exceeded `within`, 3 if it missed the goal.
     rho : ndarray (m,)
         Largest level up to which every run succeeded.
     inside : ndarray (m,)
-        Number of runs up to the level `rho`.
+        Number of runs that start at or below the level `rho`.
     inside_rate : ndarray (m,)
-        Lower bound, with `confidence`, of the success rate of starts up to the level `rho`.
+        Lower bound, at confidence level `confidence`, on the success rate of runs that start at or
+        below the level `rho`.
     rate : ndarray (m, 2)
-        Clopper-Pearson interval of the success rate of all starts up to the level `tried`.
+        Clopper-Pearson interval of the success rate of all runs, which start at or below the level
+        `tried`.
     attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
         Half-axes of the ellipsoids in base attitude [deg], base position [m] and each joint
         [rad|m].
     goal, within : str
-        Bounds on the final errors of a run, and on its errors along the way.
+        Bounds on the final errors of a run, and on its errors at any time.
     confidence : float
         Confidence level of the intervals.
     at, P : ndarray (M,), (M, nx, nx)
@@ -128,7 +130,7 @@ class Funnel(Design):
         return Trajectory(*values, hold=self.hold, frame=self.frame)
 
     def level(self, t: float) -> float:
-        """Return rho at a time; between two knots, the smaller of their levels."""
+        """Return rho at time t; between two knots, the smaller of their two levels."""
         t = number("t", t)
         if not self.t[0] <= t <= self.t[-1]:
             raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
@@ -136,14 +138,14 @@ class Funnel(Design):
         return float(self.rho[near].min())
 
     def cost(self, t: float) -> Array:
-        """Return P (nx, nx) at a time, interpolated linearly in the schedule."""
+        """Return P (nx, nx) at time t by linear interpolation of the schedule."""
         k = int(np.clip(self.at.searchsorted(t, "right") - 1, 0, len(self.at) - 2))
         part = float(np.clip((t - self.at[k]) / (self.at[k + 1] - self.at[k]), 0.0, 1.0))
         P: Array = (1.0 - part) * self.P[k] + part * self.P[k + 1]
         return P
 
     def root(self, t: float, *, smooth: bool = False) -> Array:
-        """Return W (nx, r); the ellipsoid at a time consists of all W z with |z| <= 1.
+        """Return W (nx, r): the ellipsoid at time t is the set of all W z with |z| <= 1.
 
         With `smooth`, the level is interpolated between knots, as figures show it.
         """
@@ -151,16 +153,17 @@ class Funnel(Design):
         return size * spread(self.cost(t))
 
     def contains(self, t: float, x: Any = None, *, q: Any = None, v: Any = None) -> bool:
-        """Return whether a state is inside the funnel at a time.
+        """Return whether a state is inside the funnel at time t.
 
         Parameters
         ----------
         t : float
-            Time [s] between the first and last of the knots `t`.
+            Time [s], from the first to the last knot.
         x : array_like (nx,), optional
             State of ``StateMap(robot, frame="local")``.
         q, v : array_like (nq,), (nv,), optional
-            Configuration and velocity in Pinocchio's order, instead of x; at rest without v.
+            Configuration and velocity in Pinocchio's order, instead of x. If v is omitted, the
+            robot is at rest.
         """
         rho, state = self.level(t), StateMap(self.robot, frame="local")
         if x is None and q is None:

@@ -51,9 +51,9 @@ class Validity(FrozenArrays):
         displacement. Errors are measured in the norm of the loop's Lyapunov function. NaN if a run
         left the chart.
     slope : float
-        Order of the absolute error in the displacement, over the four smallest levels; 2 is
-        expected. NaN if one of these errors is as small as the integration error, or a run left
-        the chart.
+        Order with which the absolute error grows with the displacement, fitted to the four smallest
+        levels; 2 is expected. NaN if one of these errors is as small as the integration error, or a
+        run left the chart.
     trusted : dict
         Displacement {"attitude" [deg], "position" [m], "joint" [joint_unit]} at which
         `prediction_error` reaches 10 %.
@@ -64,9 +64,10 @@ class Validity(FrozenArrays):
     holds : dict
         Displacement, with the keys of `trusted`, up to which every run settled.
     inside : int
-        Number of runs up to `holds`.
+        Number of runs with displacements up to `holds`.
     inside_rate : float
-        Lower bound, with `confidence`, of the fraction of displacements up to `holds` that settle.
+        Lower bound, at confidence level `confidence`, on the fraction of displacements up to
+        `holds` that settle.
     rate : tuple of float
         Clopper-Pearson interval of the fraction of all displacements that settle.
     confidence : float
@@ -168,15 +169,15 @@ def validity(
     progress: Progress | None = None,
     engine: str | None = None,
 ) -> Validity:
-    """Measure up to which displacements a linear model predicts, and its loop settles.
+    """Measure for which displacements a linear model predicts the motion and its loop settles.
 
     The nonlinear robot is simulated under ``u = u0 - K (x - x0)``, held between samples if the
     model is sampled. All runs start at displaced configurations with the operating point's
     velocity. There are two sets of runs:
 
     - Displacements of growing size, to compare the motion with the linear prediction.
-    - Random displacements. A run has settled when its error falls to a thousandth of its initial
-      value, within three times the time that the slowest pole needs.
+    - Random displacements. A run has settled if its error falls to a thousandth of its initial
+      value. It may take three times as long as the slowest mode of the linear loop.
 
     With numba the compiled loop computes eight runs at a time.
 
@@ -201,8 +202,8 @@ def validity(
         Further frames in whose axes to test the same linear loop, from the same displacements. The
         base of the operating point must not be rotated relative to the reference.
     limits : optional
-        Limits at which the inputs saturate, as in `simulate`, where thrusters never pull. By
-        default no input saturates.
+        Limits at which the inputs saturate, as in `simulate`. By default no input saturates, except
+        that thrusters never pull.
     executor, workers, threads, engine, progress : optional
         As in `monte_carlo`; ``progress(done, total)`` counts the runs of both sets.
 

@@ -47,7 +47,7 @@ def add_commands(commands: Commands) -> None:
     add_options(modes, "--html >FILE: write a page that plays the mode shapes")
     validity = command(
         *(commands, "validity", _validity),
-        "measure how far from its point the linear model is accurate and its regulator settles",
+        "measure up to which displacements the linear model is accurate and its regulator settles",
         "fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
     )
     add_point(validity)
@@ -61,8 +61,8 @@ def add_commands(commands: Commands) -> None:
         --samples N = 100: number of random runs; 100 by default
         --seed S = 0: random seed of the runs; 0 by default
         --jobs N = 1: number of processes, at most one for each core; 1 by default
-        --limits urdf|none = none: saturate the inputs at the limits of the robot, or not
-            (default)""",
+        --limits urdf|none = none: saturate the inputs at the limits of the robot (urdf), or never
+            (none, default)""",
     )
     frames = """--frames hybrid|local|world: also test the loop with base velocities and inputs in
         these axes"""
@@ -74,7 +74,7 @@ def add_commands(commands: Commands) -> None:
         "fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
     )
     add_point(sensitivity)
-    add_options(sensitivity, "--dt H: derivatives of the sampled model, with inputs held for H [s]")
+    add_options(sensitivity, "--dt H: differentiate the sampled model, with inputs held for H [s]")
     add_options(
         sensitivity, "--top N = 15: show the N parameters with the largest effect; 15 by default"
     )
@@ -86,7 +86,7 @@ def add_commands(commands: Commands) -> None:
     )
     uncertain = command(
         *(commands, "uncertain", _uncertain),
-        "show or save the exact linear-fractional model (LFT) of parameters in ranges, at rest",
+        "show or save the exact linear-fractional model (LFT) at rest for uncertain parameters",
         "fflin uncertain servicer_7dof --vary base.mass=0.2 --vary panel_left.stiffness=80:120 "
         "-o uncertain.mat",
     )
@@ -95,9 +95,9 @@ def add_commands(commands: Commands) -> None:
         uncertain, "--joint NAME=VALUE*: position of a joint [rad|m]; others are at neutral"
     )
     add_system(uncertain, axes=False)
-    vary = """--vary NAME=RANGE*: range of a parameter of `fflin sensitivity` or of a pattern: a
-        fraction of its value, such as 0.2, or LEAST:LARGEST; with RANGE,tied all parameters of
-        the pattern share one delta"""
+    vary = """--vary NAME=RANGE*: range of a parameter named by `fflin sensitivity`, or of all
+        parameters that match a pattern: a fraction of the nominal value, such as 0.2, or
+        LEAST:LARGEST. With RANGE,tied all parameters of the pattern share one delta"""
     add_options(uncertain, vary, type=_range, required=True)
     add_output_file(
         uncertain, "save A, B1 .. D22 and the blocks to FILE: .npz, .mat or .json", "LFT"
@@ -180,14 +180,16 @@ def _momentum(lin: LinearModel) -> str:
         count, left = len(reduced.momenta), len(reduced.A)
         wheels = ", the wheels" * (len(lin.A) > left + 2 * count)
         field = "orbit's field, the " * bool(lin.mean_motion)
-        text = f"none is conserved: the {field}inputs, springs and dampers act on all of them"
+        text = (
+            f"no momentum is conserved: the {field}inputs, springs and dampers act on all momenta"
+        )
         if count:
             text = (
-                f"{count} momenta are conserved whatever the inputs do; without them{wheels} and "
-                f"what they drive {left} states are left"
+                f"{count} momenta are conserved for all inputs; without these momenta{wheels} and "
+                f"the coordinates that they drive, {left} states remain"
             )
         elif not lin.is_equilibrium():
-            text = "none can be split off: the model is one of a point that moves on"
+            text = "no momentum can be removed: the operating point is not an equilibrium"
         text = "\n".join((text, *(f"note: {note}" for note in reduced.notes)))
     return folded(text.splitlines())
 

@@ -205,13 +205,13 @@ def add_inputs_there(command: Container) -> None:
         """
         --effort NAME=VALUE*: input at the operating point, by its name in u, such as
             tau_m.joint_1
-        --equilibrium: use the smallest inputs that hold the operating point against springs,
-            gravity and steady motion. Passive joints sag on their springs. If no inputs hold the
-            point, the command reports an error""",
+        --equilibrium: use the minimum-norm inputs that balance springs, gravity and the inertial
+            forces of a steady motion at the operating point. Passive joints sag on their springs.
+            If no inputs hold the point, the command reports an error""",
     )
     text = """--relative-equilibrium N: in orbit, use the N-th (default: first) of the 24 attitudes
-        without gravity-gradient torque, with the inputs of --equilibrium. Attitude and position
-        are relative to it"""
+        without gravity-gradient torque, with the inputs of --equilibrium. Attitude and position in
+        the state are relative to this pose"""
     add_options(command, text, nargs="?", const=1, choices=range(1, 25))
 
 
@@ -235,7 +235,7 @@ def add_system(command: Container, *, axes: bool = True) -> None:
         --damping [NAME=]VALUE*: damping of a joint [N m s/rad|N s/m], or one value for all joints;
             `urdf` uses the damping in the URDF
         --gravity X,Y,Z: uniform gravity in world axes [m/s^2]; zero by default
-        --passive NAME*: joint without a motor, which gets no torque input by default
+        --passive NAME*: joint without a motor; by default it has no torque input
         --inputs FILE.toml: inputs of the robot: a file for fflin.load_inputs, a bundled name,
             `joints` (joint torques only) or `base` (base torque and force only). The default is
             the inputs of robot.toml, or base torque, base force and all joint torques
@@ -246,10 +246,11 @@ def add_system(command: Container, *, axes: bool = True) -> None:
     )
     frame = """
         --frame hybrid|local|world|lvlh|hill: axes of velocities and wrenches. hybrid (default):
-            angular in base axes, linear in reference axes; local: all in base axes; world: all in
-            reference axes. In orbit the axes are as in hybrid, and the world is lvlh (default): x
-            along the orbit, y against its normal, z towards the body; or hill: x away from the
-            body, y along the orbit, z along its normal"""
+            angular parts in base axes, linear parts in reference axes; local: all in base axes;
+            world: all in reference axes. For a robot in orbit, the axes are as in hybrid, and the
+            orbital frame is the world. lvlh (default): x along the orbit, y opposite to the orbit
+            normal, z towards the central body; hill: x away from the central body, y along the
+            orbit, z along the orbit normal"""
     if axes:
         add_options(command, frame)
 
@@ -261,5 +262,8 @@ def add_output_file(command: Container, what: str, *kinds: str) -> None:
     """
     command.add_argument("-o", "--output-file", metavar="FILE", type=output_file, help=what)
     if kinds:
-        add_options(command, "--force: let -o replace a file that holds anything of another kind")
+        add_options(
+            command,
+            "--force: allow -o to replace a file that does not contain the same kind of result",
+        )
         command.set_defaults(kinds=kinds)

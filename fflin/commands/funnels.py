@@ -27,7 +27,7 @@ def add_commands(commands: of.Commands) -> None:
     """Add funnel."""
     funnel = of.command(
         *(commands, "funnel", _funnel),
-        "measure the errors along a trajectory from which its regulator reaches a goal",
+        "measure from which errors along a trajectory the regulator reaches a goal",
         "fflin funnel arm.toml --trajectory plan.csv --schedule gains.npz --goal attitude=1",
     )
     of.add_robot(funnel)
@@ -37,13 +37,14 @@ def add_commands(commands: of.Commands) -> None:
     of.add_options(
         funnel,
         f"""
-        --schedule FILE: gains saved by tvlqr; without it they are designed
+        --schedule FILE: gains saved by tvlqr; without this option, gains are designed
         --html >FILE: write a page that plays the motion with the funnel as a tube
         --goal NAME=VALUE*: largest error allowed at the end: {_KINDS}
         --within NAME=VALUE*: largest error allowed along the trajectory; names as in --goal
-        --limits urdf|none = urdf: saturate the inputs at the limits of the robot (default), or not
+        --limits urdf|none = urdf: saturate the inputs at the limits of the robot (urdf, default),
+            or never (none)
         --knots N = 10: number of knots to test; 10 by default
-        --samples N = 100: runs from each knot; 100 by default
+        --samples N = 100: number of runs from each knot; 100 by default
         --seed S = 0: random seed of the runs; 0 by default
         --confidence P = 0.95: confidence level of the intervals; 0.95 by default
         --threads N: number of threads; by default one for each core

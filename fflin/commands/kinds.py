@@ -24,10 +24,10 @@ def require_own_kind(arguments: argparse.Namespace) -> None:
         return
     found = kind_of(path)
     if found not in kinds and path.stat().st_size:
-        there = f"holds a {found}" if found else "is there already and is no result of fflin"
+        there = f"holds a {found}" if found else "exists and is not a result of fflin"
         raise FileError(
-            f"{path} {there}; without --force this command replaces files of kind "
-            f"{' or '.join(kinds)} alone. Name another file or add --force"
+            f"{path} {there}; without --force this command replaces only files of kind "
+            f"{' or '.join(kinds)}. Name another file or add --force"
         )
 
 

@@ -42,7 +42,7 @@ class Loop(NamedTuple):
 def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
     """Refuse options that have no effect with others."""
     if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
-        raise InputError(f"{', '.join(given)}: {why}; leave it out")
+        raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 
 def refuse_law(arguments: argparse.Namespace) -> None:
@@ -65,15 +65,16 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
     add_options(
         start,
         """
-        --offset NAME=VALUE*: initial error from the start of the trajectory, in base axes: a
-            state, group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]""",
+        --offset NAME=VALUE*: initial error relative to the start of the trajectory, in base axes.
+            NAME is a state, group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw
+            [deg]""",
     )
     add_options(
         goal,
         """
         --target-joint NAME=VALUE*: target position of a joint [rad|m]; the other joints go to
             their neutral position, the base to the world's origin
-        --target-velocity NAME=VALUE*: target velocity, such as the speed of a wheel; also the
+        --target-velocity NAME=VALUE*: target velocity, such as the speed of a wheel. It is also the
             initial velocity unless --velocity is given""",
     )
     add_inputs_there(goal)
@@ -82,16 +83,17 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
     add_options(
         law,
         """
-        --schedule FILE: follow the trajectory with gains saved by tvlqr; without it they are
+        --schedule FILE: follow the trajectory with gains saved by tvlqr; without this option, gains
+            are designed
+        --gain FILE: regulate with a gain saved by lqr, about the operating point for which it was
             designed
-        --gain FILE: regulate with a gain saved by lqr, about the point of its design
-        --controller FILE: use a linear system as controller, u - u0 = system (y - y0) about the
-            target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled; --output
-            selects y
-        --negative-feedback: the controller was designed for u - u0 = -system (y - y0)
+        --controller FILE: use a linear controller K with positive feedback, u - u0 = K (y - y0)
+            about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled.
+            y is set by --output
+        --negative-feedback: the controller assumes negative feedback, u - u0 = -K (y - y0)
         --[no-]allocate: design with torque and force on the base, and allocate the nearest wrench
             to the thrusters, which cannot pull. This is the default if the thrusters can push in
-            every direction. Without it, negative thrust is set to zero
+            every direction. With --no-allocate, negative thrust is set to zero
         --free: simulate without a regulator and without inputs
         --limits urdf|none = urdf: saturate the inputs at the efforts of the URDF, at max and min of
             the inputs and at wheel speeds (urdf, default), or only at --limit (none)
@@ -123,7 +125,7 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         "duration": arguments.duration,
     }
     if not arguments.controller:
-        _refuse(arguments, ("negative_feedback",), "it needs a --controller")
+        _refuse(arguments, ("negative_feedback",), "only a --controller has a feedback sign")
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
         return Loop(policy, options | start)

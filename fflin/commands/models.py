@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 
 def add_commands(commands: Commands) -> None:
     """Add robots, info, linearize and check."""
-    command(commands, "robots", _robots, "list the robots that load by name", "fflin robots")
+    command(
+        commands, "robots", _robots, "list the robots that can be loaded by name", "fflin robots"
+    )
     info = command(
         commands,
         "info",
@@ -66,7 +68,8 @@ def add_commands(commands: Commands) -> None:
     add_point(check)
     add_trajectory(check)
     add_options(
-        check, "--tolerance X: relative tolerance of every comparison; each has its own by default"
+        check,
+        "--tolerance X: relative tolerance of all comparisons; by default each has its own",
     )
     add_figure(check, "plot the errors and their tolerances")
 

@@ -40,9 +40,9 @@ def add_commands(commands: Commands) -> None:
         """
         --runs N!: number of runs
         --seed S = 0: random seed; 0 by default
-        --until CONDITION: stop when the fraction of runs that meet a condition, such as
-            'attitude < 1 deg', is known to within --width
-        --width P = 0.02: width of the confidence interval for --until; 0.02 by default
+        --until CONDITION: stop when the confidence interval of the success rate of a condition,
+            such as 'attitude < 1 deg', is at most --width wide
+        --width P = 0.02: width of the confidence interval at which --until stops; 0.02 by default
         --confidence P = 0.95: confidence level of all intervals; 0.95 by default
         --workers N: distribute the runs over N processes
         --threads N: distribute the runs over N threads; by default one for each core
@@ -52,8 +52,8 @@ def add_commands(commands: Commands) -> None:
     add_options(
         shown,
         """
-        --goal CONDITION*: report the fraction of runs that meet a condition, such as
-            'attitude < 1 deg and settle < 60 s', and draw its bounds
+        --goal CONDITION*: report the fraction of runs that meet a condition, such as 'attitude < 1
+            deg and settle < 60 s', and draw the bounds of the condition
         --worst K = 3: list the K worst runs; 3 by default
         --json: print the results as JSON
         --plot >FILE: plot quantile bands over time, histograms and the worst runs to FILE: .png,

@@ -44,20 +44,20 @@ def add_weights(command: Container) -> None:
     add_options(
         command,
         """
-        --weights urdf|identity: rule for all weights that are not given. `urdf` (default) keeps
-            the inputs within the limits of the URDF for displacements of 30 deg of the base and
-            0.3 rad of the joints; `identity` is 1 for each
+        --weights urdf|identity: rule that sets all weights not given by --q, --r or --bryson.
+            `urdf` (default) keeps the inputs within the limits of the URDF for displacements of 30
+            deg of the base and 0.3 rad of the joints; `identity` sets every weight to 1
         --q NAME=W*: weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b,
             q_m.hinge_*
         --r NAME=W*: weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*
-        --bryson NAME=VALUE*: largest acceptable value of a state, an input or a group; its weight
-            is 1/VALUE^2, and the weights of the rule are scaled to match
-        --dt H: design for inputs held for H [s]; the cost remains the continuous cost
+        --bryson NAME=VALUE*: largest acceptable value of a state, an input or a group, which gets
+            the weight 1/VALUE^2. The other weights, from the rule, are scaled to match
+        --dt H: design for inputs held for H [s]; the continuous-time cost is still minimised
         --reduce: if momentum is conserved, regulate only the states that the inputs can control
-        --[no-]wheel-speeds: return the speeds of reaction wheels to their values at the operating
-            point, or not. By default it does so if thrusters or a base torque can absorb their
-            torque. --wheel-speeds adds speeds that the wheels alone can change without rotating
-            the robot""",
+        --[no-]wheel-speeds: whether to return the speeds of reaction wheels to their values at the
+            operating point. By default, they are returned if thrusters or a base torque can absorb
+            the wheel torque. --wheel-speeds adds speeds that the wheels alone can change without
+            rotating the robot""",
     )
 
 

@@ -32,7 +32,10 @@ def add_commands(commands: Commands) -> None:
         "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png",
     )
     run, shown = add_loop(simulate), simulate.add_argument_group("output of the simulation")
-    add_options(run, "--every N: steps between saved rows; chosen automatically for long runs")
+    add_options(
+        run,
+        "--every N: steps from one saved row to the next; chosen automatically for long runs",
+    )
     add_options(
         shown,
         """

@@ -64,7 +64,9 @@ def add_commands(commands: Commands) -> None:
             optionally v (N, nv) and u (N, nu)
         --seed S = 0: random seed of --random; 0 by default""",
     )
-    ranges = "--range JOINT=LO:HI*: with --random: range of a joint instead of its limits"
+    ranges = (
+        "--range JOINT=LO:HI*: with --random: range of a joint, which replaces the joint limits"
+    )
     add_options(points, ranges, type=_range)
     add_pose(sweep)
     add_options(

@@ -39,7 +39,7 @@ def add_commands(commands: Commands) -> None:
     add_weights(tvlqr)
     add_options(
         tvlqr,
-        "--qf NAME=VALUE*: weight at the end; by default the cost of the steady regulator there",
+        "--qf NAME=VALUE*: weight on the final error; by default the steady cost at the end",
     )
     add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json", "GainSchedule")
 
@@ -47,14 +47,14 @@ def add_commands(commands: Commands) -> None:
 def add_trajectory(parser: Container, *, required: bool = False) -> None:
     """Add --trajectory, --hold and --strict; the file then sets the default of --frame."""
     trajectory = """--trajectory FILE: use the trajectory in FILE: .npz, .mat, .json, or .csv with
-        named columns, for fflin.Trajectory.load; --frame gives its axes, by default the frame in
-        the file, else local"""
+        named columns, as fflin.Trajectory.load reads it. --frame gives the axes of the data; by
+        default the frame in the file, else local"""
     add_options(parser, trajectory, required=required)
     add_options(
         parser,
         """
-        --hold linear|previous: inputs of FILE between its knots: linear, or constant from the
-            previous knot; by default the setting in the file, else linear
+        --hold linear|previous: inputs between the knots of FILE: interpolated linearly, or held at
+            the value of the previous knot. By default the setting in the file, else linear
         --strict: refuse a FILE that does not satisfy the dynamics of the robot""",
     )
     parser.set_defaults(frame=None)
@@ -101,8 +101,8 @@ def check_along(arguments: argparse.Namespace) -> int:
 def _tvlqr(arguments: argparse.Namespace) -> int:
     if arguments.reduce:
         raise InputError(
-            "--reduce does not apply along a trajectory, since its cost over a finite time always "
-            "exists; leave it out"
+            "--reduce does not apply along a trajectory, because the finite-horizon cost always "
+            "exists; remove --reduce"
         )
     along = models_along(arguments)
     schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")

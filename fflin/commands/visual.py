@@ -69,8 +69,7 @@ def _add_scene(command: Container) -> None:
         """
         --scene space|lab: sky and planet, or a floor with a grid (default with gravity)
         --tool FRAME: draw the axes and the trail of this frame
-        --[no-]follow: let the camera follow the base, or not; by default it follows long
-            motions""",
+        --[no-]follow: whether the camera follows the base; by default it does in long motions""",
     )
 
 

@@ -47,10 +47,10 @@ def acceleration_lqr(
               u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
 
     and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. Under an exact
-    zero-order hold the coordinates remain decoupled, and each has a closed form too. The speed of
-    a reaction wheel whose angle is not regulated is a single integrator with k_p = 0. The weight
-    on u is :math:`L^T R_a L`. The gain is computed without this product, so an ill-conditioned
-    inertia costs no digits.
+    zero-order hold the coordinates remain decoupled, and each gain still has a closed form. The
+    speed of a reaction wheel whose angle is not regulated is a single integrator with k_p = 0. The
+    weight on u is :math:`L^T R_a L`. The gain is computed without this product, so an
+    ill-conditioned inertia does not reduce its accuracy.
 
     Parameters
     ----------
@@ -77,8 +77,8 @@ def acceleration_lqr(
     StabilizabilityError
         If a coordinate is not actuated.
     InputError
-        If the model has other dynamics than double integrators, or a weight is negative or not a
-        diagonal. Qp and Ra must be positive, and also Qv on wheel speeds.
+        If the model's dynamics are not double integrators, or a weight is negative or not diagonal.
+        Qp, Ra, and Qv on wheel speeds must be positive.
     ModelError
         If the robot's model was changed after it was made.
 

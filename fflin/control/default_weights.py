@@ -294,7 +294,7 @@ def _growth(lin: LinearModel) -> _Limit:
     growth = rates_of(poles, lin.dt).real
     fastest, k = float(growth.max()), int(growth.argmax())
     moving = listed(_moving_most(lin, modes[:, [k]]))
-    return _Limit(fastest, f"the unstable mode of {moving}, {fastest:.3g} 1/s")
+    return _Limit(fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})")
 
 
 class _Loop(NamedTuple):

@@ -24,7 +24,7 @@ _nothing = partial(np.zeros, 0)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Schedule(Design):
-    """A gain over time, at the knots or samples of a trajectory."""
+    """Gain as a function of time, given at the knots or samples of a trajectory."""
 
     WIDTH: ClassVar = "nu"
 
@@ -44,10 +44,10 @@ class Schedule(Design):
         return self.gain(t)
 
     def gain(self, t: float) -> Array:
-        """Return the gain at a time; `InputError` if the time is outside the knots.
+        """Return the gain at time t, or raise `InputError` if t is outside the knots.
 
-        Between knots, the gain follows from the interpolated model and P. A sampled schedule
-        returns the gain of the last sample.
+        Between knots, the gain is computed from the interpolated model and P. A sampled schedule
+        returns the gain of the most recent sample.
         """
         passed = self.passed
         if type(t) is not float or not passed.first <= t <= passed.last:
@@ -68,12 +68,12 @@ class Schedule(Design):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GainSchedule(Schedule):
-    r"""Time-varying feedback ``u = u*(t) - K(t) e`` of the error e from a trajectory.
+    r"""Time-varying feedback ``u = u*(t) - K(t) e`` of the error e relative to a trajectory.
 
     Attributes
     ----------
     t : ndarray (M,)
-        Times [s] of the knots: the trajectory's knots and those added to interpolate P. For a
+        Times [s] of the knots: the trajectory's knots, and knots added to interpolate P. For a
         sampled schedule, the sample times.
     K : ndarray (M, nu, nx)
         Gains. In a sampled schedule the last row repeats the gain before it.
@@ -156,7 +156,7 @@ class GainSchedule(Schedule):
         return Trajectory(robot, self.knots, **values, hold=self.hold, frame=self.frame)
 
     def cost_to_go(self, t: float) -> Array:
-        """Return P (nx, nx) at a time: cubic between knots, or the value at the last sample."""
+        """Return P (nx, nx) at time t: by cubic interpolation, or held since the latest sample."""
         return self.passed.cost(self._within(t))
 
     @cached_property

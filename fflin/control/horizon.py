@@ -148,9 +148,11 @@ class Receding:
         if self.softened:
             said += f"; {self.softened} plans exceed a soft limit (worst: {self._said})"
         if self.passed:
-            said += f"; the robot exceeds one at {self.passed} samples (worst: {self._met})"
+            said += (
+                f"; the robot exceeds a soft limit at {self.passed} samples (worst: {self._met})"
+            )
         if self.unfinished:
-            said += f"; {self.unfinished} plans not found: regulator used, cut at the limits"
+            said += f"; {self.unfinished} plans were not found: the saturated regulator was used"
         return (said,) if self.solves else ()
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:

@@ -24,7 +24,7 @@ from fflin.linear.model import LinearModel, state_space
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimator(Design):
-    r"""Steady-state Kalman filter of the deviations from the point.
+    r"""Steady-state Kalman filter for the deviations of the state from the operating point.
 
     In continuous time, ``d(xh)/dt = A xh + B u + L (y - C xh - D u)``. For a sampled model, the
     left side is the prediction for the next sample. The filtered estimate, which includes the
@@ -120,7 +120,7 @@ class Compensator(Design):
     B : ndarray (nz, ny)
     C : ndarray (nu, nz)
     poles : ndarray (2 nz,) of complex
-        Closed-loop poles around the model: the poles of the gain and of the estimator.
+        Poles of the loop of model and compensator: the poles of the gain and of the estimator.
     y0, u0 : ndarray
         Outputs and inputs at the point.
     dt : float
@@ -183,7 +183,7 @@ def kalman(
 
     or its discrete-time counterpart. SciPy's solver and Newton's method solve the equation, see
     `lqr`. For a model with reaction wheels, the filter estimates only the states that `lqr`
-    regulates. It uses only the outputs that depend on no other states.
+    regulates. It uses only the outputs that depend on these states alone.
 
     Parameters
     ----------
@@ -207,7 +207,8 @@ def kalman(
     Raises
     ------
     DetectabilityError
-        If the outputs do not observe a mode that does not decay by itself; the message names it.
+        If a mode does not decay by itself and the outputs do not observe it; the message names the
+        mode.
     EquilibriumError
         If the point is not a fixed point.
     InputError

@@ -136,22 +136,23 @@ class Loop(Compensation):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearController:
-    r"""Output feedback ``u - u0 = system (y - y0)`` by any linear system.
+    r"""Output feedback ``u - u0 = system (y - y0)`` by any linear controller `system`.
 
     .. math:: \dot z = A z + B (y - y_0),\qquad u - u_0 = C z + D (y - y_0),\qquad z(0) = 0
 
     y is the vector of the robot's outputs in the chart of the model, as `outputs` returns it. The
-    output of the system is added to u0: positive feedback, as with ``hinfsyn`` and ``h2syn``.
+    output of the controller is added to u0. This is positive feedback, as for controllers from
+    ``hinfsyn`` and ``h2syn``.
 
-    A continuous system is integrated together with the robot, in the same Runge-Kutta stages. If
-    `simulate` is given `sample` or `delay`, y is held between samples and z is advanced exactly. A
-    sampled system is evaluated at its own sample times, which must be multiples of the step. Its
-    u is held between them.
+    A continuous controller is integrated together with the robot, in the same Runge-Kutta stages.
+    If `simulate` is given `sample` or `delay`, y is held between samples and z is advanced exactly.
+    A sampled controller is evaluated at its own sample times, which must be multiples of the step.
+    Its output u is held between its samples.
 
     Parameters
     ----------
     system : python-control or SciPy system, array_like, tuple, `Compensator` or path
-        The system, in one of these forms:
+        The controller, in one of these forms:
 
         - a state space or transfer function;
         - a gain D (nu, ny);
@@ -159,21 +160,22 @@ class LinearController:
         - a .mat, .npz or .json file with A, B, C, D, and with dt or Ts if sampled;
         - such a file with D alone.
 
-        Input and output names of the system (in a file ``input_names`` or ``InputName``, ...) must
-        be names of the model's outputs and inputs, with dots or underscores. They may be a subset.
-        Without names, the system must have all outputs and inputs of the model, in order. If the
-        system states no dt, the model's dt is used.
+        The controller's input names must be names of the model's outputs, and its output names must
+        be names of the model's inputs, with dots or underscores. In a file the names are
+        ``input_names`` or ``InputName``, ... Some names may be omitted. Without names, the
+        controller must use all outputs and inputs of the model, in order. If the controller has no
+        dt, the model's dt is used.
     lin : LinearModel
         Continuous or sampled model; the controller acts about its point.
     sign : {1, -1}
-        Give -1 for a system that was designed for negative feedback.
+        Give -1 for a controller designed for negative feedback, u - u0 = -K (y - y0).
     noise : callable, optional
         noise(t) -> (ny,), added to y.
 
     Attributes
     ----------
     system : tuple of A, B, C, D, dt, inputs, outputs
-        The system over all outputs and inputs of the model, with the sign applied.
+        The controller over all outputs and inputs of the model, with `sign` applied.
     loop : ndarray (nx + nz, nx + nz)
         Closed-loop matrix of the model's state and z.
 
@@ -224,9 +226,7 @@ class LinearController:
         dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
         dt = lin.dt or dt if dt < 0.0 else dt
         if dt < 0.0:
-            raise InputError(
-                "the controller is sampled, but states no sampling time; give its dt [s]"
-            )
+            raise InputError("the controller is sampled, but has no sampling time; give its dt [s]")
         if lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt:
             times = (
                 f"sampled at dt = {each:g} s" if each else "continuous" for each in (dt, lin.dt)
@@ -260,8 +260,7 @@ class LinearController:
         Raises
         ------
         InputError
-            If the robot's states, inputs or outputs differ from the model's. Its masses may
-            differ.
+            If the robot's states, inputs or outputs differ from the model's. The masses may differ.
         """
         lin, stays = self.lin, self.terms
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
@@ -270,7 +269,7 @@ class LinearController:
         return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
 
     def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
-        """Return the model augmented by the system's states, and K and u of u + K e."""
+        """Return the model augmented by the controller's states, and K and u of u + K e."""
         A, B, C, D, u0, y0, *_ = self.terms
         apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
         both = replace(
@@ -284,7 +283,7 @@ class LinearController:
 
     @cached_property
     def loop(self) -> Array:
-        """Closed-loop matrix (nx + nz, nx + nz) of the model's state and the system's state."""
+        """Closed-loop matrix (nx + nz, nx + nz) of the states of model and controller."""
         lin = self.lin.discretize(self.dt) if self.dt and not self.lin.dt else self.lin
         both, K, _ = self.around(lin)
         return both.A + both.B @ K
@@ -311,9 +310,10 @@ def growing(policy: Any) -> tuple[str, ...]:
             poles = np.linalg.eigvals(LinearController(by.system, by.lin, sign=-1.0).loop)
             if what == "linear loop" and ((np.abs(poles) < 1) if by.dt else (poles.real < 0)).all():
                 said[-1] += (
-                    "; it is stable with the other sign: set sign=-1 (--negative-feedback), "
+                    "; the loop is stable with the opposite sign: "
+                    "set sign=-1 (--negative-feedback), "
                 )
-                said[-1] += "or remove it if it is set"
+                said[-1] += "or remove this option if it is set"
     return tuple(said)
 
 

@@ -45,8 +45,8 @@ def lqr(
     .. math:: \int_0^\infty \delta x^T Q\,\delta x + 2\,\delta x^T N\,\delta u
               + \delta u^T R\,\delta u\;dt,
 
-    For a sampled model, it minimises the same sum over the samples. `sampled_cost` converts the
-    weights of the integral to weights of the sum.
+    For a sampled model, it minimises the corresponding sum over the samples. `sampled_cost`
+    converts the weights of the integral to weights of the sum.
 
     For a fully actuated model, the Riccati equation is solved by an eigenproblem of half the usual
     size. For any other model, SciPy solves it. Newton's method refines both solutions. The result
@@ -57,10 +57,10 @@ def lqr(
     Without weights, the regulator respects the limits of the URDF, (10.7) of docs/derivation.md.
     Its slowest motion has a bandwidth of 0.2 rad/s. The bandwidth is lower if the robot would
     otherwise exceed an effort or speed limit. The limits are checked for a return from a
-    displacement of 30 deg of the base and 0.3 rad of each joint. Each input then has a phase
-    margin of 60 deg and tolerates any gain factor above one half. With springs or gravity, each
-    mode that the inputs reach decays as fast as without them (10.8). ``gain.weights`` states the
-    bandwidth, decay rate and damping of the loop, and names slower modes.
+    displacement of 30 deg of the base and 0.3 rad of each joint. Each input then has a phase margin
+    of 60 deg and tolerates any gain factor above one half. With springs or gravity, each mode that
+    the inputs reach decays as fast as without them (10.8). ``gain.weights`` states the bandwidth,
+    decay rate and damping of the loop, and lists slower modes.
 
     For a model with reaction wheels, only the controllable part is regulated, (9.4) of
     docs/derivation.md; ``gain.regulated`` lists its states. Weights have no effect on the others:
@@ -74,8 +74,8 @@ def lqr(
     lin : LinearModel
         About a fixed point, or about a steady motion with ``moving=True``.
     Q : array_like (nx, nx) or (nx,), float, or mapping, optional
-        Weight on the state, positive semidefinite: a matrix, its diagonal, or {name: weight}
-        with names of states or of their groups, such as ``q_b``. Unnamed states cost nothing.
+        Weight on the state, positive semidefinite: a matrix, its diagonal, or {name: weight} with
+        names of states or of their groups, such as ``q_b``. Unnamed states have zero weight.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
         Weight on the inputs, positive definite, in the same forms.
     N : array_like (nx, nu), optional
@@ -87,8 +87,8 @@ def lqr(
     wheel_speeds : bool, optional
         Whether to regulate the wheel speeds to their values at the point. By default they are
         regulated if inputs other than the wheels can do it. With True they are also regulated if
-        only wheels turning against each other can do it. With False they are never regulated. The
-        default weights return wheel speeds at a tenth of the bandwidth.
+        only opposite wheel torques can do it. With False they are never regulated. With the default
+        weights, wheel speeds converge at a tenth of the bandwidth.
 
     Returns
     -------

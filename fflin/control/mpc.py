@@ -76,13 +76,13 @@ def mpc(
     dt : float
         Sampling time h [s].
     limits : "urdf", float, mapping or list of them, optional
-        Limits as in `simulate`, for inputs, states and outputs: {name, group or pattern:
-        magnitude, or (least, largest)}. They apply to the values themselves; along a trajectory,
-        limits of q_b and r_b apply to the error. With None there are no limits, except that
-        thrusters cannot pull.
+        Limits as in `simulate`, for inputs, states and outputs: {name, group or pattern: magnitude,
+        or (least, largest)}. They bound the values of these signals, except that limits of q_b and
+        r_b along a trajectory bound the error. With None there are no limits, except that thrusters
+        cannot pull.
     Qf : "steady", or as Q
         Weight on the error after N samples, or at the end of a trajectory. "steady" is the
-        regulator's cost from there on.
+        regulator's cost to go from there.
     weights : {"urdf", "identity"}, optional
         Rule for the weights, instead of Q and R, as in `lqr`.
 

@@ -28,8 +28,8 @@ class OutputFeedback(LinearController):
     """Feedback of the robot's outputs by a sampled compensator, such as the result of `lqg`.
 
     At each sample, u - u0 = C z is applied. Then y is measured, and z is advanced to the next
-    sample. The accelerometer model uses the commanded u, before limits. The estimate starts at
-    zero deviation from the point.
+    sample. The accelerometer model uses the commanded u, before it is limited. Initially the
+    estimated deviation from the point is zero.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class OutputFeedback(LinearController):
             )
         if not lin.dt or lin.moving:
             raise InputError(
-                "the model must be sampled and about a fixed point; take lin.discretize(dt), and "
+                "the model must be sampled and about a fixed point; use lin.discretize(dt), and "
                 "design the gain and the estimator for it"
             )
         signals = (compensator.input_names, compensator.output_names, compensator.dt)
@@ -83,7 +83,7 @@ class OutputFeedback(LinearController):
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryOutputFeedback(TrajectoryFeedback):
-    r"""Feedback ``u = u*(t) - K(t) eh`` of the estimated error from a trajectory.
+    r"""Feedback ``u = u*(t) - K(t) eh`` of the estimated error relative to a trajectory.
 
     At each sample, u is applied. Then y is measured, and the filter advances the estimate eh to
     the next sample, as in `OutputFeedback`. Positions and attitudes are measured relative to the

@@ -82,14 +82,14 @@ def plan(
     programs are built from the linear models along the motion and solved by PIQP
     (``pip install 'fflin[mpc]'``).
 
-    The attitude may turn by any angle. It makes whole turns if the angular rates at both ends
-    require them. Continuous joints take the shorter way.
+    The base may rotate by any angle. It makes whole turns if the angular rates at both ends require
+    them. Continuous joints take the shorter direction.
 
-    Limits of joints and wheels hold at the knots, and to 1 % between knots. If the integrated
-    motion exceeds a limit between knots, the limit is tightened at the neighbouring knots and the
-    plan is repeated. If that does not help, the intervals in question are halved. If more than 1 %
-    remains after 16 plans, a warning is issued. The printed trajectory states the largest excess,
-    its limit and its time.
+    Limits of joints and wheels are met at the knots; between knots, they may be exceeded by 1 %. If
+    the integrated motion exceeds a limit between knots, the limit is tightened at the neighbouring
+    knots and the plan is repeated. If that does not help, the intervals in question are halved. If
+    an excess of more than 1 % remains after 16 plans, a warning is issued. Printing the trajectory
+    shows the largest excess, its limit and its time.
 
     Parameters
     ----------

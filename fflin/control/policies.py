@@ -88,7 +88,7 @@ class StateFeedback:
         object.__setattr__(self, "K", K)
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
-        """Return K and offset of u = offset - K x of a robot's whole state, and x0 in it."""
+        """Return K and offset of u = offset - K x for a robot's whole state x, and its x0."""
         lin = self.lin
         fed = np.array([state.names.index(name) for name in lin.state_names])
         near = np.zeros(state.nx)
@@ -120,10 +120,10 @@ class StateFeedback:
 class Allocation:
     """Allocation of a policy's commands to thrusters and motors within their limits.
 
-    The policy commands the inputs of the robot `design`, such as torque and force on the base.
-    The thrusters and motors of the simulated robot then produce the closest generalised force.
-    "Closest" is in the least squares of the accelerations that the two forces would cause. No
-    thrust is negative, and no input exceeds its limit.
+    The policy commands the inputs of the robot `design`, such as torque and force on the base. The
+    thrusters and motors of the simulated robot then produce the generalised force closest to the
+    commanded one: the sum of squared differences between the accelerations that the two forces
+    cause is smallest. No thrust is negative, and no input exceeds its limit.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class Allocation:
 
     @property
     def lin(self) -> LinearModel | None:
-        """Model that the policy was made for, or None; its inputs are the design's."""
+        """Model of the robot `design` for which the policy was made, or None."""
         return getattr(self.policy, "lin", None)
 
     def bind(self, robot: Robot) -> Policy:
@@ -156,7 +156,7 @@ class Allocation:
         Raises
         ------
         InputError
-            If the two robots have different joints.
+            If the simulated robot and `design` have different joints.
         """
         if not isinstance(self.design, Robot):
             raise InputError(f"design is a {type(self.design).__name__}, expected a fflin.Robot")
@@ -205,7 +205,7 @@ class Clock:
         if self._last >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
             raise InputError(
                 f"the controller is called {apart:g} s after its last sample, expected "
-                f"{self._dt:g} s; leave out `sample`, or give it this value"
+                f"{self._dt:g} s; leave out `sample`, or set `sample` to the expected value"
             )
         self._last = t
 

@@ -33,7 +33,7 @@ Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryFeedback:
-    """Trajectory tracking ``u = u*(t) - K(t) e`` with the error e from a trajectory.
+    """Trajectory tracking ``u = u*(t) - K(t) e`` with the error e relative to a trajectory.
 
     The error is defined as in `linearize_trajectory`. Torques and forces on the base are in base
     axes, and t is the time since the first knot. After the end, the target is the last
@@ -46,8 +46,9 @@ class TrajectoryFeedback:
     schedule : GainSchedule
         Result of `tvlqr`.
     held : bool
-        Whether commands are held between samples; for a sampled schedule they always are. If
-        so, the command at the last knot already contains the inputs that hold the robot there.
+        Whether commands are held between samples; commands of a sampled schedule always are. If
+        they are held, the command at the last knot already contains the inputs that hold the robot
+        there.
 
     Examples
     --------
@@ -99,7 +100,7 @@ class TrajectoryFeedback:
             ) from None
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
-        """Return the reference q, v, and u in base axes at a time of the run."""
+        """Return the reference q, v, and u in base axes at time t of the run."""
         return self._point(t, self.duration * AT_THE_END)
 
     def _point(self, t: float, over: float) -> tuple[Array, Array, Array]:
@@ -121,11 +122,11 @@ class TrajectoryFeedback:
 
     @property
     def ahead(self) -> float:
-        """Time [s] after a sample at which a changing input is closest to its mean over it."""
+        """Time [s] into a sample at which a changing input is closest to the sample mean."""
         return 0.5 * self.schedule.dt if self.trajectory.hold == "linear" else 0.0
 
     def commanded(self, t: float) -> tuple[Array, Array, Array]:
-        """Return q, v, u of the point that the command at a time of the run refers to."""
+        """Return q, v, u of the trajectory point to which the command at run time t refers."""
         q, v, u = self._point(t, self.over)
         if self.ahead and t <= self.over:
             u = self._point(min(t + self.ahead, self.duration), self.duration)[2]
@@ -177,14 +178,14 @@ class TrajectoryFeedback:
         return chart.to_pinocchio(moved_by(self.frame, chart.to_state(q, v)[None], e[None])[0])
 
     def gain(self, t: float) -> Array:
-        """Return the gain K (nu, nx) at a time of the run."""
+        """Return the gain K (nu, nx) at time t of the run."""
         knots = self.schedule.t
         if t > self.over:
             return self.end_gain
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
 
     def law(self) -> Callable[[float, Array], Array]:
-        """Return law(t, e) -> u: the inputs at an error e and a time of the run."""
+        """Return law(t, e) -> u: the inputs for an error e at time t of the run."""
         return lambda t, e: self.commanded(t)[2] - self.gain(t) @ e
 
     def bind(self, robot: Robot) -> Policy:

@@ -27,7 +27,7 @@ from fflin.linear.trajectory_sampling import transitions
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FilterSchedule(Schedule):
-    r"""Time-varying Kalman filter of the error e from a trajectory.
+    r"""Time-varying Kalman filter for the error e relative to a trajectory.
 
     With the innovation :math:`\nu = y - y^*(t) - C \hat e - D\,\delta u`,
 
@@ -38,7 +38,7 @@ class FilterSchedule(Schedule):
     Attributes
     ----------
     t : ndarray (M,)
-        Times [s] of the knots: the trajectory's knots and those added to interpolate P. For a
+        Times [s] of the knots: the trajectory's knots, and knots added to interpolate P. For a
         sampled filter, the sample times.
     L : ndarray (M, nx, ny)
         Filter gains. In a sampled filter the last row repeats the gain before it.
@@ -90,11 +90,11 @@ class FilterSchedule(Schedule):
     dt: float = field(default_factory=float)
 
     def gain(self, t: float) -> Array:
-        """Return the filter gain L (nx, ny) at a time; see `GainSchedule.gain`."""
+        """Return the filter gain L (nx, ny) at time t; see `GainSchedule.gain`."""
         return super().gain(t).T
 
     def covariance(self, t: float) -> Array:
-        """Return P (nx, nx) at a time: cubic between knots, or the value at the last sample."""
+        """Return P (nx, nx) at time t: by cubic interpolation, or held since the latest sample."""
         return self.passed.cost(self._within(t))
 
     @cached_property
@@ -140,7 +140,7 @@ def tvkalman(
         ``G=traj.B`` the inputs are noisy, and W takes their names.
     P0 : "steady", or as W
         Covariance at the start. "steady" is the covariance of `kalman` about the start point: the
-        first configuration at rest, or the motion there if it is steady.
+        first configuration at rest, or in its initial motion if that motion is steady.
     sample : float, optional
         Sampling time [s]. It must divide the duration.
 

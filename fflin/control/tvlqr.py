@@ -65,15 +65,15 @@ def tvlqr(
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
         Weight on the inputs, positive definite.
     Qf : "steady", or as Q
-        Weight on the error at the end. "steady" is the infinite-horizon cost of `lqr` about the
-        end point: the last configuration at rest, or the motion there if it is steady. It omits
-        the states that the inputs cannot stabilise, see `momentum_reduction`.
+        Weight on the error at the end. "steady" is the infinite-horizon cost of `lqr` about the end
+        point: the last configuration at rest, or in its final motion if that motion is steady. It
+        omits the states that the inputs cannot stabilise, see `momentum_reduction`.
     sample : float, optional
         Sampling time [s]. It must divide the duration.
     weights : {"urdf", "identity"}, optional
         Rule for the weights, instead of Q and R: the rule of `lqr` about that end point, for a
-        tenth of its displacements. The loop is fast enough for errors to vanish within the
-        trajectory.
+        tenth of its displacements. The loop is fast enough for errors to decay within the duration
+        of the trajectory.
     rule : str
         Description of the rule that made Q and R.
 

@@ -35,8 +35,8 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
           ``F_b``, ``tau_m``;
         - a pattern such as ``q_m.hinge_*``.
 
-        A single name takes precedence over groups and patterns. Unnamed states cost nothing.
-        Inputs must all be named.
+        A single name takes precedence over groups and patterns. Unnamed states have zero weight.
+        Every input must be named.
 
     Returns
     -------
@@ -189,18 +189,18 @@ class SampledCost(NamedTuple):
 def sampled_cost(
     lin: LinearModel, dt: float, Q: Weight, R: Weight, N: ArrayLike | None = None
 ) -> SampledCost:
-    r"""Return the weights of the sum over samples that equals an integral cost.
+    r"""Return discrete-time weights for which the cost summed over samples equals an integral cost.
 
     The inputs are held between samples (zero-order hold).
 
-    Equation (10.1) of docs/derivation.md:
+    The weights are, by (10.1) of docs/derivation.md,
 
     .. math:: \begin{bmatrix} Q_d & N_d \\ N_d^T & R_d \end{bmatrix} = \int_0^h e^{F^T t}
               \begin{bmatrix} Q & N \\ N^T & R \end{bmatrix} e^{F t}\,dt,\qquad
               F = \begin{bmatrix} A & B \\ 0 & 0 \end{bmatrix}
 
-    At rest F^3 = 0, and the integral is an exact polynomial in h. Otherwise the integral over a
-    short step (van Loan) is computed and doubled repeatedly.
+    At rest F^3 = 0, and the integral is an exact polynomial in h. Otherwise the integral is
+    computed over a short step (van Loan), which is then doubled repeatedly.
 
     Parameters
     ----------
@@ -236,9 +236,7 @@ def sampled_cost(
     0.1
     """
     if not isinstance(lin, LinearModel) or lin.dt:
-        raise InputError(
-            "lin must be a continuous LinearModel; give the model from before discretize"
-        )
+        raise InputError("lin must be a continuous LinearModel; give the model that was sampled")
     h = number("dt", dt)
     if h <= 0.0:
         raise InputError(f"dt is {h:g} s, expected a positive sampling time")

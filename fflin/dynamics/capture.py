@@ -24,8 +24,8 @@ class Capture(Impact):
     Attributes
     ----------
     impulse : ndarray (6,)
-        Impulse on the robot, at the origin and in the axes of the payload's frame: force [N s],
-        then torque [N m s].
+        Impulse on the robot, about the origin of the payload's frame and in its axes: linear [N s],
+        then angular [N m s].
     payload : Robot
         The grasped payload as a robot. Its configuration and velocity just before the impact are
         ``payload_q`` (nq,) and ``payload_v`` (nv,).

@@ -21,7 +21,7 @@ from fflin.robot.robot import ROOT, Robot
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Impact(FrozenArrays):
-    """Robot after an instant change, with the impact; `Motion.then` continues a motion with it.
+    """Robot just after an instantaneous impact; pass it to `Motion.then` to continue a motion.
 
     Attributes
     ----------
@@ -30,15 +30,15 @@ class Impact(FrozenArrays):
     q, v : ndarray (nq,), (nv,)
         Configuration and velocity of this robot just after the impact.
     impulse : ndarray (k,)
-        From `jam`: impulse on each jammed joint, torque [N m s] or force [N s]. From `capture`:
-        see `Capture`.
+        For `jam`, the impulse on each jammed joint: [N m s] if it is revolute, [N s] if it is
+        prismatic. For `capture`, see `Capture`.
     energy_lost : float
         Kinetic energy lost in the impact [J], never negative.
     momentum : ndarray (6,)
         Total momentum before the impact: linear [N s], then angular [N m s] about the world's
         origin.
     momentum_after : ndarray (6,)
-        Total momentum after the impact, which is the same to machine precision.
+        Total momentum after the impact, equal to `momentum` to machine precision.
     event : str
         Short description of the event.
 

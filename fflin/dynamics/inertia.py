@@ -122,8 +122,8 @@ class Inertia:
         involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
         if lost:
             raise SingularInertiaError(
-                f"M of '{name}' is singular at this configuration: {involved} can move together "
-                "without moving mass; choose another configuration, give the links an inertia, or "
+                f"M of '{name}' is singular at this configuration: a motion of {involved} moves "
+                "no mass; choose another configuration, give the links an inertia, or "
                 "lock one of the joints"
             )
         warnings.warn(

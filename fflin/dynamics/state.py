@@ -50,7 +50,7 @@ class StateMap:
     axes : tuple of bool
         Whether omega_b and v_b are in reference axes.
     in_reference : tuple of slice
-        Rows of the base velocities in reference axes, in any (6 + n) velocity or wrench.
+        Rows of a velocity or wrench (6 + n) that are in reference axes.
     S : ndarray (nv, 6 + n) or None
         Matrix of v = S nu if the robot has mimic joints; otherwise None, and v is a permutation of
         nu.
@@ -59,8 +59,9 @@ class StateMap:
     origin_quaternion : ndarray (4,)
         Attitude of `origin` as a quaternion x, y, z, w.
     orbit : tuple of ndarray (3,), (3, 3), or None
-        For a robot in orbit: the rotation rate of the reference, and the matrix of the
-        acceleration field of points at rest in it, both in its axes.
+        For a robot in orbit: the angular velocity of the reference frame, and the matrix from the
+        position of a point at rest in this frame to its acceleration. Both are in the axes of the
+        frame.
 
     Raises
     ------
@@ -192,8 +193,8 @@ class StateMap:
         v : array_like (nv,)
             Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
         near : array_like (nx,), optional
-            State to which the angles of continuous joints are unwrapped: a multiple of 2 pi is
-            added to each angle so that it is nearest to this state. By default angles are in
+            State near which the angles of continuous joints are unwrapped: to each angle, the
+            multiple of 2 pi is added that brings it nearest to this state. By default angles are in
             (-pi, pi].
 
         Returns
@@ -298,11 +299,11 @@ class StateMap:
         return tau.take(self._order, axis=0) if self.S is None else self.S.T @ tau
 
     def columns(self, matrix: Array) -> Array:
-        """Return ``matrix S``, which puts columns (..., nv) over Pinocchio's v in state order."""
+        """Return ``matrix S``: columns (..., nv) for Pinocchio's v, converted to state order."""
         return matrix.take(self._order, axis=1) if self.S is None else matrix @ self.S
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
-        """Return ``S^T matrix S`` (7.3), which puts a matrix (nv, nv) over v in state order."""
+        """Return ``S^T matrix S`` (7.3): a matrix (nv, nv) for v, converted to state order."""
         if self.S is not None:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
@@ -325,7 +326,7 @@ class StateMap:
         return angles
 
     def joints_apart(self, before: Array, q: Array) -> Array:
-        """Return the difference of q_m (n,) at q from q_m at `before`; both are valid (nq,)."""
+        """Return q_m (n,) at q minus q_m at `before`, two valid configurations (nq,)."""
         apart = q.take(self._idx_q) - before.take(self._idx_q)
         if self._cos.size:
             s, c, s_0, c_0 = (x.take(at) for x in (q, before) for at in (self._sin, self._cos))

@@ -102,7 +102,8 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 
     - Pinocchio's ABA derivatives, mapped into the chart (tolerance 1e-9, relative);
     - sixth-order central differences of the nonlinear model :math:`\dot x = f(x, u)` in the same
-      chart (tolerance 1e-8). The function f itself is compared with motions that it generates.
+      chart (tolerance 1e-8). The function f itself is verified against motions that are integrated
+      with it.
 
     Tolerances grow with the condition number of M, as round-off errors do.
 

@@ -100,12 +100,12 @@ def equilibrium(
         \min \|u\|_2 \quad \text{subject to} \quad B(q)\,u = -f(q, v), \qquad
         u_k \ge 0 \text{ for every thruster } k.
 
-    The norm is taken of the plain numbers in u, each in its own unit. The rows of the balance, in
-    N m and N, are made comparable by the mobilities :math:`\sqrt{(M^{-1})_{ii}}`. With these
-    weights the residual must not exceed 1e-9 of the balanced forces.
+    The norm is computed from the numbers in u, each in its own unit. The rows of the force balance,
+    in N m and N, are weighted by the mobilities :math:`\sqrt{(M^{-1})_{ii}}` to make them
+    comparable. The weighted residual must not exceed 1e-9 of the balanced forces.
 
     A joint with a spring and without a `JointTorque` sags if no input holds it. Newton's method
-    finds its position too, with the Jacobian :math:`M\,\partial\dot\nu/\partial q_m`.
+    then finds its position, with the Jacobian :math:`M\,\partial\dot\nu/\partial q_m`.
 
     Parameters
     ----------
@@ -119,14 +119,15 @@ def equilibrium(
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the inputs on the base, as in `linearize`.
     reference : pin.SE3, optional
-        Placement whose axes are the reference axes, as in `linearize`. The default is the base's
-        own placement, so that the inputs on the base are in base axes in every frame; in orbit it
-        is the orbit's frame.
+        Placement whose axes are the reference axes, as in `linearize`. The default is the base
+        placement; the inputs on the base are then in base axes, whichever `frame` is given. For a
+        robot in orbit, the default is the orbit's frame.
 
     Returns
     -------
     Equilibrium
-        Use it as ``linearize(robot, result.q, v, u=result.u)`` with the same frame and reference.
+        Pass it on as ``linearize(robot, result.q, v, u=result.u)``, with the same frame and
+        reference.
 
     Raises
     ------

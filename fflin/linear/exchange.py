@@ -89,7 +89,7 @@ class ToolModel(Design):
 def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None) -> ToolModel:
     r"""Return a linear model in the coordinates, order and axes of another tool.
 
-    Deviations transform as x' = T x and u' = T_u u. At any point, also of a moving robot,
+    Deviations transform as x' = T x and u' = T_u u. At any point, at rest or in motion,
 
     .. math:: A' = (T A + \dot T)\,T^+ + \ldots, \qquad B' = T B\,T_u^{-1}
 
@@ -104,8 +104,9 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     tool : {"drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"}
         Name of the tool, or of the attitude coordinates.
     dt : float, optional
-        Only for "mujoco": its time step [s]. A and B are then the pair of ``mjd_transitionFD`` with
-        the integrator Euler (for a robot with dampers: with ``eulerdamp`` disabled).
+        Only for "mujoco": its time step [s]. A and B are then the matrices that
+        ``mjd_transitionFD`` returns with the Euler integrator. For a robot with dampers, this
+        requires ``eulerdamp`` to be disabled.
 
     Returns
     -------
@@ -267,7 +268,7 @@ def _step(tool: str, dt: Any) -> float:
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(
-            f"dt is {h:g} s for {tool}; expected a positive time step below 1000 s, for mujoco only"
+            f"dt is {h:g} s for {tool}; only mujoco takes dt, a positive time step below 1000 s"
         )
     return h
 

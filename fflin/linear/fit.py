@@ -83,9 +83,9 @@ def require_turns(made: str, size: int, robot: Robot) -> None:
 def line_up(gain: Any, lin: LinearModel) -> Array:
     """Return the K of a gain for another model, with states and inputs matched by name.
 
-    A robot before and after a capture, or before and after a joint jams, keeps most of its states.
-    States and inputs that only the model has get zero columns and rows; states and inputs that
-    only the gain has are dropped.
+    A robot keeps most of its states if it captures a payload or a joint jams. K gets zero columns
+    for states, and zero rows for inputs, that only the model has. States and inputs that only the
+    gain has are dropped.
 
     Parameters
     ----------

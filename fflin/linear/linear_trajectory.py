@@ -30,16 +30,18 @@ if TYPE_CHECKING:
 class LinearTrajectory(Trajectory):
     r"""Error dynamics along a motion, ``d(dx)/dt = A(t) dx + B(t) du``, ``dy = C dx + D du``.
 
-    The error dx is in the moving base's own axes, see `Linearizer` (``moving=True``). The part of
-    du on the base is in base axes. If ``dt`` is positive, the left side is the error at the next
-    knot instead. The items of the sequence are the linear models at the knots.
+    The error dx is in the moving base's own axes, see `Linearizer` (``moving=True``). Torques and
+    forces on the base in du are in base axes. If ``dt`` is positive, the left side is the error at
+    the next knot instead. ``along[k]`` is the linear model at knot k.
 
     Attributes
     ----------
     A : ndarray (N, nx, nx)
-        State matrices at the knots. With ``dt`` there are N - 1, each from one knot to the next.
+        State matrices at the knots. If ``dt`` is positive, N - 1 matrices, each from one knot to
+        the next.
     B : ndarray (N, nx, nu)
-        Input matrices at the knots. With ``dt`` there are N - 1, each from one knot to the next.
+        Input matrices at the knots. If ``dt`` is positive, N - 1 matrices, each from one knot to
+        the next.
     C : ndarray (N, ny, nx)
         Output matrices at the knots.
     D : ndarray (N, ny, nu)
@@ -106,7 +108,7 @@ class LinearTrajectory(Trajectory):
         return Linearizer(self.robot, moving=True)
 
     def matrices(self, t: float) -> tuple[Array, Array]:
-        """Return A (nx, nx) and B (nx, nu) at a time t [s], between knots evaluated at `point`."""
+        """Return A (nx, nx) and B (nx, nu) at time t [s]; between knots, about `point`(t)."""
         t = self._within(t)
         k, share = placed(self.t, t)
         if self.dt or share in (0.0, 1.0):
@@ -116,14 +118,14 @@ class LinearTrajectory(Trajectory):
         return lin.A, lin.B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
-        """Return values at a time of arrays given at the knots, interpolated linearly or held."""
+        """Evaluate arrays given at the knots, interpolated linearly or held, at one time."""
         k, share = placed(self.t, self._within(t))
         if self.dt or not share:
             return tuple(each[k] for each in arrays)
         return tuple(each[k] + share * (each[k + 1] - each[k]) for each in arrays)
 
     def check(self) -> Check:
-        """Check every knot as `fflin.check` does, and return the worst result of each error."""
+        """Check every knot by `fflin.check`, and return the largest value of each error."""
         from fflin.linear.check import check_all
 
         return check_all(self.robot, self, f"{self.robot.name}, {len(self)} knots")
@@ -183,7 +185,7 @@ def linearize_trajectory(
         Configurations, velocities and inputs at the knots, as `Trajectory` takes them; only if t
         holds times.
     strict : bool
-        Whether to refuse knots whose residual as a motion of the robot exceeds 1e-2.
+        Whether to refuse knots that violate the robot's dynamics with a residual above 1e-2.
     **options
         hold and frame, see `Trajectory`.
 
@@ -200,8 +202,8 @@ def linearize_trajectory(
     Warns
     -----
     FflinWarning
-        If the knots are not a motion of the robot. The warning names the interval with the largest
-        error, the error, and usual causes.
+        If the knots do not satisfy the robot's dynamics. The warning names the interval with the
+        largest error, the error, and usual causes.
 
     Examples
     --------

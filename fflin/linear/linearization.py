@@ -30,10 +30,10 @@ _MODERATE = 1e50
 
 
 class Linearizer:
-    r"""Linearisation of one robot at many points, with one preparation for all of them.
+    r"""Linearisation of one robot at many points; data common to all points are prepared once.
 
-    Threads may share a `Linearizer`; only one computes at a time. Copies, pickled ones too, have
-    their own work space.
+    Threads may share a `Linearizer`, but only one thread computes at a time. Every copy, including
+    a pickled one, has its own work space.
 
     At rest, with N = blkdiag(E3/2, E3, En) and the joint-space inertia M in state order,
 
@@ -42,11 +42,11 @@ class Linearizer:
         B = \begin{bmatrix} 0 \\ M^{-1} \end{bmatrix}.
 
     At other points :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
-    :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`, then transformed to the chart and
-    the velocity frame. The dynamics do not depend on the position and linear velocity of the base
-    (Galilean invariance). They are evaluated without both, so a distant base loses no accuracy.
-    docs/derivation.md has the equations. Section 14 covers a robot in orbit, whose rates are
-    relative to the orbit's frame.
+    :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`, then transformed to the chart and the
+    velocity frame. The dynamics do not depend on the position and linear velocity of the base
+    (Galilean invariance). The evaluation leaves out both, so no accuracy is lost if the base is far
+    from the origin. docs/derivation.md has the equations. Section 14 covers a robot in orbit, whose
+    rates are relative to the orbit's frame.
 
     Parameters
     ----------
@@ -55,14 +55,14 @@ class Linearizer:
         Axes of the base velocities and wrenches, see `StateMap`. The default is "hybrid". A robot
         in orbit needs "lvlh" (its default) or "hill".
     reference : pin.SE3, optional
-        Placement that attitude and position are relative to. The default is the base's own
-        placement at each point, so that the model is about the robot's present pose; in orbit it
-        is the orbit's frame.
+        Placement that attitude and position are relative to. The default is the base placement at
+        each point, so that q_b and r_b are zero there. For a robot in orbit, it is the orbit's
+        frame.
     moving : bool
-        Whether to return the error dynamics about a reference that moves through the point by the
-        robot's own dynamics. The error is q_b = vec(q*^-1 q), r_b = R*^T (p - p*), the frame is
-        "local", and f0 is zero. Use it for trajectories, and for relative equilibria such as a
-        steady spin.
+        Whether to return the error dynamics about a moving reference. This reference passes through
+        the point and obeys the dynamics of the robot. The error is q_b = vec(q*^-1 q), r_b = R*^T
+        (p - p*), the frame is "local", and f0 is zero. Use it for trajectories, and for relative
+        equilibria such as a steady spin.
     engine : {"python", "compiled"}, optional
         Engine for the accelerations of points with velocity, springs or forces: Python by
         default, or the compiled kernel of sweeps. Both engines agree to machine precision.
@@ -247,7 +247,7 @@ def linearize(
     Returns
     -------
     LinearModel
-        The equations stand in `Linearizer`, which prepares this for many points.
+        See `Linearizer` for the equations, and to linearise at many points.
 
     Raises
     ------

@@ -36,7 +36,7 @@ class Certificate:
         Condition number of M scaled to a unit diagonal. Expect residuals of this number times
         machine precision.
     inertia_residual : float
-        Largest entry of M M^-1 minus the identity, with the same scaling.
+        Largest entry of M M^-1 - I, with M scaled as for `condition`.
     route_A, route_B : float
         Largest difference from A and B computed by Pinocchio's ABA derivatives, relative to the
         largest entry of the same block.
@@ -62,8 +62,8 @@ class Certificate:
 class LinearModel(FrozenArrays):
     r"""Linear model about a point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
-    The output is ``y = y0 + C (x - x0) + D (u - u0)``. For ``dt > 0`` the left side is the next
-    sample's ``x - x0`` instead, and f0 is added at each step. Arrays are read-only.
+    The output is ``y = y0 + C (x - x0) + D (u - u0)``. If ``dt > 0``, the left side is ``x - x0``
+    at the next sample instead, and f0 is the constant term of each step. Arrays are read-only.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class LinearModel(FrozenArrays):
     frame : str
         Axes of velocities and wrenches: "hybrid", "local" or "world"; in orbit "lvlh" or "hill".
     moving : bool
-        Whether the state is the error from a reference that moves through the point.
+        Whether the state is the error relative to a reference that moves through the point.
     q : ndarray (nq,)
         Configuration of the point in Pinocchio's order.
     v : ndarray (nv,)
@@ -102,8 +102,8 @@ class LinearModel(FrozenArrays):
     fflin_version, pinocchio_version : str
         Versions of the packages that made the model.
     verified : bool
-        True for a model of this session, or read from a file with a valid SHA-256 digest. False
-        for a file without a digest, and for every result made from its data.
+        True for a model computed in this session, or read from a file with a valid SHA-256 digest.
+        False for a model read from a file without a digest, and for every result derived from it.
     weights : mapping
         Default weights of `lqr`, as `Robot.replace` takes them.
     mean_motion : float
@@ -198,7 +198,7 @@ class LinearModel(FrozenArrays):
 
     @property
     def drift(self) -> Array | None:
-        """State derivative (nx,) of a moving reference, for which f0 is zero; otherwise None.
+        """State derivative (nx,) of the reference if it moves (f0 is then zero); otherwise None.
 
         Its attitude rate excludes rotation about the direction of gravity, which has no effect.
         """
@@ -234,7 +234,8 @@ class LinearModel(FrozenArrays):
     def generator(self) -> LinearModel | None:
         """Continuous-time model from which this model was sampled, or the model itself.
 
-        None if it is not known: the sampled model is from a file, or its matrices were changed.
+        None if it is not known, because the sampled model is from a file or its matrices were
+        changed.
         """
         if not self.dt:
             return self
@@ -253,7 +254,7 @@ class LinearModel(FrozenArrays):
         These are:
 
         - the base position, except in orbit;
-        - the angles of rotors, joints whose link is symmetric about the axis and carries nothing;
+        - the angles of rotors (joints whose link is symmetric about the axis and carries no link);
         - the base attitude, for `moving` models without gravity.
         """
         return () if self._ignorable is None else self._ignorable(self)
@@ -263,16 +264,16 @@ class LinearModel(FrozenArrays):
         """{name of an input or state: limit}, from the URDF, the inputs and `Robot.limits`.
 
         The limit of an input is its largest force or torque. The limit of ``qdot_m`` is the largest
-        speed [rad/s | m/s], and of ``q_m`` the whole range of travel [rad | m].
+        speed [rad/s | m/s]. The limit of ``q_m`` is the whole range of travel [rad | m].
         """
         return {} if self._limits is None else self._limits()
 
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
-        """Return whether the point is a fixed point or relative equilibrium, with constant A, B.
+        """Return whether the point is a fixed point or a relative equilibrium.
 
-        At a relative equilibrium only ignorable coordinates move, at constant rates: a rotor
-        spins, or the base moves at constant velocity. With ``moving=True`` the motion of the
-        reference is tested instead of f0:
+        At a relative equilibrium only ignorable coordinates move, at constant rates: a rotor spins,
+        or the base moves at constant velocity. In both cases A and B are constant in time. With
+        ``moving=True`` the motion of the reference is tested instead of f0:
 
         - its velocities in base axes must be constant;
         - no joint except rotors may move;
@@ -281,8 +282,8 @@ class LinearModel(FrozenArrays):
         Parameters
         ----------
         tol : float
-            Largest rate of a coordinate that is not ignorable, in SI units. In orbit it is
-            multiplied by the mean motion, because the gravity gradient is weak.
+            Largest permitted rate of a coordinate that is not ignorable, in SI units. In orbit the
+            tolerance is multiplied by the mean motion, because the gravity gradient is weak.
         """
         rate = self.f0 if self.drift is None else self.drift
         judged = [name not in self.ignorable for name in self.state_names]

@@ -38,7 +38,7 @@ _CAUSES = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Design):
-    """Motion of a robot given by knots; the arrays are copied and read-only.
+    """Motion of a robot, given at knots; the arrays are copied and read-only.
 
     Parameters
     ----------
@@ -160,17 +160,17 @@ class Trajectory(Design):
 
     @property
     def residual(self) -> Array:
-        """Residual (N,) of the motion at each knot: the larger error of its adjacent intervals.
+        """Residual (N,) of the motion at each knot: the larger error of the two adjacent intervals.
 
-        Each interval is integrated from its first knot under its inputs. Its error is the
-        difference from the next knot divided by the interval, relative to the largest rate of the
-        motion, see `Flow`.
+        Each interval is integrated from its first knot under its inputs. The error of the interval
+        is the difference between the integrated state and the next knot, divided by the duration of
+        the interval and by the largest rate of the motion; see `Flow`.
         """
         found = self.flow.residual
         return np.maximum(np.append(found, 0.0), np.append(0.0, found))
 
     def point(self, t: float) -> tuple[Array, Array, Array]:
-        """Return q (nq,), v (nv,), and u (nu,) in base axes, at a time t [s].
+        """Return q (nq,), v (nv,), and u (nu,) in base axes, at time t [s].
 
         Between knots, q and v are cubics that match the robot's velocities and accelerations.
 
@@ -182,7 +182,7 @@ class Trajectory(Design):
         return self.flow.at(self._within(t))
 
     def resampled(self, dt: float) -> Trajectory:
-        """Return the same motion with knots dt [s] apart and one at the end, see `point`.
+        """Return the same motion with knots every dt [s] and a knot at the end, see `point`.
 
         Held inputs are unchanged if every old knot is also a new knot.
         """

@@ -65,7 +65,7 @@ class Input:
         return () if frame is None else (frame,)
 
     def names(self, count: int) -> tuple[str, ...]:
-        """Return the names of this input's entries in u; it is number `count` of its kind."""
+        """Return the names of this input's entries in u, for input number `count` of its type."""
         return tuple(f"{self.GROUP}.{entry}" for entry in self.ENTRIES)
 
 
@@ -91,7 +91,7 @@ class BaseTorque(Input):
     Parameters
     ----------
     max, min : float or sequence of float (3,), optional
-        Limits [N m] of each entry; keyword only. Every kind of input has these limits.
+        Limits [N m] of each entry; keyword only. Every type of input accepts these two parameters.
 
     Examples
     --------
@@ -219,14 +219,15 @@ class ReactionWheel(WrenchInput):
     power is u times the speed of the wheel relative to this link. Mass and inertia of the carrier
     in the URDF must include the wheel, as if it were welded.
 
-    With an ``inertia`` J, the speed of the wheel is a state. The robot has one more joint, a
-    continuous joint with the wheel's name. In the state it follows all joints that its carrier
-    carries. J a a^T moves from the carrier's inertia to the wheel; mass and transverse inertia
-    stay with the carrier.
+    With an ``inertia`` J, the speed of the wheel is a state. The robot gets one more joint: a
+    continuous joint with the wheel's name. In the state vector, it comes after all joints that the
+    carrier carries. The inertia J a a^T is transferred from the carrier to the wheel; mass and
+    transverse inertia stay with the carrier.
 
-    Without ``inertia``, the wheel is not a joint. The carrier feels the torque -u a, and the
-    gyroscopic torque :math:`-\omega \times h a` of the wheel's ``momentum`` h. This is the limit
-    of a small and fast wheel: h is constant even if u is not zero, and the carrier keeps J.
+    If ``inertia`` is omitted, the wheel is modelled only by the torques on its carrier: the
+    reaction -u a, and the gyroscopic torque :math:`-\omega \times h a` of the wheel's ``momentum``
+    h. This is the limit of a small and fast wheel: h is constant even if u is not zero, and J
+    remains part of the carrier's inertia.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ def check_root(model: pin.Model, name: str) -> None:
     fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
     if fixed:
         raise ModelError(
-            f"'{name}': joint '{fixed[0]}' hangs on the world, not on the free-flyer; connect "
+            f"'{name}': joint '{fixed[0]}' is attached to the world, not the free-flyer; connect "
             "every moving link to the one base"
         )
 

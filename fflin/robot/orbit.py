@@ -37,19 +37,19 @@ class CircularOrbit:
     The robot is described relative to a frame whose origin moves along the orbit in free fall.
     The frame rotates with the orbit. Its axes are one of
 
-    - ``lvlh``: x along the orbit, y against the orbit normal, z towards the central body;
+    - ``lvlh``: x along the orbit, y opposite to the orbit normal, z towards the central body;
     - ``hill``: x away from the central body, y along the orbit, z along the orbit normal.
 
     Pinocchio's world is this frame, and velocities are relative to it. The gravity gradient is
-    linear in the position x relative to the origin: the force per mass is
-    :math:`n^2 (3 r r^T - E) x`, with the unit vector r away from the central body and the identity
-    E. The relative error is of the order of the distance divided by the orbit's radius.
+    linear in the position x relative to the origin: the force per mass is :math:`n^2 (3 r r^T - E)
+    x`, with the unit vector r away from the central body and the identity E. The relative error of
+    this linearisation is of the order of ``|x|`` divided by the orbit's radius.
 
     Parameters
     ----------
     altitude : float, optional
-        Height above the surface [m]. An `FflinWarning` is issued if the value looks like
-        kilometres or like a radius.
+        Height above the surface [m]. An `FflinWarning` is issued if the value looks like an
+        altitude in km or an orbit radius.
     mean_motion : float, optional
         Mean motion n [rad/s], instead of the altitude.
     body : str
@@ -61,7 +61,7 @@ class CircularOrbit:
     Attributes
     ----------
     altitude, mean_motion, body, mu, body_radius
-        As above; all of them have values, given or computed.
+        The parameters; omitted ones are computed from the others.
     radius : float
         Radius of the orbit [m].
     period : float
@@ -130,7 +130,7 @@ class CircularOrbit:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
             above, said = altitude - ground, ""
             if altitude < _BARE.get(self.body, _AIR):
-                said = "altitudes are in metres: write 400 km as 400e3"
+                said = "altitudes are in metres; write 400 km as 400e3"
             elif self.body == "earth" and _LOW_ORBITS[0] <= above <= _LOW_ORBITS[1]:
                 said = f"if you mean the orbit's radius, the altitude is {above:.8g} m"
             if said and self.mu is None:  # not of an asteroid, nor of an orbit that was saved

@@ -151,8 +151,8 @@ class FrameVelocity(FrameOutput):
     - Angular velocity (3,) [rad/s], in the frame's own axes.
     - Velocity (3,) [m/s] of the frame's origin, in reference axes.
 
-    At the point of linearisation they are the time derivatives of `FramePose`, in every velocity
-    frame of the state.
+    At the point of linearisation, both are the time derivatives of `FramePose`, whichever velocity
+    frame the state uses.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ class RelativePose(FrameOutput):
 
 
 class CenterOfMass(Output):
-    """Output of the position (3,) [m] of the centre of mass from the reference, in its axes.
+    """Output of the centre of mass: position (3,) [m] relative to the reference, in its axes.
 
     Examples
     --------

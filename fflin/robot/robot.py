@@ -42,9 +42,9 @@ class Robot(Coordinates):
     Attributes
     ----------
     model : pin.Model
-        Pinocchio model with a free-flyer root joint and zero gravity. Mimic joints are ordinary
-        joints in it, and so are input wheels with an inertia. Do not change it: a robot whose
-        model was changed is refused. Make a new robot with `from_model` instead.
+        Pinocchio model with a free-flyer root joint and zero gravity. In it, mimic joints and
+        reaction wheels with an inertia are ordinary joints. Do not change the model: fflin refuses
+        a robot whose model was changed. Make a new robot with `from_model` instead.
     name : str
         Name or file stem by which the robot was loaded.
     urdf : Path or None
@@ -79,7 +79,7 @@ class Robot(Coordinates):
     passive : tuple of str
         Joints without a motor.
     weights : mapping
-        Default weights of `lqr` that replace the rule's: see `replace`.
+        Default weights of `lqr`, which replace the weights of its rule: see `replace`.
     start : mapping
         Default initial state of `simulate` and `visualize`: see `replace`.
     limits : mapping
@@ -187,8 +187,8 @@ class Robot(Coordinates):
             - a wheel has more inertia than its carrier;
             - both gravity and an orbit are given.
         UnknownNameError
-            If there is no such field, no such joint, no such frame of an input or output, or no
-            such name to limit.
+            If a field, a joint, a frame of an input or output, or a name in `limits` does not
+            exist.
         ModelError
             If dry friction is given, which is not differentiable at rest, or if the robot's model
             was changed after the robot was made.
@@ -220,12 +220,12 @@ class Robot(Coordinates):
             {body: {"mass": m [kg], "com": (3,) [m], "inertia": (3, 3) [kg m^2] about the centre of
             mass} or pin.Inertia}, in the axes of the body's joint.
 
-            A body is named by its joint, by ``base``, by a pattern, or by its link if no other
-            link is fixed to it. Links that are fixed to each other are one body, which is given
-            as a whole and includes its wheels.
+            A body is named by its joint, by ``base``, by a pattern, or by its link if no other link
+            is fixed to it. Links that are fixed to each other form one body. Give the properties of
+            the whole body, including its wheels.
 
-            Properties that are left out stay. A mass given without an inertia scales the inertia
-            in proportion, like a change of density.
+            Omitted properties are unchanged, except that a mass given without an inertia scales the
+            inertia in proportion, like a change of density.
 
         Returns
         -------

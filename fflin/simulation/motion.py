@@ -45,30 +45,33 @@ class Motion(Design):
         State in the chart of `reference` and `frame`. The angles of continuous joints grow beyond
         a full turn.
     u : ndarray (N, nu)
-        Inputs that act from t on, in the frame's axes. The last row repeats the row before it.
+        Inputs that act from time t on, in the axes of `frame`. The last row repeats the row before
+        it.
     target : ndarray (nx,) or (N, nx)
         Target state. If the policy follows a trajectory, the trajectory's state at each time.
         Empty if no target is known.
     prediction : ndarray (N, nx)
-        State that the linear model predicts under the same control law. No rows without such a
-        prediction.
+        State that the linear model predicts under the same control law. The array has no rows if
+        there is no prediction.
     energy : ndarray (N,)
-        Kinetic energy, plus the potential energy of gravity and springs [J]. In orbit the Jacobi
-        integral: kinetic energy relative to the frame, plus the potentials of the gravity
+        Kinetic energy, plus the potential energy of gravity and springs [J]. In orbit, it is the
+        Jacobi integral: kinetic energy relative to the frame, plus the potentials of the gravity
         gradient, the frame's rotation and the springs.
     momentum : ndarray (N, 6)
         Angular momentum about the centre of mass [N m s], then linear momentum [N s], in world
-        axes. In orbit the momentum of the motion relative to the frame.
+        axes. In orbit, it is the momentum of the motion relative to the orbital frame.
     momentum_drift : ndarray (N,)
-        Deviation of the momentum from its initial value plus the impulse since. It is divided by
-        the largest momentum that the kinetic energy allows, (11.5) of docs/derivation.md:
+        Difference between the momentum and its expected value: the initial momentum plus the
+        impulse since then. It is divided by the largest momentum that the kinetic energy allows,
+        (11.5) of docs/derivation.md:
 
-        - Linear part: the mass times the rms speed of its elements at the fastest row.
-        - Angular part: that speed times the mass times the radius of gyration about the base's
-          first position, plus the momentum stored in wheels.
+        - Linear part: the mass times the rms speed of the mass elements in the fastest row.
+        - Angular part: that speed times the mass times the radius of gyration about the initial
+          base position, plus the momentum stored in wheels.
 
-        Momentum is not conserved in orbit. There the drift is the deviation of `energy` from its
-        initial value plus the work since, relative to the largest terms of the energy.
+        Momentum is not conserved in orbit. There the drift is the difference between `energy` and
+        its expected value, the initial energy plus the work since then, relative to the largest
+        terms of the energy.
     com_drift : ndarray (N,)
         Distance [m] of the centre of mass from the position predicted by its initial velocity and
         the impulse since. No rows in orbit, or if the file lacks it.
@@ -78,7 +81,7 @@ class Motion(Design):
     stopped : str
         Reason for which the run ended early; empty if it did not.
     wheels : tuple of str
-        Joints that are reaction wheels. Their angles do not count as errors.
+        Joints that are reaction wheels. Their angles are not included in the errors.
     wheel_inertias : ndarray (k,)
         Inertias of the wheels about their axes [kg m^2]; empty if the file lacks them.
     steered : tuple of str
@@ -90,8 +93,8 @@ class Motion(Design):
     engine : str
         Engine that ran the loop, "compiled" or "python"; empty if the file lacks it.
     limits : ndarray (k, 2)
-        Lower and upper limits of `limit_names`, infinite on a side without one. They are listed
-        whether or not the simulation enforces them.
+        Lower and upper limits of `limit_names`; infinite if there is no limit on that side. They
+        are listed whether or not the simulation enforces them.
     phases, starts : tuple of str, ndarray (k,)
         Names and start times [s] of the phases of a motion that `then` joined.
 
@@ -221,8 +224,9 @@ class Motion(Design):
         Returns
         -------
         Motion
-            Joined motion on one time axis, for the robot and in the chart of this motion. A jammed
-            joint stands still. Energy and momentum refer to the robot of each phase.
+            Joined motion on one time axis, in the states and the chart of this motion. A jammed
+            joint stands still. In each phase, energy and momentum are computed for the robot of
+            that phase.
 
         Raises
         ------
@@ -237,9 +241,9 @@ class Motion(Design):
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion as a trajectory whose inputs are held or interpolated linearly.
 
-        Of the two, the hold that fits the dynamics better is chosen. If inputs change continuously,
-        the last input, which no row contains, is extrapolated. A motion that was read from a file
-        needs the `robot`.
+        The better fit to the dynamics decides whether inputs are held or interpolated. If inputs
+        change continuously, the input at the last row is extrapolated, because it is not recorded.
+        A motion that was read from a file needs the `robot`.
         """
         from fflin.linear.trajectory import along
 
@@ -252,7 +256,7 @@ class Motion(Design):
 
     @property
     def saturated(self) -> tuple[Saturated, ...]:
-        """Saturated inputs and wheel speeds; the one saturated for the longest time first."""
+        """Saturated inputs and wheel speeds, sorted by time in saturation, longest first."""
         names = {*self.input_names, *(f"qdot_m.{name}" for name in self.wheels)}
         return saturated(self.t, (each for each in limited(self) if each[0] in names))
 
@@ -294,10 +298,11 @@ def plot_motion(
     Parameters
     ----------
     motion : Motion
-        With a prediction, each group of states shows the nonlinear robot as solid lines and the
-        linear model as dashed lines; the panel below shows their difference. Along a trajectory,
-        each group shows the robot over the pale reference; the panel below shows the error, dashed
-        for the linear model. A dotted line marks the time at which the reference comes to rest.
+        Motion to draw. If it has a prediction, each group of states shows the nonlinear robot as
+        solid lines and the linear model as dashed lines; the panel below shows their difference.
+        Along a trajectory, each group shows the robot and, in pale colours, the reference; the
+        panel below shows the error, as dashed lines for the linear model. A dotted line marks the
+        time at which the reference comes to rest.
     path : str or Path, optional
         File to save to: .png, .pdf or .svg.
     show : sequence of str, optional

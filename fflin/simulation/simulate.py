@@ -94,8 +94,8 @@ def simulate(
         Step [s]; by default 0.01, or less if the loop's fastest pole or the samples require it. If
         the default step diverges, the simulation is repeated with a quarter of it, up to three
         times, and `Motion.notes` report this. A simulation with an event, a callback, a disturbance
-        or a custom Python policy is not repeated, because these may store their calls. If the input
-        is neither sampled nor delayed, the step is adjusted to divide the duration.
+        or a custom Python policy is not repeated, because these may keep an internal state. If the
+        input is neither sampled nor delayed, the step is adjusted to divide the duration.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
         Whether the projection above restores momentum and centre of mass.

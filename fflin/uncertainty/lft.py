@@ -27,8 +27,8 @@ class LFT(Design):
     .. math:: \dot x = A x + B_1 w + B_2 u,\quad z = C_1 x + D_{11} w + D_{12} u,\quad
               y = C_2 x + D_{21} w + D_{22} u,\quad w = \Delta z
 
-    :math:`\Delta` is diagonal and repeats each delta, between -1 and 1. Printing the model lists
-    its blocks.
+    :math:`\Delta` is diagonal. It contains every delta, a number between -1 and 1, one or more
+    times. Printing the model lists its blocks.
 
     Attributes
     ----------
@@ -39,8 +39,8 @@ class LFT(Design):
     C2, D21, D22 : ndarray (ny, nx), (ny, nw), (ny, nu)
         Matrices of the outputs y.
     parameters : tuple of str
-        Uncertain parameters in the order of the blocks. Tied parameters have their pattern as
-        name.
+        Uncertain parameters in the order of the blocks. Tied parameters are listed once, under
+        their pattern.
     repeats : ndarray (k,)
         Number of times that each delta is repeated in :math:`\Delta`.
     middle, half : ndarray (k,)
@@ -98,7 +98,7 @@ class LFT(Design):
 
     @property
     def dt(self) -> float:
-        """Sampling time: 0, the model is continuous."""
+        """Sampling time: 0, because the model is continuous."""
         return 0.0
 
     def deltas(self, values: Mapping[str, float]) -> Array:

@@ -73,9 +73,9 @@ class Sensitivity:
       also such a factor.
 
     Other parameters are ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
-    ``THRUSTER.direction.x`` (its part that rotates the unit vector) and ``WHEEL.inertia``. The
-    inertia of a carrier includes its wheels. A larger wheel inertia therefore reduces the inertia
-    of the rest of the carrier.
+    ``THRUSTER.direction.x`` (only rotation of the unit vector has an effect) and ``WHEEL.inertia``.
+    The inertia of a carrier includes its wheels. A larger wheel inertia therefore reduces the
+    inertia of the rest of the carrier.
 
     Attributes
     ----------
@@ -169,7 +169,7 @@ class Sensitivity:
         Returns
         -------
         poles, derivatives : ndarray
-            Derivatives are NaN for poles that coincide: such poles are not differentiable.
+            Derivatives of coincident poles are NaN, because such poles are not differentiable.
         """
         lin = self.lin
         K = np.zeros(lin.B.T.shape) if gain is None else getattr(gain, "K", gain)
@@ -224,8 +224,8 @@ class Sensitivity:
         top : int
             Number of rows.
         only : str, optional
-            Restriction to a kind, link or pattern: ``mass``, ``link_3``, ``*.density``. A body is
-            not listed beside its links.
+            Restriction to a kind, link or pattern: ``mass``, ``link_3``, ``*.density``. If the
+            links of a body are listed, the body is not.
         """
         shown = self.parameters.ranked(only)
         lin, sizes = self.lin, [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
@@ -253,7 +253,7 @@ class Sensitivity:
     def save(self, path: str | Path) -> None:
         """Write the derivatives to a .npz, .mat or .json file, atomically.
 
-        The file has the model's keys and these: parameters, units and values (P,),
+        In addition to the keys of the model, the file contains parameters, units and values (P,),
         dA (P, nx, nx), dB (P, nx, nu), dC, dD, df0 and dy0.
 
         Raises

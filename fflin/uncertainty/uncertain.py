@@ -90,8 +90,8 @@ class Uncertain:
         ------
         InputError
             If an output depends on accelerations or masses, or the point is not a fixed point for
-            all parameters. The latter happens with gravity, an orbit, stored momentum or a
-            deflected spring.
+            all parameters. The point can depend on the parameters if there is gravity, an orbit,
+            stored momentum or a deflected spring.
         """
         robot = self.robot
         lin = linearize(robot, q)
@@ -192,11 +192,11 @@ class Uncertain:
     def worst(
         self, gain: Any, q: Array | None = None, *, samples: int = 200, seed: int = 0
     ) -> Worst:
-        """Search for the worst closed loop u = -K x over the set, and bound the stable set.
+        """Search the set for the worst closed loop u = -K x, and bound the stable set.
 
-        No corner or draw that was tried is worse than the result; gains are exact to five digits.
-        A search with more samples and the same seed repeats the smaller search first, so its
-        result is at least as bad.
+        The result is at least as bad as every corner and draw that was tried; its gains are
+        accurate to five digits. With the same seed and more samples, the search first repeats the
+        smaller search, so its result is at least as bad as before.
 
         Parameters
         ----------

@@ -63,7 +63,8 @@ def visualize(
 
     - the robot in its colours, with triads at base and tool;
     - the trails of the tool and of the centre of mass;
-    - arrows of force and torque on the base, and plumes of thrusters, as long as u(t);
+    - arrows of force and torque on the base, and plumes of thrusters with lengths proportional to
+      u(t);
     - a translucent robot at the target, and another at the linear prediction, if there is one;
     - a time slider, and a panel with errors and inputs over time.
 
@@ -87,7 +88,7 @@ def visualize(
         Times [s] of the pictures, four by default. One time gives a picture with its panel, several
         give a strip.
     open : bool, optional
-        Whether to open a browser; by default only if no file is named.
+        Whether to open a browser; by default only if no file is given.
     scene : {"space", "lab"}, optional
         "space" shows sky and planet; "lab" shows a floor with a grid, the default under gravity. In
         orbit the planet is the central body, below and in its true size. Planet and stars rotate
@@ -99,19 +100,19 @@ def visualize(
         minute. A simulation that is shown live is slowed down to this speed.
     follow : bool, optional
         Whether the camera follows the base; by default only if the path is so long that the robot
-        would be a dot.
+        would appear as a dot.
     target : array_like (nq,), optional
         Configuration from which errors are measured; by default the motion's target. Without a
         target, the page shows the change from the start, and no translucent robot.
     tool : str, optional
         Frame whose trail is drawn; by default "tool", or the last link of the longest chain.
     cloud : Campaign, optional
-        Campaign from `monte_carlo`: the paths of base and tool in up to 240 runs, as thin lines.
-        The motion may be one of its runs, from `Campaign.replay`; it is shown with its drawn
-        bodies.
+        Campaign from `monte_carlo`: the paths of base and tool in up to 240 runs, as thin lines. If
+        the motion is one of its runs, from `Campaign.replay`, the robot is drawn with the dispersed
+        bodies of that run.
     funnel : Funnel, optional
         Funnel along the trajectory that the motion follows. A tube shows the positions of base and
-        tool inside it.
+        tool inside the funnel.
     q : array_like (nq,), optional
         Initial configuration of a live robot; by default its `start`, or neutral.
     port : int

@@ -114,7 +114,7 @@ def test_a_command_replaces_files_of_its_own_kind_alone(name, tmp_path, monkeypa
         foreign.write_text("somebody's own\n")
         with any_wording():
             code, _, error = run(*command, foreign)
-        assert code == 2 and "is no result of fflin" in error and "--force" in error
+        assert code == 2 and "is not a result of fflin" in error and "--force" in error
         assert error.count("\n") == 1 and foreign.read_text() == "somebody's own\n"
         assert run(*command, foreign, "--force")[0] == 0
     other = ("lqr", "cubesat", "-o") if name != "lqr" else ("linearize", "cubesat", "-o")

@@ -52,7 +52,7 @@ def test_refused(given, said):
         fflin.CircularOrbit(**given)
 
 
-METRES = r"an altitude of 400 m over earth: altitudes are in metres: write 400 km as 400e3"
+METRES = r"an altitude of 400 m over earth: altitudes are in metres; write 400 km as 400e3"
 
 
 @pytest.mark.parametrize(
