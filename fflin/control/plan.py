@@ -36,7 +36,7 @@ _BETWEEN, _PARTS = 0.01, 16
 # So many plans are made to that end. Limits are tightened at the knots beside if each tightening
 # leaves this share of what the last one left to exceed, and of the room between limits; if not,
 # the intervals are halved.
-_MOST_PLANS, _OF_LAST, _OF_ROOM = 16, 0.5, 0.5
+_MOST_PLANS, _OF_LAST, _OF_ROOM = 8, 0.5, 0.5
 
 # A plan that exceeds limits by more than this share of them is no start for the next one.
 _FAR = 0.5
@@ -88,7 +88,7 @@ def plan(
     Limits of joints and wheels are met at the knots; between knots, they may be exceeded by 1 %. If
     the integrated motion exceeds a limit between knots, the limit is tightened at the neighbouring
     knots and the plan is repeated. If that does not help, the intervals in question are halved. If
-    an excess of more than 1 % remains after 16 plans, a warning is issued. Printing the trajectory
+    an excess of more than 1 % remains after 8 plans, a warning is issued. Printing the trajectory
     shows the largest excess, its limit and its time.
 
     Parameters

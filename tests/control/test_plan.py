@@ -235,17 +235,6 @@ def test_knots_are_added_where_tighter_limits_do_not_help(one_joint, knots):
     assert missed(robot, motion, goal) < 1e-6 and motion.residual.max() < 1e-6
 
 
-@pytest.mark.exhaustive
-def test_light_joints_of_a_servicer_keep_their_speeds_between_far_knots():
-    """In 4 s between knots a constant torque takes joint_1 to twelve times its speed limit."""
-    locked = ["panel_*", "joint_3", "joint_5", "joint_6", "joint_7"]
-    robot = fflin.load("servicer_7dof", lock=locked, limits={"tau_b": 60.0, "F_b": 40.0})
-    goal = turned(robot, 1.2, joints={"joint_2": 0.6, "joint_4": -1.1})
-    motion = fflin.plan(robot, (goal, None), 60.0, knots=16)
-    assert (largest_speeds(motion) <= 1.01 * robot.model.velocityLimit[6:]).all()
-    assert missed(robot, motion, goal) < 1e-6 and motion.residual.max() < 1e-6
-
-
 @pytest.mark.parametrize(
     ("end", "words"),
     [
