@@ -290,7 +290,7 @@ def test_bad_input(arm):
         ({"samples": 0}, "samples"),
         ({"seed": 1.5}, r"1\.5"),
         ({"attitude": 180.0}, "175"),
-        ({"joint": -1.0}, "negative"),
+        ({"joint": -1.0}, "0 or more"),
         ({"confidence": 1.0}, "0 and 1"),
     ):
         with pytest.raises(fflin.InputError, match=words):
