@@ -81,7 +81,7 @@ class Mode(FrozenArrays):
 
     @property
     def damping_ratio(self) -> float:
-        """Damping ratio -Re(p)/|p|: 0 undamped, 1 for a real stable pole, negative unstable."""
+        """Damping ratio -Re(p)/abs(p): 0 undamped, 1 for a real stable pole, negative unstable."""
         return 0.0 if self.pole.real == 0.0 else -self.pole.real / abs(self.pole)
 
     @property

@@ -145,7 +145,7 @@ class Funnel(Design):
         return P
 
     def root(self, t: float, *, smooth: bool = False) -> Array:
-        """Return W (nx, r): the ellipsoid at time t is the set of all W z with |z| <= 1.
+        """Return W (nx, r): the ellipsoid at time t is the set of all W z with norm(z) <= 1.
 
         With `smooth`, the level is interpolated between knots, as figures show it.
         """

@@ -68,7 +68,9 @@ def test_init_warns_of_what_its_file_leaves_open_alone(tmp_path):
     assert says(done.stderr, "fflin: warning: own: ", "'hinge 1'")
     assert done.stderr.count("\n") == 1
     comments = [x for x in (tmp_path / "own.toml").read_text().splitlines() if x.startswith("#")]
-    assert max(map(len, comments)) <= 80 and "direction [1, 0, 0]" in "".join(comments)
+    assert max(map(len, comments)) <= 80 and "direction [1, 0, 0]" in " ".join(
+        x[2:] for x in comments
+    )
 
 
 def test_all_that_init_suggests_can_be_taken(tmp_path):

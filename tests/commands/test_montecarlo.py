@@ -119,6 +119,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.compiled
 @pytest.mark.process
 @pytest.mark.parametrize(("how", "ending"), [("INT", ".h5"), ("INT", ".npz"), ("KILL", ".npz")])
 def test_the_same_command_goes_on_after_ctrl_c_and_a_kill(folder, how, ending):
@@ -159,6 +160,7 @@ def test_ctrl_c_without_a_file_says_that_nothing_is_kept(folder):
     assert re.fullmatch(r"fflin: stopped .*\b90 .*", last)
 
 
+@pytest.mark.compiled
 @pytest.mark.process
 def test_a_killed_worker_costs_nothing(folder):
     pytest.importorskip("h5py")

@@ -256,7 +256,7 @@ def nothing(t, q, v):
 def test_what_cannot_be_compiled_says_why(robots):
     robot, options = robots["planar_detumble"], {"duration": 0.1, "engine": "compiled"}
     cases = (
-        ({"policy": nothing}, "a function decides in Python"),
+        ({"policy": nothing}, "Python"),
         ({"callback": print}, "callbacks"),
         ({"events": [lambda t, q, v: 1.0]}, "events"),
         ({"disturbance": lambda t, q, v: np.zeros(robot.nv)}, "disturbances"),
