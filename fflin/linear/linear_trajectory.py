@@ -108,7 +108,7 @@ class LinearTrajectory(Trajectory):
         return Linearizer(self.robot, moving=True)
 
     def matrices(self, t: float) -> tuple[Array, Array]:
-        """Return A (nx, nx) and B (nx, nu) at time t [s]; between knots, about the point of `point` there."""
+        """Return A (nx, nx) and B (nx, nu) at time t [s]; between knots, about that point."""
         t = self._within(t)
         k, share = placed(self.t, t)
         if self.dt or share in (0.0, 1.0):
