@@ -228,7 +228,7 @@ def modes(lin: LinearModel) -> Modes:
     Parameters
     ----------
     lin : LinearModel
-        Continuous-time model, full or reduced, also loaded from a file.
+        Continuous-time model, full or reduced. A model loaded from a file is also accepted.
 
     Returns
     -------

@@ -86,7 +86,7 @@ def sweep(
         Number of worker processes to start, at most one per core. A process that dies is replaced.
         With workers, call `sweep` under ``if __name__ == "__main__":``.
     threads : int, optional
-        Threads of the kernel in this process; by default all available cores.
+        Number of threads of the compiled code; by default one for each available core.
     chunk : int, optional
         Number of points in a chunk. By default the result of a chunk takes about 4 MB. A resumed
         sweep uses the chunk size of its unfinished file.

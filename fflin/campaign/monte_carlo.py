@@ -92,8 +92,9 @@ def monte_carlo(
         makes one draw for all of them. A name is one of
 
         - a state, ``q_b``, ``r_b.x``, ``q_m.*``, ``omega_b``: added to the initial state.
-        - ``BODY.mass`` and ``BODY.inertia``, relative, of ``base`` or the body of a joint, as in
-          `Robot.perturbed`. ``mass`` multiplies mass and inertia by 1 + d. ``inertia`` multiplies
+        - ``BODY.mass`` and ``BODY.inertia``: relative changes d from the nominal values, as in
+          `Robot.perturbed`. BODY is ``base`` or the name of the joint that carries the body.
+          ``mass`` multiplies mass and inertia by 1 + d. ``inertia`` multiplies
           each second moment per mass along the axes of the body's frame by 1 + d. The
           pseudo-inertia stays positive definite.
         - ``BODY.com`` [m]: shift of the centre of mass along each axis of the body's frame. Mass

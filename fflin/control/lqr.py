@@ -86,9 +86,9 @@ def lqr(
         cost, which is then sampled under zero-order hold.
     wheel_speeds : bool, optional
         Whether to regulate the wheel speeds to their values at the point. By default they are
-        regulated if inputs other than the wheels can do it. With True they are also regulated if
-        only opposite wheel torques can do it. With False they are never regulated. With the default
-        weights, wheel speeds converge at a tenth of the bandwidth.
+        regulated if inputs other than the wheels can change them. With True, combinations of wheel
+        speeds that exert no net torque on the base are regulated too. With False, no wheel speed
+        is regulated. With the default weights, wheel speeds converge at a tenth of the bandwidth.
 
     Returns
     -------

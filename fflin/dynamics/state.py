@@ -193,8 +193,8 @@ class StateMap:
         v : array_like (nv,)
             Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
         near : array_like (nx,), optional
-            State near which the angles of continuous joints are unwrapped: to each angle, the
-            multiple of 2 pi is added that brings it nearest to this state. By default angles are in
+            State near which the angles of continuous joints are unwrapped: each angle is shifted by
+            the multiple of 2 pi that brings it closest to its value in this state. By default angles are in
             (-pi, pi].
 
         Returns

@@ -38,8 +38,8 @@ class Certificate:
     inertia_residual : float
         Largest entry of M M^-1 - I, with M scaled as for `condition`.
     route_A, route_B : float
-        Largest difference from A and B computed by Pinocchio's ABA derivatives, relative to the
-        largest entry of the same block.
+        Largest difference between A and B of this model and A and B from Pinocchio's ABA
+        derivatives, relative to the largest entry of the same block.
     f0 : float
         Largest entry of the state derivative at the point; 0 at a fixed point.
 

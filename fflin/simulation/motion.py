@@ -241,7 +241,7 @@ class Motion(Design):
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion as a trajectory whose inputs are held or interpolated linearly.
 
-        The better fit to the dynamics decides whether inputs are held or interpolated. If inputs
+        Inputs are held or interpolated between rows, whichever fits the dynamics better. If inputs
         change continuously, the input at the last row is extrapolated, because it is not recorded.
         A motion that was read from a file needs the `robot`.
         """
