@@ -56,8 +56,8 @@ def add_weights(command: Container) -> None:
         --reduce: if momentum is conserved, regulate only the states that the inputs can control
         --[no-]wheel-speeds: whether to return the speeds of reaction wheels to their values at the
             operating point. By default, they are returned if thrusters or a base torque can absorb
-            the wheel torque. --wheel-speeds also returns the combinations of wheel speeds that exert
-            no net torque on the robot (redundant wheels)""",
+            the wheel torque. --wheel-speeds also returns the combinations of wheel speeds that
+            exert no net torque on the robot (redundant wheels)""",
     )
 
 

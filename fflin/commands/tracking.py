@@ -39,7 +39,8 @@ def add_commands(commands: Commands) -> None:
     add_weights(tvlqr)
     add_options(
         tvlqr,
-        "--qf NAME=VALUE*: weight on the final error; by default the solution of the algebraic Riccati equation at the end",
+        "--qf NAME=VALUE*: weight on the final error; by default the solution of the algebraic "
+        "Riccati equation at the end",
     )
     add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json", "GainSchedule")
 

@@ -194,8 +194,8 @@ class StateMap:
             Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
         near : array_like (nx,), optional
             State near which the angles of continuous joints are unwrapped: each angle is shifted by
-            the multiple of 2 pi that brings it closest to its value in this state. By default angles are in
-            (-pi, pi].
+            the multiple of 2 pi that brings it closest to its value in this state. By default
+            angles are in (-pi, pi].
 
         Returns
         -------

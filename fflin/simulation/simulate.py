@@ -143,9 +143,9 @@ def simulate(
         Whether to show a progress bar on stderr; by default on a terminal, for long runs.
     engine : {"python", "compiled"}, optional
         Engine that runs the loop. The default is Python, except that a run of more than 20,000
-        steps uses the compiled engine if it has already been compiled. The compiled engine needs numba, no
-        orbit, and no policy, event, callback or disturbance in Python. Both engines agree to
-        machine precision.
+        steps uses the compiled engine if it has already been compiled. The compiled engine needs
+        numba, no orbit, and no policy, event, callback or disturbance in Python. Both engines
+        agree to machine precision.
 
     Returns
     -------
