@@ -42,10 +42,10 @@ class RelativeEquilibrium(FrozenArrays):
     poles : ndarray (6,)
         Poles [rad/s] of the attitude with fixed joints: pitch, then roll and yaw.
     stable : bool or None
-        Whether no pole has a positive real part; None if rounding decides.
+        Whether no pole has a positive real part; None if rounding error leaves this undecided.
     margin : float
-        Smallest of the stability conditions relative to its rounding error: unstable below -1,
-        stable above 1.
+        Value of the smallest stability condition, divided by its rounding error. The equilibrium is
+        unstable if this is below -1, and stable if it is above 1.
 
     Examples
     --------

@@ -39,7 +39,8 @@ class Grid:
     axes : mapping
         {joint: values (k,) [rad|m]}.
     start : ndarray (nq,)
-        Configuration that fixes the base and the joints that the grid does not vary.
+        Configuration with the base pose, and with the values of the joints that the grid does not
+        vary.
 
     Examples
     --------
@@ -72,7 +73,7 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class RandomConfigurations:
-    """Random configurations, uniform in ranges of the joints; see `random_configurations`.
+    """Random configurations, uniform within joint ranges; see `random_configurations`.
 
     Attributes
     ----------
@@ -82,7 +83,7 @@ class RandomConfigurations:
     ranges : mapping
         {joint: (low, high) [rad|m]}.
     start : ndarray (nq,)
-        Configuration that fixes the base.
+        Configuration with the base pose.
 
     Examples
     --------
@@ -202,7 +203,7 @@ def random_configurations(
     ranges: Mapping[str, tuple[float, float]] | None = None,
     base: pin.SE3 | None = None,
 ) -> RandomConfigurations:
-    """Return random configurations, uniform within the joint limits, for `sweep`.
+    """Return random configurations, uniformly distributed within joint limits, for `sweep`.
 
     Parameters
     ----------
