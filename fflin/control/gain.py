@@ -39,7 +39,7 @@ class Gain(Design):
     K : ndarray (nu, nx)
         Gain.
     P : ndarray (nx, nx)
-        Cost matrix: the optimal cost from x on is ``(x - x0)' P (x - x0)``.
+        Cost matrix: the optimal cost of the motion from state x is ``(x - x0)' P (x - x0)``.
     poles : ndarray (nz,) of complex
         Eigenvalues of ``A - B K`` over the regulated states: [1/s] for a continuous model,
         discrete-time poles z for a sampled one.
@@ -63,7 +63,8 @@ class Gain(Design):
     weights : str
         Description of the rule that made the weights.
     regulated : tuple of str (nz,)
-        States that are fed back; if empty, all are. K, P, Q and N are zero for the other states.
+        States that are fed back; if empty, all states are fed back. K, P, Q and N are zero for the
+        other states.
 
     Examples
     --------

@@ -74,7 +74,7 @@ class Motion(Design):
         terms of the energy.
     com_drift : ndarray (N,)
         Distance [m] of the centre of mass from the position predicted by its initial velocity and
-        the impulse since. No rows in orbit, or if the file lacks it.
+        the impulse since. Empty in orbit, or if the file lacks it.
     state_names, input_names, state_units, input_units : tuple of str
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
     robot, urdf_sha256 : str

@@ -190,7 +190,7 @@ class Sensitivity:
     def check(self, names: Sequence[str] | None = None) -> dict[str, float]:
         """Compare the derivatives of A and B with finite differences.
 
-        The parameter is changed in small steps. At each step, A and B are computed independently,
+        Each parameter is changed in small steps. At each step, A and B are computed independently,
         from the derivatives of ABA.
 
         Parameters

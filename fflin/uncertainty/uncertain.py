@@ -257,7 +257,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
         - the robot at the middle of the ranges is not physically realisable;
         - a mass, density or wheel inertia may become 0 or less;
         - a stiffness or damping may become negative;
-        - a tied parameter has another range too.
+        - a tied parameter is given a second range.
 
     References
     ----------
