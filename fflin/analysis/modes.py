@@ -156,7 +156,7 @@ class Modes:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on missing data, and on modes whose stability is within rounding error."""
+        """Remarks on missing data, and on modes whose stability is undecided due to rounding."""
         undecided = tuple(
             f"undecided: whether the mode at {mode.frequency:.4g} rad/s grows or decays; its real "
             f"part is {mode.margin:.1g} times its rounding error"
@@ -223,7 +223,7 @@ def modes(lin: LinearModel) -> Modes:
     over the coordinates E on which the stiffness K acts. M* is a Schur complement of M: the
     effective inertia of the coordinates E if all other coordinates are free to move. In all other
     cases the modes are the eigenvectors of A. The zero eigenvalues form Jordan blocks of size two
-    or more. They are separated exactly before the other eigenvalues are computed.
+    or more. They are separated exactly from the other eigenvalues.
 
     Parameters
     ----------

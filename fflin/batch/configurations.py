@@ -63,7 +63,7 @@ class Grid:
         return math.prod(self.shape)
 
     def rows(self, start: int, stop: int) -> Array:
-        """Return the configurations (stop - start, nq)."""
+        """Return configurations start to stop - 1 as rows of an array (stop - start, nq)."""
         picks = np.unravel_index(np.arange(start, stop), self.shape)
         values = {
             name: axis[pick] for (name, axis), pick in zip(self.axes.items(), picks, strict=True)
@@ -103,7 +103,7 @@ class RandomConfigurations:
         return self.count
 
     def rows(self, start: int, stop: int) -> Array:
-        """Return the configurations (stop - start, nq)."""
+        """Return configurations start to stop - 1 as rows of an array (stop - start, nq)."""
         low, high = np.array(list(self.ranges.values())).reshape(-1, 2).T
         first = start // _DRAWN
         blocks = [np.empty((0, len(low)))] + [
@@ -125,7 +125,7 @@ class GivenConfigurations:
         return len(self.q)
 
     def rows(self, start: int, stop: int) -> Array:
-        """Return the configurations (stop - start, nq)."""
+        """Return configurations start to stop - 1 as rows of an array (stop - start, nq)."""
         return self.q[start:stop]
 
 

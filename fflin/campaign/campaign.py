@@ -216,8 +216,8 @@ class Campaign(FrozenArrays):
     def quantile(self, name: str, p: float, *, confidence: float = 0.95) -> Estimate:
         """Return the p-quantile of a figure over the runs, with its confidence interval.
 
-        The interval is computed from order statistics and is valid for any distribution. Final
-        states and inputs have a sign; their quantiles include only the completed runs.
+        The interval is computed from order statistics and is valid for any distribution. Quantiles
+        of final states and inputs, which have a sign, include only the completed runs.
         """
         values = self.values(name)
         if name in (*self.state_names, *self.input_names):

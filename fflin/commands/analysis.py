@@ -78,7 +78,11 @@ def add_commands(commands: Commands) -> None:
     add_options(
         sensitivity, "--top N = 15: show the N parameters with the largest effect; 15 by default"
     )
-    add_options(sensitivity, "--only NAME: show one kind, link or pattern, such as mass")
+    add_options(
+        sensitivity,
+        "--only NAME: show only the parameters of this kind, link or pattern, such as mass, "
+        "link_3, *.density",
+    )
     add_output_file(
         sensitivity,
         "save dA, dB, df0 for each parameter to FILE: .npz, .mat or .json",

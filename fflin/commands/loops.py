@@ -90,7 +90,7 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
         --controller FILE: use a linear controller K with positive feedback, u - u0 = K (y - y0)
             about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled.
             y is set by --output
-        --negative-feedback: apply --controller with negative feedback, u - u0 = -K (y - y0)
+        --negative-feedback: the controller assumes negative feedback, u - u0 = -K (y - y0)
         --[no-]allocate: design with torque and force on the base, and allocate the nearest wrench
             to the thrusters, which cannot pull. This is the default if the thrusters can push in
             every direction. With --no-allocate, negative thrust is set to zero

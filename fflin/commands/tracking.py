@@ -40,7 +40,7 @@ def add_commands(commands: Commands) -> None:
     add_options(
         tvlqr,
         "--qf NAME=VALUE*: weight on the final error; by default the solution of the algebraic "
-        "Riccati equation at the last configuration",
+        "Riccati equation about the last configuration",
     )
     add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json", "GainSchedule")
 

@@ -51,7 +51,8 @@ class Gain(Design):
     method : str
         Solver: "structured" (half-size), "general" (SciPy) or "closed form".
     A, B, Q, R, N : ndarray
-        The model and the weights on deviations; N is zero if no cross weight was given.
+        Matrices of the model, and weights on the deviations x - x0 and u - u0. N is zero if no
+        cross weight was given.
     x0 : ndarray (nx,)
     u0 : ndarray (nu,)
         State and inputs at the point.

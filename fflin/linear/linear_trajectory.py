@@ -118,7 +118,7 @@ class LinearTrajectory(Trajectory):
         return lin.A, lin.B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
-        """Evaluate arrays given at the knots, interpolated linearly or held, at one time."""
+        """Evaluate arrays at one time: interpolated between knots, or held since the last knot."""
         k, share = placed(self.t, self._within(t))
         if self.dt or not share:
             return tuple(each[k] for each in arrays)

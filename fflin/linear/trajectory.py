@@ -51,7 +51,7 @@ class Trajectory(Design):
     v : array_like (N, nv)
         Velocities in Pinocchio's order.
     u : array_like (N, nu) or (N - 1, nu)
-        Inputs at the knots; with N - 1 rows, each row acts over one interval.
+        Inputs at the knots. If there are N - 1 rows, each row acts over one interval between knots.
     hold : {"linear", "previous"}, optional
         Inputs between the knots: "linear" interpolates, "previous" holds the value of the previous
         knot, like a digital controller. The default is "linear", or "previous" if u has N - 1

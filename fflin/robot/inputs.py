@@ -169,8 +169,8 @@ class Thruster(WrenchInput):
         of each sample into one pulse of `max`, a whole number of steps long. The remaining
         impulse is carried over to the next sample, so that the mean impulse is correct.
     least_impulse : float, optional
-        Smallest impulse of a sample [N s]. Below it the thruster does not fire, and the impulse
-        is carried over to the next sample.
+        Smallest impulse of a sample [N s]. If the commanded impulse is smaller, the thruster does
+        not fire, and this impulse is carried over to the next sample.
 
     Examples
     --------
