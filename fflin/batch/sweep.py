@@ -60,11 +60,11 @@ def sweep(
 ) -> LinearBatch:
     r"""Linearise a robot about many points.
 
-    With numba installed (``pip install 'fflin[fast]'``), a compiled kernel processes eight points
-    at a time, on all threads. At rest M depends on the joints only, and :math:`B = [0;\, M^{-1}]`.
-    The kernel also supports operating points in motion. Without numba, or if the robot has outputs
-    other than its state, a `Linearizer` processes the points one by one. These points can be
-    distributed over worker processes.
+    If numba is installed (``pip install 'fflin[fast]'``), a compiled kernel processes groups of
+    eight points on all threads. At rest M depends only on the joint positions, and
+    :math:`B = [0;\, M^{-1}]`. The kernel also supports operating points in motion. Without numba,
+    or if the robot has outputs other than its state, a `Linearizer` processes the points one by
+    one. These points can be distributed over worker processes.
 
     Parameters
     ----------

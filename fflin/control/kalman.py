@@ -185,7 +185,7 @@ def kalman(
 
     or its discrete-time counterpart. SciPy's solver and Newton's method solve the equation, see
     `lqr`. For a model with reaction wheels, the filter estimates only the states that `lqr`
-    regulates. It uses only the outputs that depend on these states alone.
+    regulates. It uses only outputs that depend on no other states.
 
     Parameters
     ----------

@@ -113,9 +113,9 @@ def equilibrium(
     q : array_like (nq,), optional
         Configuration in Pinocchio's order; neutral by default.
     v : array_like (nv,), optional
-        Velocity of a steady motion, which is constant in base axes; at rest by default. Only joints
-        that are rotors may move, see `LinearModel.ignorable`. Under gravity, the base may rotate
-        only about the vertical.
+        Velocity of a steady motion, which is constant in base axes; at rest by default. No joints
+        except rotors may move, see `LinearModel.ignorable`. Under gravity, the base may rotate only
+        about the vertical.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the inputs on the base, as in `linearize`.
     reference : pin.SE3, optional

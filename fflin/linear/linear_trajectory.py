@@ -196,7 +196,7 @@ def linearize_trajectory(
     Raises
     ------
     InputError
-        If the arrays are not valid for `Trajectory`. With `strict`, also if the residual of the
+        If the arrays are not valid for `Trajectory`. If `strict` is true and the residual of the
         motion exceeds 1e-2.
 
     Warns

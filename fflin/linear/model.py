@@ -271,9 +271,9 @@ class LinearModel(FrozenArrays):
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
         """Return whether the point is a fixed point or a relative equilibrium.
 
-        At a relative equilibrium only ignorable coordinates move, at constant rates: a rotor spins,
-        or the base moves at constant velocity. In both cases A and B are constant in time. With
-        ``moving=True`` the motion of the reference is tested instead of f0:
+        At a relative equilibrium, ignorable coordinates move at constant rates and all others are
+        at rest: a rotor spins, or the base moves at constant velocity. In both cases A and B are
+        constant in time. With ``moving=True`` the motion of the reference is tested instead of f0:
 
         - its velocities in base axes must be constant;
         - no joint except rotors may move;

@@ -128,7 +128,7 @@ def simulate(
         Model that predicts the motion under the same control law; by default the policy's own
         model, False for no prediction. A motion can be predicted for a StateFeedback, a feedback
         along a trajectory, an OutputFeedback or LinearController (without its noise), or no policy.
-        A sampled law is predicted only if every row falls on a sample.
+        For a sampled law, every recorded row must fall on a sample.
     target : LinearModel or array_like (nx,), optional
         Target state from which errors are measured, or a model whose operating point is the
         target. By default the operating point of the policy's own model, or the followed

@@ -78,9 +78,9 @@ def visualize(
     robot : Robot
         Robot to show.
     motion : Motion or Modes, optional
-        Motion from `simulate`; or modes from `modes`, which the page animates one at a time, listed
-        by name and frequency. Without a motion or modes, a live page shows the robot with a slider
-        for each joint.
+        Motion from `simulate`, or modes from `modes`. The page lists modes by name and frequency,
+        and animates one of them. Without a motion or modes, a live page shows the robot with a
+        slider for each joint.
     html : path, optional
         File to write; a temporary one by default.
     png, gif : path, optional
@@ -89,7 +89,7 @@ def visualize(
         Times [s] of the pictures, four by default. One time gives a picture with its panel, several
         give a strip.
     open : bool, optional
-        Whether to open a browser; by default only if no file is given.
+        Whether to open a browser. By default a browser is opened if no file is given.
     scene : {"space", "lab"}, optional
         "space" shows sky and planet; "lab" shows a floor with a grid, the default under gravity. In
         orbit the planet is the central body, below and in its true size. Planet and stars rotate
@@ -100,8 +100,8 @@ def visualize(
         Seconds of motion per second of playback; by default 1, or more for motions longer than a
         minute. A simulation that is shown live is slowed down to this speed.
     follow : bool, optional
-        Whether the camera follows the base; by default only if the path is so long that the robot
-        would appear as a dot.
+        Whether the camera follows the base; by default it does if the path is so long that the
+        robot would appear as a dot.
     target : array_like (nq,), optional
         Configuration from which errors are measured; by default the motion's target. Without a
         target, the page shows the change from the start, and it shows no translucent robot.
