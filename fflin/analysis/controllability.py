@@ -38,12 +38,13 @@ class Controllability(FrozenArrays):
     dimension : int
         Dimension of the controllable subspace.
     controllable : tuple of str
-        ``dimension`` states that the inputs can set independently. The other states then follow
-        from `basis`.
+        Names of ``dimension`` states that the inputs can set independently. In the controllable
+        subspace, their values determine all other states through `basis`.
     uncontrollable : tuple of str
         Names of the uncontrollable combinations of states.
     rows : ndarray (nx - dimension, nx)
-        Coefficients of these combinations: the controllable subspace is ``rows @ x = 0``.
+        Coefficients of the uncontrollable combinations. The controllable subspace is the set of all
+        x with ``rows @ x = 0``.
     basis : ndarray (nx, dimension)
         Basis of the controllable subspace. Column i changes ``controllable[i]`` by 1, and no other
         state in `controllable`.
@@ -53,8 +54,8 @@ class Controllability(FrozenArrays):
     stabilizable : bool
         Whether all fixed poles are stable.
     reach : dict
-        Number of directions of "base attitude", "base position" and "joints" that the inputs can
-        set, if the other states are free to follow.
+        {"base attitude", "base position", "joints": number of independent directions}. The inputs
+        can set these directions if all other states may take any value.
     method : str
         Method that determined the dimension: "closed form", "modes" or "eigenvalues".
     margin : Margin
@@ -62,7 +63,7 @@ class Controllability(FrozenArrays):
         largest counted as zero, each divided by its tolerance. If they are far above and far below
         1, the decision is clear.
     notes : tuple of str
-        Remarks on the result, such as undecided ranks.
+        Remarks on the result, such as ranks that rounding error leaves undecided.
 
     Examples
     --------
@@ -123,7 +124,8 @@ def controllability(lin: LinearModel) -> Controllability:
     Parameters
     ----------
     lin : LinearModel
-        Linear model: continuous or sampled, full or reduced, also loaded from a file.
+        Linear model: continuous or sampled, full or reduced. A model loaded from a file is also
+        accepted.
 
     Returns
     -------
@@ -137,9 +139,10 @@ def controllability(lin: LinearModel) -> Controllability:
 
     Notes
     -----
-    Inputs are assumed to act in both directions, also thrusters, which can only push. At a nonzero
-    angular velocity the result holds for the frozen model and certifies nothing about the motion.
-    At nonzero velocity, poles slower than about 1e-8 times the fastest pole count as zero.
+    All inputs are assumed to act in both directions. This includes thrusters, although they can
+    only push. At a nonzero angular velocity the result applies to the model with A and B frozen at
+    the point. It does not prove that the motion is controllable. At nonzero velocity, poles with a
+    modulus below about 1e-8 times the largest modulus are treated as zero.
 
     References
     ----------

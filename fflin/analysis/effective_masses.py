@@ -27,8 +27,8 @@ _ROUNDING = 1e-14
 class EffectiveMasses(FrozenArrays):
     """Effective masses of the vibration modes with the base clamped; prints as a table.
 
-    All quantities are about the origin of the base frame and in its axes, translation before
-    rotation.
+    All quantities refer to the origin of the base frame and are expressed in its axes. Entries for
+    translation come before entries for rotation.
 
     Attributes
     ----------
@@ -103,18 +103,18 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
         K \phi_i = \omega_i^2 \tilde M_{mm} \phi_i, \qquad \phi_i^T \tilde M_{mm} \phi_i = 1,
         \qquad L_i = \tilde M_{bm} \phi_i.
 
-    If the base is shaken along axis d, mode i reacts like a mass on a spring: its effective mass
-    :math:`L_{di}^2` [kg]. If the base is shaken about d, this is its effective inertia [kg m^2].
-    The sum over all modes, the part of the free joints and the residual is the inertia of the rigid
-    robot,
+    If the base is accelerated along axis d, mode i exerts the same force on it as a mass
+    :math:`L_{di}^2` [kg] on a spring, the effective mass. For rotation about d, :math:`L_{di}^2` is
+    the effective moment of inertia [kg m^2]. The contributions of all modes, of the joints without
+    springs (free) and of the residual add up to the inertia of the rigid robot,
 
     .. math::
         \textstyle\sum_i L_i L_i^T + M_{free} + M_{res} = M_{bb}, \qquad
         M_{res} = M_{bb} - M_{bm} M_{mm}^{-1} M_{mb}.
 
-    The floating robot has higher frequencies, which `modes` lists. If several modes have the same
-    frequency, only the sum of their masses is unique; the first of them is given the largest
-    possible mass.
+    With a free base, the natural frequencies are higher; `modes` lists them. If several modes have
+    the same frequency, only the sum of their masses is unique; the first of them is given the
+    largest possible mass.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     Raises
     ------
     InputError
-        If the model is reduced or was loaded from a file, and so lacks the robot's springs.
+        If the model is reduced or was loaded from a file. Such a model lacks the robot's springs.
     ModelError
         If the robot's model was changed after the linear model was made.
 

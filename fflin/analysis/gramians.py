@@ -25,7 +25,7 @@ class Gramians(FrozenArrays):
     observability : ndarray (nx, nx)
         Gramian W_o; the output energy of the free response from x is ``x^T W_o x``.
     duration : float
-        Horizon [s]; infinite if none was given, for an asymptotically stable model.
+        Horizon [s]; infinite if `duration` was omitted.
 
     Examples
     --------
@@ -47,17 +47,19 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
         W_c = \int_0^T e^{A t} B B^T e^{A^T t}\,dt, \quad
         W_o = \int_0^T e^{A^T t} C^T C e^{A t}\,dt,
 
-    or, for a sampled model, the sums over its samples. Over infinite time they solve Lyapunov
-    equations. Over a horizon T, they are polynomials in T at rest, where :math:`A^2 = 0`. Otherwise
-    they are built by doubling a short step, :math:`W(2 t) = W(t) + e^{A t} W(t) e^{A^T t}`.
+    or, for a sampled model, the sums over its samples. For an infinite horizon, the Gramians solve
+    Lyapunov equations. For a finite horizon T, they are polynomials in T if :math:`A^2 = 0`, as at
+    rest without springs. Otherwise they are computed for a short horizon, which is then doubled
+    repeatedly, :math:`W(2 t) = W(t) + e^{A t} W(t) e^{A^T t}`.
 
     Parameters
     ----------
     lin : LinearModel
         Continuous or sampled model.
     duration : float, optional
-        Horizon T [s]; a multiple of dt for a sampled model. The default is infinite time, for which
-        the model must be asymptotically stable. A model with a free base never is.
+        Horizon T [s]; a multiple of dt for a sampled model. By default the horizon is infinite, and
+        the model must be asymptotically stable. A model with a free base is never asymptotically
+        stable.
 
     Returns
     -------

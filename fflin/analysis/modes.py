@@ -48,9 +48,9 @@ class Mode(FrozenArrays):
     .. math::
         e_i = \frac{V_i^H I_i V_i}{\sum_k V_k^H I_k V_k}.
 
-    The twists are relative to the reference frame. If the robot floats freely from rest, a mode
-    has no momentum, and the fractions do not depend on which link is the base. A product
-    :math:`\phi_i (M \phi)_i` of one coordinate can be negative; :math:`e_i` cannot.
+    The twists are relative to the reference frame. If the robot floats freely from rest, a mode has
+    no momentum, and the fractions do not depend on which link is the base. The fraction :math:`e_i`
+    is never negative, unlike the product :math:`\phi_i (M \phi)_i` for one coordinate.
 
     Examples
     --------
@@ -156,7 +156,7 @@ class Modes:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on missing data, and on modes whose stability rounding error leaves undecided."""
+        """Remarks on missing data, and on modes whose stability is undecided due to rounding."""
         undecided = tuple(
             f"undecided: whether the mode at {mode.frequency:.4g} rad/s grows or decays; its real "
             f"part is {mode.margin:.1g} times its rounding error"
@@ -220,10 +220,10 @@ def modes(lin: LinearModel) -> Modes:
     .. math::
         K \phi = \omega^2 M^* \phi, \qquad M^* = ((M^{-1})_{EE})^{-1},
 
-    over the coordinates E on which the stiffness K acts. M* is the Schur complement of M: the
-    effective inertia while all other coordinates float. In all other cases the modes are the
-    eigenvectors of A. The zero eigenvalues, in Jordan blocks of two and more, are split off
-    exactly.
+    over the coordinates E on which the stiffness K acts. M* is a Schur complement of M: the
+    effective inertia of the coordinates E if all other coordinates are free to move. In all other
+    cases the modes are the eigenvectors of A. The zero eigenvalues form Jordan blocks of size two
+    or more. They are separated exactly from the other eigenvalues.
 
     Parameters
     ----------

@@ -37,7 +37,8 @@ class ReducedModel(LinearModel):
     T : ndarray (nx, nz)
         Map from the reduced state to the full state.
     S : ndarray (nz, nx)
-        Map from the full state to the reduced state; it selects the states of the same names.
+        Map from the full state to the reduced state; it selects the states that have the same
+        names.
     momenta : ndarray (k, nx)
         Rows L1 of the conserved momenta, which are zero in the reduced model.
     coordinates : ndarray (k, nx)
@@ -45,7 +46,7 @@ class ReducedModel(LinearModel):
     margin : Margin
         Certainty of the rank decision on the conserved momenta, as in `Controllability`.
     notes : tuple of str
-        Undecided ranks.
+        Ranks that rounding error leaves undecided.
 
     Examples
     --------
@@ -79,9 +80,9 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
     These are equations (9.2) and (9.3) of docs/derivation.md.
 
-    If attitude or position is actuated too, its states are kept. Without springs the result is
-    minimal; with springs it may contain vibrations that no input drives. Its transfer function from
-    inputs to joint states equals the full model's.
+    If inputs act on the attitude or on the position of the base, the states of this coordinate are
+    kept. Without springs the result is minimal; with springs it may contain vibrations that no
+    input drives. Its transfer function from inputs to joint states equals the full model's.
 
     Reaction wheels are removed as well, whatever their momentum (9.4), while the attitude that they
     control is kept. Three kinds of wheels are kept with their angles:
@@ -96,7 +97,7 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
         Model about rest, continuous or sampled.
     wheel_speeds : bool, optional
         Whether to keep wheels whose speeds the inputs can control. By default they are kept if
-        inputs other than wheels turn the base.
+        inputs other than the wheels can rotate the base.
 
     Returns
     -------

@@ -29,7 +29,8 @@ class Observability(FrozenArrays):
     basis : ndarray (nx, nx - dimension)
         Unobservable motions, one column each.
     rows : ndarray (dimension, nx)
-        Observable combinations of states: the unobservable subspace is ``rows @ x = 0``.
+        Observable combinations of states. The unobservable subspace is the set of all x with
+        ``rows @ x = 0``.
     fixed_poles : ndarray (nx - dimension,)
         Poles of the estimation error that no observer can move: [1/s] for a continuous model,
         discrete-time poles z for a sampled one.
@@ -40,7 +41,7 @@ class Observability(FrozenArrays):
     margin : Margin
         Certainty of the rank decisions, as in `Controllability`.
     notes : tuple of str
-        Undecided ranks.
+        Ranks that rounding error leaves undecided.
 
     Examples
     --------
@@ -83,7 +84,8 @@ def observability(lin: LinearModel) -> Observability:
     Parameters
     ----------
     lin : LinearModel
-        Linear model: continuous or sampled, full or reduced, also loaded from a file.
+        Linear model: continuous or sampled, full or reduced. A model loaded from a file is also
+        accepted.
 
     Returns
     -------

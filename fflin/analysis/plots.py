@@ -28,7 +28,7 @@ _LEAST = 0.005
 
 
 def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
-    """Draw which entries of A and B exceed rounding error, and their magnitudes, by state groups.
+    """Draw the magnitudes of all entries of A and B that exceed rounding error, by state groups.
 
     Parameters
     ----------

@@ -42,10 +42,10 @@ class RelativeEquilibrium(FrozenArrays):
     poles : ndarray (6,)
         Poles [rad/s] of the attitude with fixed joints: pitch, then roll and yaw.
     stable : bool or None
-        Whether no pole has a positive real part; None if rounding decides.
+        Whether no pole has a positive real part; None if rounding error leaves this undecided.
     margin : float
-        Smallest of the stability conditions relative to its rounding error: unstable below -1,
-        stable above 1.
+        Value of the smallest stability condition, divided by its rounding error. The equilibrium is
+        unstable if this is below -1, and stable if it is above 1.
 
     Examples
     --------
@@ -92,16 +92,16 @@ def relative_equilibria(
     r"""List the attitudes in which a robot with fixed joints stays at rest in its orbital frame.
 
     In these attitudes the principal axes of inertia are parallel to the axes of the frame, which is
-    possible in 24 ways. With the moments :math:`I_r, I_a, I_n` about the radial axis, the
-    along-track axis and the orbit normal,
+    possible in 24 ways. Let :math:`I_r, I_a, I_n` be the moments of inertia about the radial axis,
+    the along-track axis and the orbit normal. The poles of pitch solve the first of these equations
+    (14.8) of docs/derivation.md, and the poles of roll and yaw the second:
 
     .. math::
         \lambda^2 = -3 n^2 (I_a - I_r)/I_n, \qquad
         \lambda^4 + (1 + 3 k_a + k_a k_r)\,n^2 \lambda^2 + 4 k_a k_r\,n^4 = 0, \qquad
-        k_a = (I_n - I_r)/I_a, \quad k_r = (I_n - I_a)/I_r,
+        k_a = (I_n - I_r)/I_a, \quad k_r = (I_n - I_a)/I_r.
 
-    give the poles of pitch, and of roll and yaw, (14.8) of docs/derivation.md. If all poles are
-    imaginary and simple, the body librates.
+    If all poles are imaginary and simple, the body librates.
 
     Parameters
     ----------

@@ -133,7 +133,7 @@ class ChartError(FflinError, ValueError):
 
 
 class EquilibriumError(FflinError, ValueError):
-    """Error for a point that must be a fixed point and is not, or that no inputs can hold.
+    """Error for a point that no inputs can hold, or that is not a fixed point as required.
 
     Examples
     --------

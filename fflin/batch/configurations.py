@@ -39,7 +39,8 @@ class Grid:
     axes : mapping
         {joint: values (k,) [rad|m]}.
     start : ndarray (nq,)
-        Configuration that fixes the base and the joints that the grid does not vary.
+        Configuration with the base pose, and with the values of the joints that the grid does not
+        vary.
 
     Examples
     --------
@@ -62,7 +63,7 @@ class Grid:
         return math.prod(self.shape)
 
     def rows(self, start: int, stop: int) -> Array:
-        """Return the configurations (stop - start, nq)."""
+        """Return configurations start to stop - 1 as rows of an array (stop - start, nq)."""
         picks = np.unravel_index(np.arange(start, stop), self.shape)
         values = {
             name: axis[pick] for (name, axis), pick in zip(self.axes.items(), picks, strict=True)
@@ -72,7 +73,7 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class RandomConfigurations:
-    """Random configurations, uniform in ranges of the joints; see `random_configurations`.
+    """Random configurations, uniform within joint ranges; see `random_configurations`.
 
     Attributes
     ----------
@@ -82,7 +83,7 @@ class RandomConfigurations:
     ranges : mapping
         {joint: (low, high) [rad|m]}.
     start : ndarray (nq,)
-        Configuration that fixes the base.
+        Configuration with the base pose.
 
     Examples
     --------
@@ -102,7 +103,7 @@ class RandomConfigurations:
         return self.count
 
     def rows(self, start: int, stop: int) -> Array:
-        """Return the configurations (stop - start, nq)."""
+        """Return configurations start to stop - 1 as rows of an array (stop - start, nq)."""
         low, high = np.array(list(self.ranges.values())).reshape(-1, 2).T
         first = start // _DRAWN
         blocks = [np.empty((0, len(low)))] + [
@@ -124,7 +125,7 @@ class GivenConfigurations:
         return len(self.q)
 
     def rows(self, start: int, stop: int) -> Array:
-        """Return the configurations (stop - start, nq)."""
+        """Return configurations start to stop - 1 as rows of an array (stop - start, nq)."""
         return self.q[start:stop]
 
 
@@ -202,7 +203,7 @@ def random_configurations(
     ranges: Mapping[str, tuple[float, float]] | None = None,
     base: pin.SE3 | None = None,
 ) -> RandomConfigurations:
-    """Return random configurations, uniform within the joint limits, for `sweep`.
+    """Return random configurations, uniformly distributed within joint limits, for `sweep`.
 
     Parameters
     ----------

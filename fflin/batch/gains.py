@@ -241,8 +241,8 @@ class ScheduledFeedback:
     lin : LinearModel
         Model about the target.
     gains : GainBatch
-        Gains on a grid of the same robot. If the robot has captured or released an object since,
-        `line_up` matches states and inputs.
+        Gains of the same robot, on a grid of its joint positions. If the robot has captured or
+        released an object since the gains were designed, `line_up` matches states and inputs.
 
     Raises
     ------

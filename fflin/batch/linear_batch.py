@@ -59,7 +59,7 @@ class LinearBatch(FrozenArrays):
     robot : str
         Name of the robot.
     urdf_sha256, fflin_version, pinocchio_version : str
-        SHA-256 of the URDF, and the versions that made the batch.
+        SHA-256 of the URDF, and versions of the packages that made the batch.
     locked : tuple of str
         Names of the locked joints.
     columns : tuple of (int, int)
@@ -208,7 +208,7 @@ class LinearBatch(FrozenArrays):
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
-        """Return the models whose named joints have given values or lie in ranges [rad|m].
+        """Return the models in which named joints have given values or lie in given ranges [rad|m].
 
         Raises
         ------

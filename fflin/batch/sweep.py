@@ -60,10 +60,10 @@ def sweep(
 ) -> LinearBatch:
     r"""Linearise a robot about many points.
 
-    With numba installed (``pip install 'fflin[fast]'``), a compiled kernel processes eight points
-    at a time, on all threads. At rest M depends on the joints only, and
+    If numba is installed (``pip install 'fflin[fast]'``), a compiled kernel processes groups of
+    eight points on all threads. At rest M depends only on the joint positions, and
     :math:`B = [0;\, M^{-1}]`. The kernel also supports operating points in motion. Without numba,
-    or if the robot has other outputs than its state, a `Linearizer` processes the points one by
+    or if the robot has outputs other than its state, a `Linearizer` processes the points one by
     one. These points can be distributed over worker processes.
 
     Parameters
@@ -91,7 +91,8 @@ def sweep(
         Number of points in a chunk. By default the result of a chunk takes about 4 MB. A resumed
         sweep uses the chunk size of its unfinished file.
     progress : callable, optional
-        Function ``progress(done, total)``, called after every chunk with numbers of points.
+        Function ``progress(done, total)``, called after every chunk with the number of finished
+        points and the number of all points.
     out : str or Path, optional
         File to write, .h5 or .npz. Chunks are first written to NAME.part. After a crash, repeat
         the same call: it resumes with the intact chunks of that file.

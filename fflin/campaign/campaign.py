@@ -37,10 +37,10 @@ class Campaign(FrozenArrays):
     Statistics and conditions refer to the figures of a run by these names:
 
     - ``attitude`` [deg], ``position`` [m], ``joints``, ``turning`` (omega_b), ``moving`` (v_b) and
-      ``rates`` (of the joints): final error of this kind.
+      ``rates`` (of the joints): final error in these states. These names are the kinds of error.
     - The name of a state or input: its final value, with sign.
     - ``worst NAME``: largest value over the whole run; for a state, its largest error.
-    - ``settle KIND`` [s]: settling time of this error, after which it stays within 2 % of its
+    - ``settle KIND`` [s]: settling time, after which the error of this kind stays within 2 % of its
       largest value. ``settle`` [s]: the longest of these settling times.
     - ``end`` [s]: end of the run.
     - ``drawn NAME``: value drawn for the dispersed parameter NAME.
@@ -66,8 +66,8 @@ class Campaign(FrozenArrays):
         Errors of each kind, and commands, at these times. After a run is stopped, its errors are
         infinite and its commands are zero.
     stop, end : ndarray (N,)
-        Outcome (0 completed, 1 diverged, 2 left the chart, 3 stopped otherwise) and end time [s] of
-        each run.
+        Outcome (0 completed, 1 diverged, 2 left the chart, 3 stopped for another reason) and end
+        time [s] of each run.
     asked : int
         Requested number of runs. N is smaller if the condition `until` ended the campaign early.
     goals : tuple of str
@@ -146,7 +146,7 @@ class Campaign(FrozenArrays):
 
     @property
     def bounds(self) -> list[Bound]:
-        """Comparisons of a figure with a number in the goals."""
+        """Comparisons in the goals, each of a figure with a number."""
         return [each for goal in self.goals for each in bounds_of(goal, self.figure)]
 
     def values(self, name: str) -> Array:
@@ -216,8 +216,8 @@ class Campaign(FrozenArrays):
     def quantile(self, name: str, p: float, *, confidence: float = 0.95) -> Estimate:
         """Return the p-quantile of a figure over the runs, with its confidence interval.
 
-        The interval is computed from order statistics and is valid for any distribution. Final
-        states and inputs have a sign; their quantiles include only the completed runs.
+        The interval is computed from order statistics and is valid for any distribution. Quantiles
+        of final states and inputs, which have a sign, include only the completed runs.
         """
         values = self.values(name)
         if name in (*self.state_names, *self.input_names):

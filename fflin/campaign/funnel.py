@@ -144,7 +144,7 @@ def funnel(
     engine: str | None = None,
     **options: Any,
 ) -> Funnel:
-    r"""Estimate the errors from which the tracking loop along a trajectory reaches a goal.
+    r"""Estimate the initial errors from which a trajectory tracking loop reaches a goal.
 
     At each knot, errors are drawn from an ellipsoid :math:`e^T P(t)\,e \le \rho` of the schedule's
     cost to go. Their directions are uniformly distributed, and the square roots of their levels are
@@ -164,7 +164,7 @@ def funnel(
     within : mapping, optional
         Largest errors allowed at any time of a run, with the kinds of `goal`.
     knots : int or sequence of float
-        Number of knots to test, or times [s], of which the nearest knots are tested.
+        Number of knots to test, or times [s]. The knot nearest to each time is tested.
     samples : int
         Number of runs from each knot.
     seed : int
@@ -174,7 +174,8 @@ def funnel(
     executor, workers, threads, engine : optional
         As in `monte_carlo`; each task is one knot.
     progress : callable, optional
-        Function ``progress(done, total)``, called with numbers of knots.
+        Function ``progress(done, total)``, called with the number of finished knots and the number
+        of all knots.
     **options
         Options of `simulate`: dt, method, project, sample, delay, limits, disturbance.
 

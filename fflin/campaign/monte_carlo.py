@@ -91,7 +91,8 @@ def monte_carlo(
         Each name in a pattern or group is drawn independently; ``{"range": spread, "tied": True}``
         makes one draw for all of them. A name is one of
 
-        - a state, ``q_b``, ``r_b.x``, ``q_m.*``, ``omega_b``: added to the initial state.
+        - a state, ``q_b``, ``r_b.x``, ``q_m.*``, ``omega_b``: the drawn value is added to the
+          initial state.
         - ``BODY.mass`` and ``BODY.inertia``: relative changes d from the nominal values, as in
           `Robot.perturbed`. BODY is ``base`` or the name of the joint that carries the body.
           ``mass`` multiplies mass and inertia by 1 + d. ``inertia`` multiplies
@@ -100,20 +101,22 @@ def monte_carlo(
         - ``BODY.com`` [m]: shift of the centre of mass along each axis of the body's frame. Mass
           and inertia about the centre of mass are unchanged, as for ``LINK.com.x`` in
           `sensitivity` and `uncertain`.
-        - ``LINK.density``, relative, of a link by its name in the URDF, including links fixed to
-          another link: its mass and inertia are multiplied by 1 + d. `sensitivity` and `uncertain`
-          use the same name; their ``LINK.mass`` leaves the inertia unchanged.
-        - ``INPUT.gain``, relative, and ``INPUT.bias`` [N m|N]: a command u acts as (1 + d) u + b.
-          ``INPUT.fails`` [s]: the input is zero from that time on. The recorded inputs are the
-          commands, even after a failure.
+        - ``LINK.density``: relative change d; the mass and inertia of a link are multiplied by 1 +
+          d. LINK is a name in the URDF, and may be a link that is fixed to another link.
+          `sensitivity` and `uncertain` use the same name; their ``LINK.mass`` leaves the inertia
+          unchanged.
+        - ``INPUT.gain`` (relative change d) and ``INPUT.bias`` (b, in N m or N): a command u acts
+          as (1 + d) u + b. ``INPUT.fails`` [s]: the input is zero from that time on. The recorded
+          inputs are the commands, even after a failure.
         - ``INPUT.misalignment`` [rad]: rotates the direction of a thruster, the axis of a wheel, or
           an axis of tau_b or F_b about two perpendicular axes. Each angle is drawn independently.
         - ``NAME.sensor``: offset of a state that a `StateFeedback` reads, or of an output that an
           `OutputFeedback`, `LinearController` or `TrajectoryOutputFeedback` measures.
           ``NAME.noise``: white noise added at each sample. A number is its standard deviation; any
           other spread draws one standard deviation for each run.
-        - ``delay`` [s]: added to the `delay` of `simulate`, rounded to whole steps, at least 0.
-        - ``JOINT.stiffness`` and ``JOINT.damping``, relative.
+        - ``delay`` [s]: added to the `delay` of `simulate`. The sum is rounded to whole steps; a
+          negative sum becomes 0.
+        - ``JOINT.stiffness`` and ``JOINT.damping``: relative changes from the nominal values.
     runs : int
         Number of runs.
     duration : float, optional
@@ -133,7 +136,7 @@ def monte_carlo(
     executor, workers, threads, progress : optional
         As in `sweep`. The workers of an executor must be able to import the policy's modules.
     chunk : int, optional
-        Runs per chunk, a multiple of 8; with `until` also a divisor of 256.
+        Number of runs per chunk, a multiple of 8. If `until` is given, this number must divide 256.
     histories : int, optional
         Number of evenly spaced times at which the errors and inputs of each run are recorded. The
         bands of `plot_campaign` need them.
@@ -142,9 +145,10 @@ def monte_carlo(
         same call resumes from its intact chunks. If a .h5 file already holds all of these runs, it
         is read, even if its goals differ.
     overwrite : bool
-        Whether to replace a file `out` that was not written by the same call; refused by default.
+        Whether to replace the file `out` if a different call wrote it. By default this is an error.
     engine : {"python", "compiled"}, optional
-        By default the compiled one if it can run them, see `simulate`.
+        Engine that runs the loop; by default the compiled engine if it supports these runs, see
+        `simulate`.
     **options
         Options of `simulate`: x0, q0, v0, dt, method, project, sample, delay, limits, disturbance,
         target, frame, reference.
@@ -157,7 +161,8 @@ def monte_carlo(
     Raises
     ------
     InputError
-        If a size or value is wrong, or a draw gives no valid robot; the message names the draw.
+        If a size or value is wrong, or the robot of a draw is not valid; the message names the
+        draw.
     UnknownNameError
         If a name is unknown.
     SweepError

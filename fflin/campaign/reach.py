@@ -39,14 +39,15 @@ class Funnel(Design):
     """Ellipsoids ``e' P(t) e <= rho`` of errors relative to a trajectory; prints as a table.
 
     Errors are defined as in `linearize_trajectory`; P is the schedule's cost to go. Errors in
-    directions to which P gives no weight are not tested.
+    directions in which P is zero are not tested.
 
     Attributes
     ----------
     t : ndarray (m,)
         Times [s] of the knots.
     tried : ndarray (m,)
-        Largest level rho of the initial errors. The square roots of their levels are evenly spread.
+        Largest level rho of the tested initial errors. The square roots of the levels of all tested
+        errors are evenly spread.
     outcomes : ndarray (m, N)
         Outcome of each run, sorted by ascending level: 0 if it reached the goal, 1 if it was
         stopped early, 2 if it exceeded `within`, 3 if it missed the goal.
@@ -58,8 +59,8 @@ class Funnel(Design):
         Lower bound, at confidence level `confidence`, on the success rate of runs that start at or
         below the level `rho`.
     rate : ndarray (m, 2)
-        Clopper-Pearson interval of the success rate of all runs, which start at or below the level
-        `tried`.
+        Clopper-Pearson interval of the success rate of all runs. All of them start at or below the
+        level `tried`.
     attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
         Half-axes of the ellipsoids in base attitude [deg], base position [m] and each joint
         [rad|m].

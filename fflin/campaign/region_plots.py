@@ -84,7 +84,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
 
 
 def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
-    """Draw the half-axes of a funnel at each knot, and the success rates of its starts.
+    """Draw the half-axes of a funnel at each knot, and the success rates of the runs from there.
 
     Parameters
     ----------

@@ -67,13 +67,13 @@ class Validity(FrozenArrays):
         Number of runs with displacements up to `holds`.
     inside_rate : float
         Lower bound, at confidence level `confidence`, on the fraction of displacements up to
-        `holds` that settle.
+        `holds` from which the loop settles.
     rate : tuple of float
-        Clopper-Pearson interval of the fraction of all displacements that settle.
+        Clopper-Pearson interval of the fraction of all displacements from which the loop settles.
     confidence : float
         Confidence level of the intervals.
     joint_unit : str
-        "rad" or "m" if all joints are of one kind, else "rad|m".
+        "rad" or "m" if all joints have this unit, otherwise "rad|m".
     frame : str
         Frame in whose axes base velocities and inputs are fed back.
     frames : dict
@@ -177,7 +177,8 @@ def validity(
 
     - Displacements of growing size, to compare the motion with the linear prediction.
     - Random displacements. A run has settled if its error falls to a thousandth of its initial
-      value. It may take three times as long as the slowest mode of the linear loop.
+      value. The time allowed is three times the time that the slowest mode of the linear loop
+      needs.
 
     With numba the compiled loop computes eight runs at a time.
 

@@ -78,7 +78,11 @@ def add_commands(commands: Commands) -> None:
     add_options(
         sensitivity, "--top N = 15: show the N parameters with the largest effect; 15 by default"
     )
-    add_options(sensitivity, "--only NAME: show these parameters only: mass, link_3, *.density")
+    add_options(
+        sensitivity,
+        "--only NAME: show only the parameters of this kind, link or pattern, such as mass, "
+        "link_3, *.density",
+    )
     add_output_file(
         sensitivity,
         "save dA, dB, df0 for each parameter to FILE: .npz, .mat or .json",
@@ -91,9 +95,7 @@ def add_commands(commands: Commands) -> None:
         "-o uncertain.mat",
     )
     add_robot(uncertain)
-    add_options(
-        uncertain, "--joint NAME=VALUE*: position of a joint [rad|m]; others are at neutral"
-    )
+    add_options(uncertain, "--joint NAME=VALUE*: position of a joint [rad|m]; default: neutral")
     add_system(uncertain, axes=False)
     vary = """--vary NAME=RANGE*: range of a parameter named by `fflin sensitivity`, or of all
         parameters that match a pattern: a fraction of the nominal value, such as 0.2, or

@@ -205,13 +205,13 @@ def add_inputs_there(command: Container) -> None:
         """
         --effort NAME=VALUE*: input at the operating point, by its name in u, such as
             tau_m.joint_1
-        --equilibrium: use the minimum-norm inputs that balance springs, gravity and the inertial
+        --equilibrium: apply the minimum-norm inputs that balance springs, gravity and the inertial
             forces of a steady motion at the operating point. Passive joints sag on their springs.
             If no inputs hold the point, the command reports an error""",
     )
     text = """--relative-equilibrium N: in orbit, use the N-th (default: first) of the 24 attitudes
-        without gravity-gradient torque, with the inputs of --equilibrium. Attitude and position in
-        the state are relative to this pose"""
+        without gravity-gradient torque, and the inputs that --equilibrium computes. Attitude
+        and position in the state are relative to this pose"""
     add_options(command, text, nargs="?", const=1, choices=range(1, 25))
 
 
@@ -235,7 +235,7 @@ def add_system(command: Container, *, axes: bool = True) -> None:
         --damping [NAME=]VALUE*: damping of a joint [N m s/rad|N s/m], or one value for all joints;
             `urdf` uses the damping in the URDF
         --gravity X,Y,Z: uniform gravity in world axes [m/s^2]; zero by default
-        --passive NAME*: joint without a motor; by default it has no torque input
+        --passive NAME*: treat this joint as having no motor: the default inputs omit its torque
         --inputs FILE.toml: inputs of the robot: a file for fflin.load_inputs, a bundled name,
             `joints` (joint torques only) or `base` (base torque and force only). The default is
             the inputs of robot.toml, or base torque, base force and all joint torques

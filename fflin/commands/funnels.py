@@ -27,7 +27,7 @@ def add_commands(commands: of.Commands) -> None:
     """Add funnel."""
     funnel = of.command(
         *(commands, "funnel", _funnel),
-        "measure from which errors along a trajectory the regulator reaches a goal",
+        "measure from which errors the regulator along a trajectory still reaches a goal",
         "fflin funnel arm.toml --trajectory plan.csv --schedule gains.npz --goal attitude=1",
     )
     of.add_robot(funnel)
@@ -37,10 +37,11 @@ def add_commands(commands: of.Commands) -> None:
     of.add_options(
         funnel,
         f"""
-        --schedule FILE: gains saved by tvlqr; without this option, gains are designed
+        --schedule FILE: use the gains that tvlqr saved; without this option, gains are designed
+            along the trajectory
         --html >FILE: write a page that plays the motion with the funnel as a tube
         --goal NAME=VALUE*: largest error allowed at the end: {_KINDS}
-        --within NAME=VALUE*: largest error allowed along the trajectory; names as in --goal
+        --within NAME=VALUE*: largest error allowed at any time of a run; names as in --goal
         --limits urdf|none = urdf: saturate the inputs at the limits of the robot (urdf, default),
             or never (none)
         --knots N = 10: number of knots to test; 10 by default

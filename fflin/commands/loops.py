@@ -72,8 +72,8 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
     add_options(
         goal,
         """
-        --target-joint NAME=VALUE*: target position of a joint [rad|m]; the other joints go to
-            their neutral position, the base to the world's origin
+        --target-joint NAME=VALUE*: target position of a joint [rad|m]; the target of other
+            joints is their neutral position, and the target of the base is the world's origin
         --target-velocity NAME=VALUE*: target velocity, such as the speed of a wheel. It is also the
             initial velocity unless --velocity is given""",
     )
@@ -83,10 +83,10 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
     add_options(
         law,
         """
-        --schedule FILE: follow the trajectory with gains saved by tvlqr; without this option, gains
-            are designed
-        --gain FILE: regulate with a gain saved by lqr, about the operating point for which it was
-            designed
+        --schedule FILE: follow the trajectory with the gains that tvlqr saved; without this option,
+            gains are designed along --trajectory
+        --gain FILE: use a gain that lqr saved, and regulate to the operating point for which this
+            gain was designed
         --controller FILE: use a linear controller K with positive feedback, u - u0 = K (y - y0)
             about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled.
             y is set by --output
@@ -96,10 +96,10 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
             every direction. With --no-allocate, negative thrust is set to zero
         --free: simulate without a regulator and without inputs
         --limits urdf|none = urdf: saturate the inputs at the efforts of the URDF, at max and min of
-            the inputs and at wheel speeds (urdf, default), or only at --limit (none)
-        --limit NAME=VALUE*: largest magnitude of an input, a group such as tau_m, or a pattern; it
-            takes precedence over --limits
-        --delay T = 0: time from a sample to its effect [s]""",
+            the inputs and at wheel speeds (urdf, default), or at no limits except --limit (none)
+        --limit NAME=VALUE*: largest magnitude of an input, or of all inputs of a group such as
+            tau_m or a pattern. This value takes precedence over --limits
+        --delay T = 0: time [s] from a sample until its command acts; 0 by default""",
     )
     add_options(
         run,

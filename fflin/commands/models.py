@@ -59,7 +59,7 @@ def add_commands(commands: Commands) -> None:
         *(linearize, "save to FILE: .npz, .mat, .json, or .csv (one per matrix: NAME.A.csv, ...)"),
         *("LinearModel", "LinearTrajectory", "ToolModel"),
     )
-    add_figure(linearize, "plot the pattern of A and B")
+    add_figure(linearize, "plot the magnitudes of the entries of A and B")
     check = command(
         *(commands, "check", _check),
         "compare A and B with two independent computations; exit code 1 if they differ",
@@ -69,7 +69,7 @@ def add_commands(commands: Commands) -> None:
     add_trajectory(check)
     add_options(
         check,
-        "--tolerance X: relative tolerance of all comparisons; by default each has its own",
+        "--tolerance X: relative tolerance of all errors; by default each error has its own",
     )
     add_figure(check, "plot the errors and their tolerances")
 

@@ -23,8 +23,8 @@ def add_commands(commands: Commands) -> None:
     """Add montecarlo."""
     montecarlo = command(
         *(commands, "montecarlo", _montecarlo),
-        "simulate a loop many times with random parameters; show quantiles, fractions, the worst "
-        "runs and their causes",
+        "simulate a loop many times with random parameters; show quantiles, success rates, the "
+        "worst runs and their causes",
         "fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png",
     )
     add_loop(montecarlo)
@@ -64,7 +64,7 @@ def add_commands(commands: Commands) -> None:
         "save the runs to FILE: .h5 (HDF5) or .npz; the runs are collected in FILE.part, from "
         "which the same command resumes",
     )
-    add_options(shown, "--force: replace the file of -o if it contains other data than these runs")
+    add_options(shown, "--force: replace the file of -o even if another call wrote it")
     add_pictures(shown, "that plays the worst run, with the paths of other runs as thin lines")
 
 

@@ -34,13 +34,13 @@ def add_commands(commands: Commands) -> None:
     run, shown = add_loop(simulate), simulate.add_argument_group("output of the simulation")
     add_options(
         run,
-        "--every N: steps from one saved row to the next; chosen automatically for long runs",
+        "--every N: number of steps between saved rows; chosen automatically for long runs",
     )
     add_options(
         shown,
         """
         --plot >FILE: plot the nonlinear and the linear motion to FILE: .png, .pdf or .svg
-        --show NAME*: curves of --plot: a state, an input, a group or a pattern, such as q_m or
+        --show NAME*: show only these curves in --plot: a state, input, group or pattern, as q_m or
             '*.hinge_*'""",
     )
     add_output_file(shown, "save the motion to FILE: .npz, .mat, .json or .csv", "Motion")

@@ -48,12 +48,13 @@ def add_commands(commands: Commands) -> None:
     )
     add_robot(sweep)
     points = sweep.add_argument_group(
-        "points", "--grid, --random or --configurations; at rest unless --velocity is given"
+        "points",
+        "give --grid, --random or --configurations; without --velocity, points are at rest",
     )
     add_options(
         points,
-        """--grid JOINT=LO:HI:N*: N values of a joint [rad|m] from LO to HI; for several joints all
-            combinations, and the last joint varies fastest""",
+        """--grid JOINT=LO:HI:N*: N values of a joint [rad|m] from LO to HI; for several joints, all
+            combinations are used, and the last joint varies fastest""",
         type=_axis,
     )
     add_options(

@@ -40,7 +40,7 @@ def add_commands(commands: Commands) -> None:
     add_options(
         tvlqr,
         "--qf NAME=VALUE*: weight on the final error; by default the solution of the algebraic "
-        "Riccati equation at the end",
+        "Riccati equation about the last configuration",
     )
     add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json", "GainSchedule")
 
@@ -49,13 +49,14 @@ def add_trajectory(parser: Container, *, required: bool = False) -> None:
     """Add --trajectory, --hold and --strict; the file then sets the default of --frame."""
     trajectory = """--trajectory FILE: use the trajectory in FILE: .npz, .mat, .json, or .csv with
         named columns, as fflin.Trajectory.load reads it. --frame gives the axes of the data; by
-        default the frame in the file, else local"""
+        default the frame named in the file, or local if the file names none"""
     add_options(parser, trajectory, required=required)
     add_options(
         parser,
         """
         --hold linear|previous: inputs between the knots of FILE: interpolated linearly, or held at
-            the value of the previous knot. By default the setting in the file, else linear
+            the value of the previous knot. By default the setting in the file, or
+            linear if the file has none
         --strict: refuse a FILE that does not satisfy the dynamics of the robot""",
     )
     parser.set_defaults(frame=None)

@@ -37,7 +37,7 @@ def add_commands(commands: Commands) -> None:
     add_robot(view)
     add_pose(view)
     add_orbit(view)
-    add_options(view, "--frame lvlh|hill: axes of the world in orbit; lvlh by default")
+    add_options(view, "--frame lvlh|hill: orbital frame used as the world; lvlh by default")
     _add_scene(view)
     add_options(view, "--no-open: do not open a browser; the address appears on stderr")
     add_options(view, "--port N = 0: port on 127.0.0.1; a free port by default", type=int)
@@ -49,8 +49,8 @@ def add_pictures(command: Container, page: str = "that plays the motion without 
         command,
         f"""
         --html >FILE: write a page {page}
-        --png >FILE: write a picture (needs Chromium): a strip of four images, or images at
-            the --times
+        --png >FILE: write a picture (needs Chromium): a strip of four images, or of images
+            at the times of --times
         --gif >FILE: write an animation (needs Chromium)""",
     )
     add_options(command, "--times T: times of the pictures [s]", nargs="+")
@@ -67,7 +67,8 @@ def _add_scene(command: Container) -> None:
     add_options(
         command,
         """
-        --scene space|lab: sky and planet, or a floor with a grid (default with gravity)
+        --scene space|lab: show sky and planet (space), or a floor with a grid (lab, the default
+            under gravity)
         --tool FRAME: draw the axes and the trail of this frame
         --[no-]follow: whether the camera follows the base; by default it does in long motions""",
     )

@@ -58,8 +58,9 @@ def acceleration_lqr(
         Continuous or sampled model at rest, without gravity, orbit, springs or dampers. Every
         coordinate that `lqr` regulates must be actuated.
     Qp, Qv, Ra : array_like (6 + n,) or float, or mapping
-        Diagonal weights on the positions (q_b, r_b, q_m), the velocities and the accelerations.
-        In a mapping {name: weight}, `Qp` takes names of positions, `Qv` and `Ra` of velocities.
+        Diagonal weights on the positions (q_b, r_b, q_m), the velocities and the accelerations. In
+        a mapping {name: weight}, `Qp` takes names of positions; `Qv` and `Ra` take names of
+        velocities.
     dt : float, optional
         Sampling time [s]; the continuous model is sampled first.
     wheel_speeds : bool, optional

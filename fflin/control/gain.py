@@ -39,7 +39,7 @@ class Gain(Design):
     K : ndarray (nu, nx)
         Gain.
     P : ndarray (nx, nx)
-        Cost matrix: the optimal cost from x on is ``(x - x0)' P (x - x0)``.
+        Cost matrix: the optimal cost of the motion from state x is ``(x - x0)' P (x - x0)``.
     poles : ndarray (nz,) of complex
         Eigenvalues of ``A - B K`` over the regulated states: [1/s] for a continuous model,
         discrete-time poles z for a sampled one.
@@ -51,7 +51,8 @@ class Gain(Design):
     method : str
         Solver: "structured" (half-size), "general" (SciPy) or "closed form".
     A, B, Q, R, N : ndarray
-        The model and the weights on deviations; N is zero if no cross weight was given.
+        Matrices of the model, and weights on the deviations x - x0 and u - u0. N is zero if no
+        cross weight was given.
     x0 : ndarray (nx,)
     u0 : ndarray (nu,)
         State and inputs at the point.
@@ -63,7 +64,8 @@ class Gain(Design):
     weights : str
         Description of the rule that made the weights.
     regulated : tuple of str (nz,)
-        States that are fed back; if empty, all are. K, P, Q and N are zero for the other states.
+        States that are fed back; if empty, all states are fed back. K, P, Q and N are zero for the
+        other states.
 
     Examples
     --------

@@ -81,8 +81,8 @@ class GainSchedule(Schedule):
         Cost matrix: the optimal cost from t on is e' P(t) e.
     A : ndarray (M, nx, nx)
     B : ndarray (M, nx, nu)
-        Linear model at the knots. A sampled schedule has M - 1 of each, from one sample to the
-        next.
+        Linear model at the knots. A sampled schedule has M - 1 matrices A and B; each pair leads
+        from one sample to the next.
     Q, R, Qf : ndarray
         Weights of the continuous cost.
     residual : float
@@ -156,7 +156,7 @@ class GainSchedule(Schedule):
         return Trajectory(robot, self.knots, **values, hold=self.hold, frame=self.frame)
 
     def cost_to_go(self, t: float) -> Array:
-        """Return P (nx, nx) at time t: by cubic interpolation, or held since the latest sample."""
+        """Return P (nx, nx) at time t by cubic interpolation; if sampled, at the latest sample."""
         return self.passed.cost(self._within(t))
 
     @cached_property

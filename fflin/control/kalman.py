@@ -57,7 +57,8 @@ class Estimator(Design):
     state_names, input_names, output_names : tuple of str
     robot : str
     estimated : tuple of str (nz,)
-        Estimated states; if empty, all are. L, P and W are zero for the other states.
+        Estimated states; if empty, all states are estimated. L, P and W are zero for the other
+        states.
 
     Examples
     --------
@@ -120,7 +121,8 @@ class Compensator(Design):
     B : ndarray (nz, ny)
     C : ndarray (nu, nz)
     poles : ndarray (2 nz,) of complex
-        Poles of the loop of model and compensator: the poles of the gain and of the estimator.
+        Closed-loop poles of the model with the compensator: the poles of the gain and of the
+        estimator.
     y0, u0 : ndarray
         Outputs and inputs at the point.
     dt : float
@@ -183,7 +185,7 @@ def kalman(
 
     or its discrete-time counterpart. SciPy's solver and Newton's method solve the equation, see
     `lqr`. For a model with reaction wheels, the filter estimates only the states that `lqr`
-    regulates. It uses only the outputs that depend on these states alone.
+    regulates. It uses only outputs that depend on no other states.
 
     Parameters
     ----------
@@ -192,11 +194,11 @@ def kalman(
         Intensity of the disturbance, positive semidefinite: a matrix, its diagonal, or
         {name: intensity} with names of states or of their groups.
     V : array_like (ny, ny) or (ny,), float, or mapping
-        Intensity of the measurement noise, positive definite, in the same forms with names of
-        outputs.
+        Intensity of the measurement noise, positive definite, in the same forms as W, but with
+        names of outputs.
     G : array_like (nx, nw), optional
-        Input matrix of the disturbance; W is then (nw, nw). With ``G=lin.B`` the inputs are
-        noisy, and W takes their names.
+        Input matrix of the disturbance; W is then (nw, nw). With ``G=lin.B`` the disturbance acts
+        at the inputs, and W takes names of inputs.
     wheel_speeds : bool, optional
         As in `lqr`.
 
@@ -283,7 +285,7 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     Raises
     ------
     InputError
-        If the two belong to different models, or the gain feeds back a state that is not
+        If gain and estimator belong to different models, or the gain feeds back a state that is not
         estimated.
 
     Examples

@@ -166,7 +166,7 @@ class LinearController:
         controller must use all outputs and inputs of the model, in order. If the controller has no
         dt, the model's dt is used.
     lin : LinearModel
-        Continuous or sampled model; the controller acts about its point.
+        Continuous or sampled model. The controller acts on deviations from the point of this model.
     sign : {1, -1}
         Give -1 for a controller designed for negative feedback, u - u0 = -K (y - y0).
     noise : callable, optional

@@ -50,20 +50,21 @@ def lqr(
 
     For a fully actuated model, the Riccati equation is solved by an eigenproblem of half the usual
     size. For any other model, SciPy solves it. Newton's method refines both solutions. The result
-    contains the residual in the model's own variables. A weight formed with the inertia, such as
-    M^-1 R_a M^-1 on accelerations, loses digits to the condition number of the inertia before any
-    solver sees it. `acceleration_lqr` avoids this loss.
+    contains the residual in the model's own variables. A weight that is computed from an
+    ill-conditioned inertia, such as M^-1 R_a M^-1 for accelerations, is inaccurate whichever solver
+    is used. `acceleration_lqr` avoids this loss.
 
     Without weights, the regulator respects the limits of the URDF, (10.7) of docs/derivation.md.
     Its slowest motion has a bandwidth of 0.2 rad/s. The bandwidth is lower if the robot would
     otherwise exceed an effort or speed limit. The limits are checked for a return from a
     displacement of 30 deg of the base and 0.3 rad of each joint. Each input then has a phase margin
     of 60 deg and tolerates any gain factor above one half. With springs or gravity, each mode that
-    the inputs reach decays as fast as without them (10.8). ``gain.weights`` states the bandwidth,
-    decay rate and damping of the loop, and lists slower modes.
+    the inputs reach decays as fast as it would without springs and gravity (10.8). ``gain.weights``
+    states the bandwidth, decay rate and damping of the loop, and lists slower modes.
 
     For a model with reaction wheels, only the controllable part is regulated, (9.4) of
-    docs/derivation.md; ``gain.regulated`` lists its states. Weights have no effect on the others:
+    docs/derivation.md; ``gain.regulated`` lists its states. Weights on the following states have no
+    effect:
 
     - wheel angles, which are ignorable;
     - wheel speeds that follow the body's rate, if the wheels alone turn the body;
@@ -72,7 +73,7 @@ def lqr(
     Parameters
     ----------
     lin : LinearModel
-        About a fixed point, or about a steady motion with ``moving=True``.
+        Model about a fixed point, or about a steady motion if it was made with ``moving=True``.
     Q : array_like (nx, nx) or (nx,), float, or mapping, optional
         Weight on the state, positive semidefinite: a matrix, its diagonal, or {name: weight} with
         names of states or of their groups, such as ``q_b``. Unnamed states have zero weight.
@@ -101,8 +102,8 @@ def lqr(
     StabilizabilityError
         If the inputs cannot stabilise a mode that does not decay by itself; the message names it.
     InputError
-        If a weight has a wrong size, is not positive (semi)definite, or omits a mode that does not
-        decay by itself.
+        If a weight has a wrong size, is not positive (semi)definite, or is zero for a mode that
+        does not decay by itself.
     UnknownNameError
         If a name does not exist.
     ModelError

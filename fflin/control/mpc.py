@@ -57,10 +57,11 @@ def mpc(
     `lqr` or `tvlqr`.
 
     - Input limits are hard: inputs never exceed them.
-    - Limits of states and outputs are soft and hold at the samples, as the linear model predicts.
-      If the program is infeasible, they are exceeded slightly; the motion's `notes` report it.
-    - If the solver finds no plan, the regulator's command is applied, cut at the input limits,
-      and a warning is issued.
+    - Limits of states and outputs are soft. They apply to the values that the linear model predicts
+      at the samples. If the program is infeasible, they are exceeded slightly; the motion's `notes`
+      report it.
+    - If the solver finds no plan, the regulator's command is applied, saturated at the input
+      limits, and a warning is issued.
 
     DAQP solves the quadratic program (docs/guide/mpc.md; ``pip install 'fflin[mpc]'``). It starts
     from the limits that were active at the previous sample.
@@ -81,8 +82,8 @@ def mpc(
         r_b along a trajectory bound the error. With None there are no limits, except that thrusters
         cannot pull.
     Qf : "steady", or as Q
-        Weight on the error after N samples, or at the end of a trajectory. "steady" is the
-        regulator's cost to go from there.
+        Weight on the error after N samples, or at the end of a trajectory. "steady" is the cost to
+        go of the regulator from that time on.
     weights : {"urdf", "identity"}, optional
         Rule for the weights, instead of Q and R, as in `lqr`.
 

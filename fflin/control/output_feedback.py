@@ -28,8 +28,8 @@ class OutputFeedback(LinearController):
     """Feedback of the robot's outputs by a sampled compensator, such as the result of `lqg`.
 
     At each sample, u - u0 = C z is applied. Then y is measured, and z is advanced to the next
-    sample. The accelerometer model uses the commanded u, before it is limited. Initially the
-    estimated deviation from the point is zero.
+    sample. Accelerometer outputs are computed with the commanded u, before saturation. The initial
+    estimate of the deviation from the point is zero.
 
     Parameters
     ----------

@@ -85,11 +85,11 @@ def plan(
     The base may rotate by any angle. It makes whole turns if the angular rates at both ends require
     them. Continuous joints take the shorter direction.
 
-    Limits of joints and wheels are met at the knots; between knots, they may be exceeded by 1 %. If
-    the integrated motion exceeds a limit between knots, the limit is tightened at the neighbouring
-    knots and the plan is repeated. If that does not help, the intervals in question are halved. If
-    an excess of more than 1 % remains after 8 plans, a warning is issued. Printing the trajectory
-    shows the largest excess, its limit and its time.
+    Limits of joints and wheels are met at the knots; between knots, they may be exceeded, by up to
+    1 %. If the integrated motion exceeds a limit between knots, the limit is tightened at the
+    neighbouring knots and the plan is repeated. If that does not help, these intervals are halved.
+    If an excess of more than 1 % remains after 8 plans, a warning is issued. Printing the
+    trajectory shows the largest excess, its limit and its time.
 
     Parameters
     ----------
@@ -120,8 +120,8 @@ def plan(
     Returns
     -------
     Trajectory
-        Motion of the robot under its inputs. Torques and forces on the base are expressed, and
-        held between knots, in base axes.
+        Planned motion and its inputs. Torques and forces on the base are in base axes, and are held
+        in these axes between knots.
 
     Raises
     ------

@@ -121,9 +121,10 @@ class Allocation:
     """Allocation of a policy's commands to thrusters and motors within their limits.
 
     The policy commands the inputs of the robot `design`, such as torque and force on the base. The
-    thrusters and motors of the simulated robot then produce the generalised force closest to the
-    commanded one: the sum of squared differences between the accelerations that the two forces
-    cause is smallest. No thrust is negative, and no input exceeds its limit.
+    thrusters and motors of the simulated robot then produce the generalised force that is closest
+    to the commanded force. The distance between two forces is the sum of squared differences
+    between the accelerations that they cause. No thrust is negative, and no input exceeds its
+    limit.
 
     Parameters
     ----------

@@ -46,9 +46,9 @@ class TrajectoryFeedback:
     schedule : GainSchedule
         Result of `tvlqr`.
     held : bool
-        Whether commands are held between samples; commands of a sampled schedule always are. If
-        they are held, the command at the last knot already contains the inputs that hold the robot
-        there.
+        Whether commands are held between samples; commands of a sampled schedule are always held.
+        With held commands, the command at the last knot already contains the inputs that hold the
+        robot there.
 
     Examples
     --------

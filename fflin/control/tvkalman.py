@@ -94,7 +94,7 @@ class FilterSchedule(Schedule):
         return super().gain(t).T
 
     def covariance(self, t: float) -> Array:
-        """Return P (nx, nx) at time t: by cubic interpolation, or held since the latest sample."""
+        """Return P (nx, nx) at time t by cubic interpolation; if sampled, at the latest sample."""
         return self.passed.cost(self._within(t))
 
     @cached_property
@@ -120,8 +120,8 @@ def tvkalman(
 
     .. math:: \dot P = A P + P A^T - P C^T V^{-1} C P + W,\qquad L = P C^T V^{-1}.
 
-    In reversed time this is the equation of `tvlqr` for :math:`A^T, C^T, W, V`. It is solved in
-    the same way.
+    In reversed time this is the equation of `tvlqr` with :math:`A, B, Q, R` replaced by
+    :math:`A^T, C^T, W, V`. It is solved in the same way.
 
     With `sample`, the filter is sampled, (10.4): a computer measures y at the samples and holds
     :math:`\delta u` between them. V is then the noise covariance per sample. W remains the
@@ -137,7 +137,7 @@ def tvkalman(
         Intensity of the measurement noise, positive definite.
     G : array_like (nx, nw) or (N, nx, nw), optional
         Input matrix of the disturbance, linear between the knots; W is then (nw, nw). With
-        ``G=traj.B`` the inputs are noisy, and W takes their names.
+        ``G=traj.B`` the disturbance acts at the inputs, and W takes names of inputs.
     P0 : "steady", or as W
         Covariance at the start. "steady" is the covariance of `kalman` about the start point: the
         first configuration at rest, or in its initial motion if that motion is steady.

@@ -55,7 +55,8 @@ def tvlqr(
     agree to 1e-7.
 
     With `sample`, the regulator is sampled: a computer measures e at the samples and holds
-    :math:`\delta u` between them. The cost is the same, by (10.1) and (10.3) along the motion.
+    :math:`\delta u` between them. The cost remains the integral above, evaluated by (10.1) and
+    (10.3) along the motion.
 
     Parameters
     ----------
@@ -71,9 +72,9 @@ def tvlqr(
     sample : float, optional
         Sampling time [s]. It must divide the duration.
     weights : {"urdf", "identity"}, optional
-        Rule for the weights, instead of Q and R: the rule of `lqr` about that end point, for a
-        tenth of its displacements. The loop is fast enough for errors to decay within the duration
-        of the trajectory.
+        Rule for the weights, instead of Q and R: the rule of `lqr` about that end point, for
+        displacements a tenth as large. The loop is fast enough for errors to decay within the
+        duration of the trajectory.
     rule : str
         Description of the rule that made Q and R.
 

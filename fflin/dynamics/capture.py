@@ -74,8 +74,8 @@ def capture(
     The joints are free during the impact, because motors give only finite torques. The velocity
     just after the impact solves :math:`M_+ \nu_+ = G^T \mathrm{diag}(M, M_p) (\nu_-, V_p)`. Here G
     is the Jacobian of the velocities of robot and payload with respect to the velocity of the
-    combined robot. This is the M-orthogonal projection onto the motions that the weld allows. It
-    conserves linear and angular momentum.
+    combined robot. The solution is the M-orthogonal projection onto the motions that the weld
+    allows. It conserves linear and angular momentum.
 
     Parameters
     ----------

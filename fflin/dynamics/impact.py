@@ -85,9 +85,9 @@ def jam(
     r"""Stop joints or wheels instantly and permanently at their present positions.
 
     The other joints are free during the impact. The velocity just after it solves
-    :math:`M_+ \nu_+ = G^T M \nu` (13.1), with the Jacobian G of the robot whose jammed joints are
-    fixed. Linear and angular momentum are conserved. If a motor fails but its joint still moves
-    freely, use ``robot.replace(passive=[joint])`` instead; there is then no impact.
+    :math:`M_+ \nu_+ = G^T M \nu` (13.1), where G is the Jacobian of the robot with the jammed
+    joints fixed. Linear and angular momentum are conserved. If a motor fails but its joint still
+    moves freely, use ``robot.replace(passive=[joint])`` instead; there is then no impact.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def jam(
     Returns
     -------
     Impact
-        Result whose robot has these joints welded and no inputs on them.
+        Result of the impact. In its robot, these joints are welded and have no inputs.
 
     Raises
     ------

@@ -37,7 +37,7 @@ class StateMap:
         - local: both in base axes;
         - world: both in reference axes;
         - lvlh (default in orbit) or hill, only for a robot in orbit: Pinocchio's world is this
-          frame of the orbit, and the axes are as in hybrid.
+          orbital frame. The axes of omega_b and v_b are as in hybrid.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class StateMap:
         return chart
 
     def charts(self, q: Array) -> Chart:
-        """Return the attitude charts at rows of valid configurations (N, nq), at any turn."""
+        """Return the charts at rows of valid configurations (N, nq), for any base attitude."""
         return Chart.of(q[:, 3:7] @ turning.product_matrix(self.origin_quaternion).T)
 
     def rotation(self, q: Array) -> Array:
@@ -172,7 +172,7 @@ class StateMap:
         return turned if self._aligned else self._rotation.dot(turned)
 
     def gravity(self, q: Array) -> Array:
-        """Return the robot's gravity (.., 3) [m/s^2] in base axes, q (.., nq) being valid."""
+        """Return the robot's gravity (.., 3) [m/s^2] in base axes at valid q (.., nq)."""
         if not self._pulled:
             return self._gravity
         turned = turning.rotation_matrix if q.ndim == 1 else turning.rotation_matrices
@@ -326,7 +326,7 @@ class StateMap:
         return angles
 
     def joints_apart(self, before: Array, q: Array) -> Array:
-        """Return q_m (n,) at q minus q_m at `before`, two valid configurations (nq,)."""
+        """Return the change of q_m (n,) from `before` to q, two valid configurations (nq,)."""
         apart = q.take(self._idx_q) - before.take(self._idx_q)
         if self._cos.size:
             s, c, s_0, c_0 = (x.take(at) for x in (q, before) for at in (self._sin, self._cos))

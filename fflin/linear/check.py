@@ -115,7 +115,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
         Model in continuous time: just linearised, loaded from a file, or made by another tool.
     tolerance : float, optional
         Relative tolerance that replaces the tolerance of every error, such as 1e-5 if another tool
-        computed A and B by differences.
+        computed A and B by finite differences.
 
     Returns
     -------

@@ -113,9 +113,9 @@ def equilibrium(
     q : array_like (nq,), optional
         Configuration in Pinocchio's order; neutral by default.
     v : array_like (nv,), optional
-        Velocity of a steady motion, which is constant in base axes; at rest by default. Only
-        joints that are rotors may move, see `LinearModel.ignorable`. Under gravity the base may
-        rotate about the vertical only.
+        Velocity of a steady motion, which is constant in base axes; at rest by default. No joints
+        except rotors may move, see `LinearModel.ignorable`. Under gravity, the base may rotate only
+        about the vertical.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the inputs on the base, as in `linearize`.
     reference : pin.SE3, optional
@@ -144,8 +144,8 @@ def equilibrium(
 
     Notes
     -----
-    With the bounds this is a least-distance problem, which non-negative least squares solve exactly
-    (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    With the bounds of thrusters, this is a least-distance problem. Non-negative least squares solve
+    it exactly (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974, chapter 23).
 
     Examples
     --------

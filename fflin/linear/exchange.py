@@ -38,7 +38,8 @@ class ToolModel(Design):
     T : ndarray (nx, 12 + 2n)
         Matrix from state deviations of the `LinearModel` to deviations of x.
     T_left : ndarray (12 + 2n, nx)
-        Inverse of T. It is only a left inverse if x contains a whole quaternion or mimic joints.
+        Inverse of T. If x contains a whole quaternion or mimic joints, it is a left inverse and not
+        a right inverse.
     T_u : ndarray (nu, nu)
         Matrix from input deviations of the `LinearModel` to the tool's. A gain K of the
         `LinearModel` becomes ``T_u K T_left`` for the tool.
@@ -115,8 +116,8 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     Raises
     ------
     InputError
-        If the model does not fit the robot, a sampled model comes from a file, or `dt` is given
-        for another tool or out of range.
+        If the model does not fit the robot, a sampled model comes from a file, or `dt` is out of
+        range or not allowed for this tool.
     UnknownNameError
         If there is no such tool.
     ChartError

@@ -83,9 +83,9 @@ def require_turns(made: str, size: int, robot: Robot) -> None:
 def line_up(gain: Any, lin: LinearModel) -> Array:
     """Return the K of a gain for another model, with states and inputs matched by name.
 
-    A robot keeps most of its states if it captures a payload or a joint jams. K gets zero columns
-    for states, and zero rows for inputs, that only the model has. States and inputs that only the
-    gain has are dropped.
+    A robot keeps most of its states if it captures a payload or a joint jams. K gets a
+    zero column for each state that the gain lacks, and a zero row for each input that it lacks.
+    States and inputs that the model lacks are dropped.
 
     Parameters
     ----------

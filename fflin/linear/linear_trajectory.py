@@ -108,7 +108,7 @@ class LinearTrajectory(Trajectory):
         return Linearizer(self.robot, moving=True)
 
     def matrices(self, t: float) -> tuple[Array, Array]:
-        """Return A (nx, nx) and B (nx, nu) at time t [s]; between knots, about that point."""
+        """Return A (nx, nx) and B (nx, nu) about the point at time t [s], also between knots."""
         t = self._within(t)
         k, share = placed(self.t, t)
         if self.dt or share in (0.0, 1.0):
@@ -118,7 +118,7 @@ class LinearTrajectory(Trajectory):
         return lin.A, lin.B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
-        """Evaluate arrays given at the knots, interpolated linearly or held, at one time."""
+        """Evaluate arrays at one time: interpolated between knots, or held since the last knot."""
         k, share = placed(self.t, self._within(t))
         if self.dt or not share:
             return tuple(each[k] for each in arrays)
@@ -182,8 +182,8 @@ def linearize_trajectory(
     t : Trajectory or array_like (N,)
         The motion as a `Trajectory`, or the times of its knots [s].
     q, v, u : array_like, optional
-        Configurations, velocities and inputs at the knots, as `Trajectory` takes them; only if t
-        holds times.
+        Configurations, velocities and inputs at the knots, as `Trajectory` takes them. Give them if
+        t contains times.
     strict : bool
         Whether to refuse knots that violate the robot's dynamics with a residual above 1e-2.
     **options
@@ -196,7 +196,7 @@ def linearize_trajectory(
     Raises
     ------
     InputError
-        If the arrays are not valid for `Trajectory`. With `strict`, also if the residual of the
+        If the arrays are not valid for `Trajectory`. If `strict` is true and the residual of the
         motion exceeds 1e-2.
 
     Warns

@@ -33,8 +33,8 @@ class Certificate:
     Attributes
     ----------
     condition : float
-        Condition number of M scaled to a unit diagonal. Expect residuals of this number times
-        machine precision.
+        Condition number of M scaled to a unit diagonal. Residuals of about this number times
+        machine precision are expected.
     inertia_residual : float
         Largest entry of M M^-1 - I, with M scaled as for `condition`.
     route_A, route_B : float
@@ -249,7 +249,7 @@ class LinearModel(FrozenArrays):
 
     @cached_property
     def ignorable(self) -> tuple[str, ...]:
-        """Names of the states on which nothing in the model depends, derived from the robot.
+        """Names of the states on which the dynamics do not depend, derived from the robot.
 
         These are:
 
@@ -271,13 +271,13 @@ class LinearModel(FrozenArrays):
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
         """Return whether the point is a fixed point or a relative equilibrium.
 
-        At a relative equilibrium only ignorable coordinates move, at constant rates: a rotor spins,
-        or the base moves at constant velocity. In both cases A and B are constant in time. With
-        ``moving=True`` the motion of the reference is tested instead of f0:
+        At a relative equilibrium, ignorable coordinates move at constant rates and all others are
+        at rest: a rotor spins, or the base moves at constant velocity. In both cases A and B are
+        constant in time. With ``moving=True`` the motion of the reference is tested instead of f0:
 
         - its velocities in base axes must be constant;
         - no joint except rotors may move;
-        - under gravity the base may rotate about the vertical only.
+        - under gravity, the base may rotate only about the vertical.
 
         Parameters
         ----------

@@ -130,7 +130,7 @@ def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None
     q, v : array_like (nq,), (nv,)
         Configuration and velocity in Pinocchio's order; v is zero by default.
     u : array_like (nu,), optional
-        Inputs, which affect only accelerometers; u0 by default.
+        Inputs; u0 by default. They affect no outputs except accelerometers.
 
     Returns
     -------

@@ -51,7 +51,7 @@ class Trajectory(Design):
     v : array_like (N, nv)
         Velocities in Pinocchio's order.
     u : array_like (N, nu) or (N - 1, nu)
-        Inputs at the knots; with N - 1 rows, each row acts over one interval.
+        Inputs at the knots. If there are N - 1 rows, each row acts over one interval between knots.
     hold : {"linear", "previous"}, optional
         Inputs between the knots: "linear" interpolates, "previous" holds the value of the previous
         knot, like a digital controller. The default is "linear", or "previous" if u has N - 1
@@ -60,7 +60,8 @@ class Trajectory(Design):
         Axes in which the inputs on the base are given and held. local: base axes. hybrid: force in
         world axes, torque in base axes. world: both in world axes.
     verified : bool
-        False for data from a file without a SHA-256 digest, in which damage cannot be detected.
+        False for data from a file without a SHA-256 digest. Damage to such a file cannot be
+        detected.
 
     Raises
     ------
@@ -210,7 +211,7 @@ class Trajectory(Design):
         """Warn if the residual of the motion exceeds 1e-2, or raise `InputError` if `strict`.
 
         The message names the interval with the largest error, the error, and the number of
-        intervals that exceed 1e-2. A motion that overflows always raises.
+        intervals that exceed 1e-2. If the motion overflows, `InputError` is raised in either case.
         """
         fault = self._fault
         if fault and (strict or self.flow.residual.max() == np.inf):

@@ -162,14 +162,15 @@ class Thruster(WrenchInput):
     name : str, optional
         Name of the input; thruster_1, thruster_2, ... by default.
     max, min : float, optional
-        Limits [N], at least 0: a thruster never pulls. Keyword only, like all that follow.
+        Limits [N], at least 0: a thruster never pulls. Keyword only, like all parameters that
+        follow.
     on_off : bool
         Whether the thruster can only fire with `max` or be off. `simulate` then turns the command
         of each sample into one pulse of `max`, a whole number of steps long. The remaining
         impulse is carried over to the next sample, so that the mean impulse is correct.
     least_impulse : float, optional
-        Smallest impulse of a sample [N s]. Below it the thruster does not fire, and the impulse
-        is carried over to the next sample.
+        Smallest impulse of a sample [N s]. If the commanded impulse is smaller, the thruster does
+        not fire, and this impulse is carried over to the next sample.
 
     Examples
     --------
@@ -242,7 +243,7 @@ class ReactionWheel(WrenchInput):
     momentum : float
         h [N m s] along the axis, relative to the carrier; only for a wheel without inertia.
     max, min : float, optional
-        Limits [N m] of the motor's torque; keyword only, like all that follow.
+        Limits [N m] of the motor's torque; keyword only, like all parameters that follow.
     max_speed : float, optional
         Largest speed [rad/s] relative to the carrier, in both directions, of a wheel with inertia
         J. The wheel stores at most J max_speed [N m s].

@@ -47,7 +47,8 @@ def load(
     **fields
         inputs, outputs, stiffness, damping, rest, gravity, orbit, limits, passive, weights, start:
         see `Robot.replace`. Fields given here take precedence over the robot file. Locks, limits,
-        springs and dampers are merged with it name by name.
+        springs and dampers given here are added to the robot file's, and replace entries of the
+        same name.
 
     Returns
     -------

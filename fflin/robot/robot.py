@@ -86,7 +86,7 @@ class Robot(Coordinates):
         {name of an input or state: (least, largest)}, which replaces the limits of the URDF and
         of the inputs.
     links : mapping
-        {link: LinkMass} of all links with mass, as the URDF gives them.
+        {link: LinkMass}: mass properties of all links with mass, as given in the URDF.
     file_joints : tuple of str
         All joints of the file, including fixed joints.
     attached : tuple of (str, Robot)
@@ -139,7 +139,7 @@ class Robot(Coordinates):
             object.__setattr__(self, "inputs", default)
 
     def replace(self, **fields: Any) -> Robot:
-        """Return the same robot with other inputs, passive joints, gravity or orbit.
+        """Return a copy of the robot with other inputs, passive joints, gravity or orbit.
 
         Parameters
         ----------
@@ -162,7 +162,8 @@ class Robot(Coordinates):
         orbit : CircularOrbit, float, mapping or None
             Orbit of the robot, an altitude over the earth [m], or {parameter: value} of an orbit.
         passive : sequence of str
-            Joints without a motor; their torques are removed from the inputs.
+            Names of joints without a motor; the torques of these joints are removed from the
+            inputs.
         weights : mapping
             Default weights of `lqr`: ``rule`` ("urdf" or "identity"), and ``q``, ``r``,
             ``bryson``, each {state, input, group or pattern: weight or largest value}.
@@ -190,8 +191,8 @@ class Robot(Coordinates):
             If a field, a joint, a frame of an input or output, or a name in `limits` does not
             exist.
         ModelError
-            If dry friction is given, which is not differentiable at rest, or if the robot's model
-            was changed after the robot was made.
+            If dry friction is given (it is not differentiable at rest), or if the robot's model was
+            changed after the robot was made.
         """
         self.require_unchanged()
         robot = self
@@ -212,7 +213,7 @@ class Robot(Coordinates):
         return robot
 
     def with_mass_properties(self, bodies: Mapping[str, Any]) -> Robot:
-        """Return the same robot with other masses, centres of mass or inertias.
+        """Return a copy of the robot with other masses, centres of mass or inertias.
 
         Parameters
         ----------
@@ -247,7 +248,7 @@ class Robot(Coordinates):
     def perturbed(
         self, *, mass: float = 0.1, com: float = 0.1, inertia: float = 0.1, seed: int = 0
     ) -> Robot:
-        """Return the same robot with random, physically realisable mass properties.
+        """Return a copy of the robot with random, physically realisable mass properties.
 
         A number d is drawn uniformly from [-1, 1], independently for each body and axis:
 

@@ -48,7 +48,7 @@ class Motion(Design):
         Inputs that act from time t on, in the axes of `frame`. The last row repeats the row before
         it.
     target : ndarray (nx,) or (N, nx)
-        Target state. If the policy follows a trajectory, the trajectory's state at each time.
+        Target state; if the policy follows a trajectory, the state of the trajectory at each time.
         Empty if no target is known.
     prediction : ndarray (N, nx)
         State that the linear model predicts under the same control law. The array has no rows if
@@ -74,12 +74,12 @@ class Motion(Design):
         terms of the energy.
     com_drift : ndarray (N,)
         Distance [m] of the centre of mass from the position predicted by its initial velocity and
-        the impulse since. No rows in orbit, or if the file lacks it.
+        the impulse since. Empty in orbit, or if the file lacks it.
     state_names, input_names, state_units, input_units : tuple of str
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
     robot, urdf_sha256 : str
     stopped : str
-        Reason for which the run ended early; empty if it did not.
+        Reason why the run ended early; empty if it reached its end.
     wheels : tuple of str
         Joints that are reaction wheels. Their angles are not included in the errors.
     wheel_inertias : ndarray (k,)

@@ -71,8 +71,8 @@ def simulate(
 
     Thrusters never pull: a negative thrust is saturated at zero.
 
-    In orbit q and v are relative to the orbital frame, for policies too. Momentum is not conserved
-    there, and the projection is off.
+    In orbit, q and v are relative to the orbital frame; policies receive these values. Momentum is
+    not conserved there, and the projection is off.
 
     Parameters
     ----------
@@ -104,8 +104,9 @@ def simulate(
         sample time of the policy's model. If that model is continuous, the policy is evaluated at
         every stage of every step.
     delay : float
-        Time [s] from a sample to its effect, a multiple of dt. Before the first command arrives,
-        u0 of the policy's model acts, or zero. A delay without `sample` samples every dt.
+        Time [s] from a sample to its effect, a multiple of dt. Before the first command arrives, u0
+        of the policy's model acts, or zero without a model. If `delay` is given without `sample`,
+        the policy is sampled every dt.
     limits : "urdf", float, mapping or list of them, optional
         Limits at which the inputs saturate; by default none:
 
@@ -125,33 +126,35 @@ def simulate(
         Function callback(t, q, v, u), called at every recorded row.
     linear : LinearModel or bool, optional
         Model that predicts the motion under the same control law; by default the policy's own
-        model, False for no prediction. The law is a StateFeedback, a feedback along a trajectory,
-        an OutputFeedback or LinearController (without its noise), or no policy. A sampled law
-        is predicted only if every row falls on a sample.
+        model, False for no prediction. A motion can be predicted for a StateFeedback, a feedback
+        along a trajectory, an OutputFeedback or LinearController (without its noise), or no policy.
+        For a sampled law, every recorded row must fall on a sample.
     target : LinearModel or array_like (nx,), optional
         Target state from which errors are measured, or a model whose operating point is the
         target. By default the operating point of the policy's own model, or the followed
         trajectory's state at each time. A policy without either has no target.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
     reference : pin.SE3, optional
-        Chart of x and axes of u. By default the policy's; without a policy, frame "hybrid" ("lvlh"
-        in orbit) and the identity.
+        Chart of x and axes of u. By default the chart and axes of the policy; without a policy,
+        frame "hybrid" ("lvlh" in orbit) and the identity.
     every : int, optional
-        Steps from one recorded row to the next; by default 1. If that exceeds 100,000 rows, the
-        default is chosen to record about 10,000, and the motion's `notes` report this.
+        Number of steps from one recorded row to the next; by default 1. If this would give more
+        than 100,000 rows, the default is increased to record about 10,000 rows, and the motion's
+        `notes` report this.
     progress : bool, optional
         Whether to show a progress bar on stderr; by default on a terminal, for long runs.
     engine : {"python", "compiled"}, optional
         Engine that runs the loop. The default is Python, except that a run of more than 20,000
         steps uses the compiled engine if it has already been compiled. The compiled engine needs
-        numba, no orbit, and no policy, event, callback or disturbance in Python. Both engines
-        agree to machine precision.
+        numba. It does not support orbits, or policies, events, callbacks and disturbances written
+        in Python. Both engines agree to machine precision.
 
     Returns
     -------
     Motion
         Simulated motion. If it ended early, ``stopped`` gives the reason: an event, an interrupt
-        (Ctrl-C), or a loop that left the chart or diverged, with the step size.
+        (Ctrl-C), or a loop that left the chart or diverged. For such a loop, the step size is
+        given.
 
     Raises
     ------

@@ -44,8 +44,8 @@ class LFT(Design):
     repeats : ndarray (k,)
         Number of times that each delta is repeated in :math:`\Delta`.
     middle, half : ndarray (k,)
-        A parameter is ``middle + half * delta``. For tied parameters this is their common value,
-        or the common factor on their nominal values.
+        A parameter is ``middle + half * delta``. For tied parameters, this expression is their
+        common value, or the common factor on their nominal values.
     units : tuple of str
         Units of the parameters; "1" for a factor.
     state_names, input_names, output_names : tuple of str

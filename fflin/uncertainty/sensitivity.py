@@ -69,13 +69,13 @@ class Sensitivity:
       mass;
     - ``LINK.inertia.xx`` .. ``.yz`` [kg m^2] about the centre of mass, in the axes of the URDF's
       <inertial>; for a body, in the axes of its joint;
-    - ``LINK.density``, a relative factor on mass and inertia; ``BODY.mass`` of `monte_carlo` is
-      also such a factor.
+    - ``LINK.density``, a relative factor on mass and inertia. In `monte_carlo`, ``BODY.mass`` has
+      this meaning.
 
     Other parameters are ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
-    ``THRUSTER.direction.x`` (only rotation of the unit vector has an effect) and ``WHEEL.inertia``.
-    The inertia of a carrier includes its wheels. A larger wheel inertia therefore reduces the
-    inertia of the rest of the carrier.
+    ``THRUSTER.direction.x`` (a change of its length has no effect) and ``WHEEL.inertia``. The
+    inertia of a carrier includes its wheels. A larger wheel inertia therefore reduces the inertia
+    of the rest of the carrier.
 
     Attributes
     ----------
@@ -190,7 +190,7 @@ class Sensitivity:
     def check(self, names: Sequence[str] | None = None) -> dict[str, float]:
         """Compare the derivatives of A and B with finite differences.
 
-        The parameter is changed in small steps. At each step, A and B are computed independently,
+        Each parameter is changed in small steps. At each step, A and B are computed independently,
         from the derivatives of ABA.
 
         Parameters

@@ -111,8 +111,8 @@ class Uncertain:
     def at(self, values: Mapping[str, float]) -> Robot:
         """Return the robot with the parameters {parameter or pattern: value}.
 
-        Parameters that are not named keep their nominal values. The pattern of tied parameters
-        takes their common value, or a common factor on their nominal values.
+        Parameters that are not named keep their nominal values. For the pattern of tied parameters,
+        give their common value, or the common factor on their nominal values.
 
         Raises
         ------
@@ -192,11 +192,11 @@ class Uncertain:
     def worst(
         self, gain: Any, q: Array | None = None, *, samples: int = 200, seed: int = 0
     ) -> Worst:
-        """Search the set for the worst closed loop u = -K x, and bound the stable set.
+        """Search the uncertainty set for the worst closed loop u = -K x, and bound the stable set.
 
         The result is at least as bad as every corner and draw that was tried; its gains are
         accurate to five digits. With the same seed and more samples, the search first repeats the
-        smaller search, so its result is at least as bad as before.
+        smaller search. Its result is therefore at least as bad as the result of the smaller search.
 
         Parameters
         ----------
@@ -257,7 +257,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
         - the robot at the middle of the ranges is not physically realisable;
         - a mass, density or wheel inertia may become 0 or less;
         - a stiffness or damping may become negative;
-        - a tied parameter has another range too.
+        - a tied parameter is given a second range.
 
     References
     ----------

@@ -68,27 +68,28 @@ def visualize(
     - a translucent robot at the target, and another at the linear prediction, if there is one;
     - a time slider, and a panel with errors and inputs over time.
 
-    Along a trajectory, a translucent robot moves with the reference. The reference paths of base
-    and tool are dashed, and its joint curves are pale. A dotted line marks the time at which the
-    reference comes to rest. Every body is a node ``meshcat/robot/JOINT`` of meshcat's scene, at the
-    pose of the joint's frame.
+    Along a trajectory, a translucent robot moves with the reference. Dashed lines are the reference
+    paths of base and tool; pale curves are the reference joint positions. A dotted line marks the
+    time at which the reference comes to rest. Every body is a node ``meshcat/robot/JOINT`` of
+    meshcat's scene, at the pose of the joint's frame.
 
     Parameters
     ----------
     robot : Robot
         Robot to show.
     motion : Motion or Modes, optional
-        Motion from `simulate`; or modes from `modes`, which the page animates one at a time, listed
-        by name and frequency. Without it, a live page shows the robot with a slider per joint.
+        Motion from `simulate`, or modes from `modes`. The page lists modes by name and frequency,
+        and animates one of them. Without a motion or modes, a live page shows the robot with a
+        slider for each joint.
     html : path, optional
         File to write; a temporary one by default.
     png, gif : path, optional
-        Pictures to write; they need Chromium.
+        Files for a picture (.png) and an animation (.gif); both need Chromium.
     times : sequence of float, optional
         Times [s] of the pictures, four by default. One time gives a picture with its panel, several
         give a strip.
     open : bool, optional
-        Whether to open a browser; by default only if no file is given.
+        Whether to open a browser. By default a browser is opened if no file is given.
     scene : {"space", "lab"}, optional
         "space" shows sky and planet; "lab" shows a floor with a grid, the default under gravity. In
         orbit the planet is the central body, below and in its true size. Planet and stars rotate
@@ -99,11 +100,11 @@ def visualize(
         Seconds of motion per second of playback; by default 1, or more for motions longer than a
         minute. A simulation that is shown live is slowed down to this speed.
     follow : bool, optional
-        Whether the camera follows the base; by default only if the path is so long that the robot
-        would appear as a dot.
+        Whether the camera follows the base; by default it does if the path is so long that the
+        robot would appear as a dot.
     target : array_like (nq,), optional
         Configuration from which errors are measured; by default the motion's target. Without a
-        target, the page shows the change from the start, and no translucent robot.
+        target, the page shows the change from the start, and it shows no translucent robot.
     tool : str, optional
         Frame whose trail is drawn; by default "tool", or the last link of the longest chain.
     cloud : Campaign, optional
@@ -118,7 +119,7 @@ def visualize(
     port : int
         Port of the live page; a free port by default.
     frame : {"lvlh", "hill"}, optional
-        Orbital frame that is the world of a live robot in orbit; "lvlh" by default.
+        Orbital frame used as the world of a robot in orbit on a live page; "lvlh" by default.
 
     Returns
     -------
