@@ -47,7 +47,7 @@ def add_commands(commands: Commands) -> None:
     add_options(modes, "--html >FILE: write a page that plays the mode shapes")
     validity = command(
         *(commands, "validity", _validity),
-        "measure up to which displacements the linear model is accurate and its regulator settles",
+        "measure how far the robot can be displaced until the linear model or its regulator fails",
         "fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
     )
     add_point(validity)

@@ -183,9 +183,9 @@ def kalman(
 
     .. math:: A P + P A^T - P C^T V^{-1} C P + W = 0,\qquad L = P C^T V^{-1}
 
-    or its discrete-time counterpart. SciPy's solver and Newton's method solve the equation, see
-    `lqr`. For a model with reaction wheels, the filter estimates only the states that `lqr`
-    regulates. It uses only outputs that depend on no other states.
+    or its discrete-time counterpart. SciPy solves the equation, and Newton's method refines the
+    solution, see `lqr`. For a model with reaction wheels, the filter estimates only the states that
+    `lqr` regulates. It uses only outputs that depend on no other states.
 
     Parameters
     ----------

@@ -148,7 +148,7 @@ class Allocation:
 
     @property
     def lin(self) -> LinearModel | None:
-        """Model of the robot `design` for which the policy was made, or None."""
+        """Linear model of `design`, the robot for which the policy was made, or None."""
         return getattr(self.policy, "lin", None)
 
     def bind(self, robot: Robot) -> Policy:

@@ -84,10 +84,10 @@ def jam(
 ) -> Impact:
     r"""Stop joints or wheels instantly and permanently at their present positions.
 
-    The other joints are free during the impact. The velocity just after it solves
-    :math:`M_+ \nu_+ = G^T M \nu` (13.1), where G is the Jacobian of the robot with the jammed
-    joints fixed. Linear and angular momentum are conserved. If a motor fails but its joint still
-    moves freely, use ``robot.replace(passive=[joint])`` instead; there is then no impact.
+    The other joints are free during the impact. Immediately after the impact, the velocity
+    satisfies :math:`M_+ \nu_+ = G^T M \nu` (13.1), where G is the Jacobian of the robot with the
+    jammed joints fixed. Linear and angular momentum are conserved. If a motor fails but its joint
+    still moves freely, use ``robot.replace(passive=[joint])`` instead; there is then no impact.
 
     Parameters
     ----------

@@ -197,8 +197,8 @@ def from_tool(
     Returns
     -------
     LinearModel
-        Model whose ``q``, ``v`` and ``u0`` are the point in fflin's order. `check` and
-        ``certificate`` show how accurate A and B are.
+        Model whose ``q``, ``v`` and ``u0`` hold the operating point in the order of fflin. `check`
+        and ``certificate`` show how accurate A and B are.
 
     Raises
     ------
