@@ -7,7 +7,7 @@ from benchmarks.robots import Array
 
 # A normal's standard deviation, and the least and largest of a uniform: of the mass, relative, and
 # with it the inertia.
-SPREADS = {"q_b": 0.05, "base.mass": (-0.1, 0.1)}
+SPREADS = {"q_b": 0.05, "base.density": (-0.1, 0.1)}
 
 
 def draws(loop: Loop, runs: int) -> Array:

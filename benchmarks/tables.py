@@ -75,7 +75,7 @@ def machine() -> str:
             cpu = next(line.split(":")[1].strip() for line in file if "model name" in line)
     except (OSError, StopIteration):
         pass
-    from fflin.base.version import __version__
+    from fflin.base import __version__
 
     versions = [f"Python {platform.python_version()}", f"fflin {__version__}"]
     for name in PACKAGES:

@@ -61,6 +61,7 @@ html_theme = "furo"
 html_title = f"fflin {release}"
 html_static_path = ["_static"]
 html_css_files = ["fflin.css"]
+html_js_files = ["from_disk.js"]
 html_copy_source = False
 html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True}

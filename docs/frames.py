@@ -13,7 +13,7 @@ import numpy as np
 
 import fflin
 from fflin.campaign.dispersions import Draws
-from fflin.campaign.settling import OUTCOMES, SettlingJob, checked_loop, flown
+from fflin.campaign.settling import OUTCOMES, SettlingJob, checked_loop, settle
 
 FRAMES = ("hybrid", "local", "world")
 ROBOTS, TURNS, POSTURES = ("canadarm2", "ur5", "panda", "servicer_7dof"), (20, 60, 90, 120, 150), 10
@@ -34,7 +34,7 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
         for frame in FRAMES:
             there = replace(loop, lin=replace(lin, frame=frame))
             job = SettlingJob(there, False, None, 0.0, engine="python")
-            arrays = flown(job, lambda runs, *_, x=x: Draws(x, runs), np.arange(1), {})
+            arrays = settle(job, lambda runs, *_, x=x: Draws(x, runs), np.arange(1))
             counts[frame] += OUTCOMES[int(arrays["outcome"][0])] == "settled"
     return "/".join(map(str, counts.values()))
 

@@ -1,35 +1,160 @@
 """Linear models of free-floating robots from URDF, for analysis, control and simulation."""
 
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
-from fflin.base.version import __version__
+from fflin.base import __version__
 
-# The stub beside this file is the only list of the public names, grouped by task, with their
-# modules. A name is imported when it is first used, so that a command without dynamics does not
-# load Pinocchio.
-_titles: dict[str, list[str]] = {}
-_modules: dict[str, str] = {}
-for _line in Path(__file__).with_suffix(".pyi").read_text("utf-8").splitlines():
-    if _line.startswith("# "):
-        _names = _titles[_line[2:]] = []
-    elif _line.startswith("from "):
-        _, _module, _, _name, *_ = _line.split()
-        _modules[_name] = _module
-        _names.append(_name)
+# The public names by task, with their modules. A name is imported when it is first used (PEP 562),
+# so that a command without dynamics does not load Pinocchio. Type checkers read the stub beside
+# this file, which has the same names and modules.
+_PUBLIC = {
+    "Robots": {
+        "robot.loading": ["load", "from_model"],
+        "robot.catalog": ["list_robots"],
+        "robot.robot": ["Robot"],
+        "robot.orbit": ["CircularOrbit"],
+        "robot.appendages": ["FlexibleAppendage", "Slosh"],
+        "dynamics.points": ["configuration", "velocity", "effort"],
+        "dynamics.impact": ["capture", "Capture", "jam", "Impact"],
+    },
+    "Inputs": {
+        "robot.inputs": ["BaseTorque", "BaseForce", "JointTorque", "Thruster", "ReactionWheel"],
+        "robot.robot_files": ["load_inputs"],
+    },
+    "Outputs": {
+        "robot.outputs": [
+            "FullState",
+            "JointPositions",
+            "JointVelocities",
+            "BasePose",
+            "FramePose",
+            "FrameVelocity",
+            "RelativePose",
+            "Gyroscope",
+            "Accelerometer",
+            "CenterOfMass",
+            "Momentum",
+        ],
+    },
+    "Linear models": {
+        "linear.linearization": ["linearize", "Linearizer"],
+        "linear.model": ["LinearModel", "Certificate"],
+        "dynamics.state": ["StateMap"],
+        "linear.nonlinear": ["outputs"],
+        "linear.equilibrium": ["equilibrium", "Equilibrium"],
+        "linear.trajectory": ["Trajectory"],
+        "linear.linear_trajectory": ["linearize_trajectory", "LinearTrajectory"],
+        "linear.exchange": ["transform", "from_tool", "ToolModel", "ToolGain"],
+        "linear.check": ["check", "Check"],
+    },
+    "Analysis": {
+        "analysis.controllability": [
+            "controllability",
+            "Controllability",
+            "observability",
+            "Observability",
+        ],
+        "analysis.gramians": ["gramians", "Gramians"],
+        "analysis.modes": ["modes", "Modes", "Mode"],
+        "analysis.effective_masses": ["effective_masses", "EffectiveMasses"],
+        "analysis.relative_equilibria": [
+            "relative_equilibria",
+            "RelativeEquilibria",
+            "RelativeEquilibrium",
+        ],
+        "analysis.reduction": [
+            "momentum_reduction",
+            "ReducedModel",
+            "generalized_inertia",
+            "generalized_jacobian",
+        ],
+    },
+    "Control": {
+        "control.lqr": ["lqr", "acceleration_lqr"],
+        "linear.fit": ["line_up"],
+        "control.weights": ["bryson", "sampled_cost"],
+        "control.gain": ["Gain"],
+        "control.plan": ["plan"],
+        "control.mpc": ["mpc"],
+        "control.tvlqr": ["tvlqr", "tvkalman"],
+        "control.gain_schedule": ["GainSchedule", "FilterSchedule"],
+        "control.kalman": ["kalman", "Estimator", "lqg", "Compensator"],
+    },
+    "Uncertainty": {
+        "uncertainty.sensitivity": ["sensitivity", "Sensitivity"],
+        "uncertainty.uncertain": ["uncertain", "Uncertain"],
+        "uncertainty.lft": ["LFT"],
+    },
+    "Policies": {
+        "control.policies": ["StateFeedback", "Allocation"],
+        "control.tracking": ["TrajectoryFeedback", "TrajectoryOutputFeedback"],
+        "control.linear_controller": ["OutputFeedback", "LinearController"],
+        "batch.gains": ["ScheduledFeedback"],
+    },
+    "C code": {
+        "export.writing": ["write_c"],
+        "export.claw": ["CLaw"],
+    },
+    "Simulation": {
+        "simulation.simulate": ["simulate"],
+        "simulation.motion": ["Motion"],
+        "view.visualize": ["visualize"],
+    },
+    "Campaigns": {
+        "campaign.monte_carlo": ["monte_carlo"],
+        "campaign.campaign": ["Campaign"],
+        "campaign.spreads": ["load_dispersions"],
+        "campaign.funnel": ["funnel", "Funnel"],
+        "campaign.validity": ["validity", "Validity"],
+    },
+    "Sweeps": {
+        "batch.sweep": ["sweep"],
+        "batch.linear_batch": ["LinearBatch"],
+        "batch.gains": ["lqr_batch", "GainBatch"],
+        "batch.configurations": ["grid", "Grid", "random_configurations", "RandomConfigurations"],
+    },
+    "Figures": {
+        "analysis.plots": ["plot_matrices", "plot_check", "plot_modes"],
+        "campaign.plots": ["plot_validity", "plot_funnel", "plot_campaign"],
+        "control.plots": ["plot_poles", "plot_loops"],
+        "simulation.motion": ["plot_motion"],
+    },
+    "Errors": {
+        "base.errors": [
+            "FflinError",
+            "InputError",
+            "UnknownNameError",
+            "FileError",
+            "MissingPackageError",
+            "ModelError",
+            "UrdfError",
+            "ChartError",
+            "EquilibriumError",
+            "SingularInertiaError",
+            "StabilizabilityError",
+            "DetectabilityError",
+            "SweepError",
+            "FflinWarning",
+        ],
+    },
+}
 
-for _title, _names in _titles.items():
-    _rows = (", ".join(_names[at : at + 4]) for at in range(0, len(_names), 4))
+
+_MODULES: dict[str, str] = {}
+for _title, _modules in _PUBLIC.items():
+    _names = [name for names in _modules.values() for name in names]
+    _rows = [", ".join(_names[at : at + 4]) for at in range(0, len(_names), 4)]
     __doc__ = "\n    ".join((f"{__doc__}\n\n{_title}", *_rows))
+    _MODULES |= {name: module for module, names in _modules.items() for name in names}
 
-__all__ = sorted(_modules)  # noqa: PLE0605
+__all__ = sorted(_MODULES)  # noqa: PLE0605
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _modules:
+    if name not in _MODULES:
         raise AttributeError(f"module 'fflin' has no attribute '{name}'")
-    value = getattr(import_module(_modules[name]), name)
+    value = getattr(import_module(f"fflin.{_MODULES[name]}"), name)
     if type(value) is type(__getattr__):
         _untyped(value)
     globals()[name] = value
@@ -47,4 +172,4 @@ def _untyped(function: Any) -> None:
 
 def __dir__() -> list[str]:
     own = (name for name in globals() if name.startswith("__") and name.endswith("__"))
-    return sorted({*own, *_modules})
+    return sorted({*own, *_MODULES})

@@ -8,11 +8,13 @@ from fflin.robot.loading import from_model as from_model
 from fflin.robot.catalog import list_robots as list_robots
 from fflin.robot.robot import Robot as Robot
 from fflin.robot.orbit import CircularOrbit as CircularOrbit
+from fflin.robot.appendages import FlexibleAppendage as FlexibleAppendage
+from fflin.robot.appendages import Slosh as Slosh
 from fflin.dynamics.points import configuration as configuration
 from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort
-from fflin.dynamics.capture import capture as capture
-from fflin.dynamics.capture import Capture as Capture
+from fflin.dynamics.impact import capture as capture
+from fflin.dynamics.impact import Capture as Capture
 from fflin.dynamics.impact import jam as jam
 from fflin.dynamics.impact import Impact as Impact
 
@@ -22,7 +24,7 @@ from fflin.robot.inputs import BaseForce as BaseForce
 from fflin.robot.inputs import JointTorque as JointTorque
 from fflin.robot.inputs import Thruster as Thruster
 from fflin.robot.inputs import ReactionWheel as ReactionWheel
-from fflin.robot.input_files import load_inputs as load_inputs
+from fflin.robot.robot_files import load_inputs as load_inputs
 
 # Outputs
 from fflin.robot.outputs import FullState as FullState
@@ -52,14 +54,15 @@ from fflin.linear.linear_trajectory import LinearTrajectory as LinearTrajectory
 from fflin.linear.exchange import transform as transform
 from fflin.linear.exchange import from_tool as from_tool
 from fflin.linear.exchange import ToolModel as ToolModel
+from fflin.linear.exchange import ToolGain as ToolGain
 from fflin.linear.check import check as check
 from fflin.linear.check import Check as Check
 
 # Analysis
 from fflin.analysis.controllability import controllability as controllability
 from fflin.analysis.controllability import Controllability as Controllability
-from fflin.analysis.observability import observability as observability
-from fflin.analysis.observability import Observability as Observability
+from fflin.analysis.controllability import observability as observability
+from fflin.analysis.controllability import Observability as Observability
 from fflin.analysis.gramians import gramians as gramians
 from fflin.analysis.gramians import Gramians as Gramians
 from fflin.analysis.modes import modes as modes
@@ -70,24 +73,24 @@ from fflin.analysis.effective_masses import EffectiveMasses as EffectiveMasses
 from fflin.analysis.relative_equilibria import relative_equilibria as relative_equilibria
 from fflin.analysis.relative_equilibria import RelativeEquilibria as RelativeEquilibria
 from fflin.analysis.relative_equilibria import RelativeEquilibrium as RelativeEquilibrium
-from fflin.analysis.momentum import momentum_reduction as momentum_reduction
-from fflin.analysis.momentum import ReducedModel as ReducedModel
-from fflin.analysis.momentum import generalized_inertia as generalized_inertia
-from fflin.analysis.momentum import generalized_jacobian as generalized_jacobian
+from fflin.analysis.reduction import momentum_reduction as momentum_reduction
+from fflin.analysis.reduction import ReducedModel as ReducedModel
+from fflin.analysis.reduction import generalized_inertia as generalized_inertia
+from fflin.analysis.reduction import generalized_jacobian as generalized_jacobian
 
 # Control
 from fflin.control.lqr import lqr as lqr
 from fflin.linear.fit import line_up as line_up
 from fflin.control.weights import bryson as bryson
 from fflin.control.gain import Gain as Gain
-from fflin.control.acceleration_lqr import acceleration_lqr as acceleration_lqr
+from fflin.control.lqr import acceleration_lqr as acceleration_lqr
 from fflin.control.weights import sampled_cost as sampled_cost
 from fflin.control.plan import plan as plan
 from fflin.control.mpc import mpc as mpc
 from fflin.control.tvlqr import tvlqr as tvlqr
 from fflin.control.gain_schedule import GainSchedule as GainSchedule
-from fflin.control.tvkalman import tvkalman as tvkalman
-from fflin.control.tvkalman import FilterSchedule as FilterSchedule
+from fflin.control.tvlqr import tvkalman as tvkalman
+from fflin.control.gain_schedule import FilterSchedule as FilterSchedule
 from fflin.control.kalman import kalman as kalman
 from fflin.control.kalman import Estimator as Estimator
 from fflin.control.kalman import lqg as lqg
@@ -104,10 +107,14 @@ from fflin.uncertainty.lft import LFT as LFT
 from fflin.control.policies import StateFeedback as StateFeedback
 from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
 from fflin.control.policies import Allocation as Allocation
-from fflin.control.output_feedback import OutputFeedback as OutputFeedback
+from fflin.control.linear_controller import OutputFeedback as OutputFeedback
 from fflin.control.linear_controller import LinearController as LinearController
-from fflin.control.output_feedback import TrajectoryOutputFeedback as TrajectoryOutputFeedback
+from fflin.control.tracking import TrajectoryOutputFeedback as TrajectoryOutputFeedback
 from fflin.batch.gains import ScheduledFeedback as ScheduledFeedback
+
+# C code
+from fflin.export.writing import write_c as write_c
+from fflin.export.claw import CLaw as CLaw
 
 # Simulation
 from fflin.simulation.simulate import simulate as simulate
@@ -117,9 +124,9 @@ from fflin.view.visualize import visualize as visualize
 # Campaigns
 from fflin.campaign.monte_carlo import monte_carlo as monte_carlo
 from fflin.campaign.campaign import Campaign as Campaign
-from fflin.campaign.dispersion_files import load_dispersions as load_dispersions
+from fflin.campaign.spreads import load_dispersions as load_dispersions
 from fflin.campaign.funnel import funnel as funnel
-from fflin.campaign.reach import Funnel as Funnel
+from fflin.campaign.funnel import Funnel as Funnel
 from fflin.campaign.validity import validity as validity
 from fflin.campaign.validity import Validity as Validity
 
@@ -137,8 +144,8 @@ from fflin.batch.configurations import RandomConfigurations as RandomConfigurati
 from fflin.analysis.plots import plot_matrices as plot_matrices
 from fflin.analysis.plots import plot_check as plot_check
 from fflin.analysis.plots import plot_modes as plot_modes
-from fflin.campaign.region_plots import plot_validity as plot_validity
-from fflin.campaign.region_plots import plot_funnel as plot_funnel
+from fflin.campaign.plots import plot_validity as plot_validity
+from fflin.campaign.plots import plot_funnel as plot_funnel
 from fflin.control.plots import plot_poles as plot_poles
 from fflin.control.plots import plot_loops as plot_loops
 from fflin.simulation.motion import plot_motion as plot_motion

@@ -1,7 +1,11 @@
-"""The picture of the rooms is that of the code."""
+"""The picture of the rooms is that of the code, and the stub that of the public names."""
 
+import ast
+import re
 import runpy
 from pathlib import Path
+
+import fflin
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -11,4 +15,38 @@ def test_the_picture_is_made_from_the_code_and_no_import_runs_up():
     picture = rooms["drawing"]()
     assert (DOCS / "rooms.svg").read_text(encoding="utf-8") == picture, "run python docs/rooms.py"
     assert 'class="up"' not in picture
-    assert len(rooms["rooms"]()) == 13
+    assert len(rooms["rooms"]()) == 14
+
+
+def test_the_page_names_modules_and_files_that_exist():
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    package = Path(fflin.__file__).parent
+    rooms = "|".join(runpy.run_path(str(DOCS / "rooms.py"))["rooms"]())
+    modules = set(re.findall(rf"`((?:{rooms})(?:\.\w+)+)`", page))
+    assert len(modules) > 100
+    assert not [m for m in modules if not (package / f"{m.replace('.', '/')}.py").is_file()]
+    files = set(re.findall(r"`([\w./]+/\w*\.?(?:pyi?|toml)?)`", page))
+    assert len(files) > 40
+    places = package, DOCS.parent
+    assert not [f for f in files - {"tests/ROOM"} if not any((p / f).exists() for p in places)]
+
+
+def test_the_stub_has_the_names_and_modules_of_the_package():
+    tree = ast.parse(Path(fflin.__file__).with_suffix(".pyi").read_text())
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    # In a stub a name is public where it is imported as itself.
+    names = {alias.asname for node in imports for alias in node.names if alias.asname == alias.name}
+    assert names == set(fflin.__all__)
+    modules = {alias.name: node.module for node in imports for alias in node.names}
+    assert modules == {name: f"fflin.{module}" for name, module in fflin._MODULES.items()}
+
+
+def test_the_package_and_its_citation_have_the_same_version():
+    root = Path(__file__).parents[1]
+    project = (root / "pyproject.toml").read_text(encoding="utf-8")
+    citation = (root / "CITATION.cff").read_text(encoding="utf-8")
+    found = [
+        re.search(r'^version = "(.*)"$', project, re.M),
+        re.search(r"^version: (.*)$", citation, re.M),
+    ]
+    assert [match and match[1] for match in found] == [fflin.__version__] * 2

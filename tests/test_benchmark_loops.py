@@ -177,7 +177,7 @@ def test_campaigns_on_threads_are_the_same():
     alone, threads = (fflin_campaign("", loop, 16, threads=count) for count in (1, 4))
     alone.run(), threads.run()
     np.testing.assert_array_equal(alone.end(), threads.end())
-    assert set(SPREADS) == {"q_b", "base.mass"} and draws(loop, 16).shape == (16, 4)
+    assert set(SPREADS) == {"q_b", "base.density"} and draws(loop, 16).shape == (16, 4)
 
 
 def test_floor_is_timed_before_and_after(monkeypatch):

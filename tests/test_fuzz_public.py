@@ -42,6 +42,7 @@ def results(name):
 
 
 RESULTS = {
+    "ToolGain",
     *(
         "Campaign",
         "Capture",

@@ -12,8 +12,9 @@ def run() -> Table:
         "One linearisation at rest",
         "The columns show the time of fflin, the ratio of this time to a lower bound (crba, dpotrf "
         "and dpotri called by hand), and the times of the other tools divided by the time of "
-        "fflin. If such a ratio is above 1, fflin is faster. MuJoCo by hand consists of "
-        "kinematics, inertia, factorisation, solution and B, without checks, names or units.",
+        "fflin. If such a ratio is above 1, fflin is faster. The column 'MuJoCo by hand' is a "
+        "sequence of MuJoCo functions for kinematics, inertia, factorisation, solution and B, "
+        "without checks, names or units.",
         (random_point(load(name)) for name in NAMES),
         fflin_call,
         in_readme=True,

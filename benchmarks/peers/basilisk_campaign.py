@@ -27,7 +27,7 @@ def campaign(loop: Loop, drawn: Array) -> Contender:
     ends: list[Array] = []
     hub = BasiliskLoop(loop).craft.hub
     attitude, mass = np.ravel(hub.sigma_BNInit).tolist(), hub.mHub
-    least, largest = (mass * (1.0 + each) for each in SPREADS["base.mass"])
+    least, largest = (mass * (1.0 + each) for each in SPREADS["base.density"])
 
     def make() -> SimBaseClass:
         here = BasiliskLoop(loop)

@@ -1,11 +1,12 @@
-"""Controllability of a linear model, with the names of its uncontrollable states."""
+"""Controllability and observability of a linear model, with names of what is missed."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fflin.analysis import mechanics
+from fflin.analysis.hautus import split_by_poles, unobservable
 from fflin.analysis.mechanics import ConservedMomenta
 from fflin.analysis.names import (
     combination,
@@ -15,12 +16,20 @@ from fflin.analysis.names import (
     unsettled,
     with_rates,
 )
-from fflin.analysis.pbh import split_by_poles
-from fflin.analysis.ranks import FixedPoles, Margin, Noisy, echelon, image, null_space, unit_columns
-from fflin.analysis.second_order import Hidden, SecondOrder, hidden
-from fflin.base.frozen import FrozenArrays
+from fflin.analysis.ranks import (
+    EPS,
+    FixedPoles,
+    Margin,
+    Noisy,
+    Values,
+    echelon,
+    image,
+    null_space,
+    unit_columns,
+    without_rounding,
+)
 from fflin.base.tables import folded
-from fflin.base.validation import Array
+from fflin.base.validation import Array, FrozenArrays
 from fflin.linear.model import LinearModel
 
 _LOOPS = (
@@ -54,8 +63,9 @@ class Controllability(FrozenArrays):
     stabilizable : bool
         Whether all fixed poles are stable.
     reach : dict
-        {"base attitude", "base position", "joints": number of independent directions}. The inputs
-        can set these directions if all other states may take any value.
+        {"base attitude", "base position", "joints": number of independent directions}. Along each
+        of these directions the inputs can bring the state to any value, if the final values of all
+        other states are left free.
     method : str
         Method that determined the dimension: "closed form", "modes" or "eigenvalues".
     margin : Margin
@@ -78,7 +88,7 @@ class Controllability(FrozenArrays):
     uncontrollable: tuple[str, ...]
     rows: Array
     basis: Array
-    fixed_poles: Any
+    fixed_poles: Values
     stabilizable: bool
     reach: dict[str, int]
     method: str
@@ -158,31 +168,44 @@ def controllability(lin: LinearModel) -> Controllability:
     (6, False)
     """
     lin = mechanics.checked(lin)
-    held = mechanics.conserved(lin)
-    part = _by_second_order(lin, held) or _by_poles(lin, held)
-    fixed, size = part.fixed, mechanics.state_sizes(lin)
-    others: Array = np.zeros((len(part.rows), len(lin.A)))
-    others[:, held.selected] = part.rows
+    conserved, size = mechanics.conserved(lin), mechanics.state_sizes(lin)
+    part = _by_second_order(lin, conserved) or _by_poles(lin, conserved)
+    fixed, z = part.fixed, conserved.selected
+    rows, names = part.rows, part.names
+    if names is None:
+        rows = echelon(rows.T, 1.0 / size[z])[0].T
+        states = tuple(lin.state_names[i] for i in z)
+        names = tuple(combination(row, states, 1.0 / size[z]) for row in rows)
+    others: Array = np.zeros((len(rows), len(lin.A)))
+    others[:, z] = rows
     # States are named after the coordinates that an input pushes on directly, where possible.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
-    basis, pivots = echelon(held.T @ part.reached, size, np.tile(driven, 2))
-    zero = np.full(2 * len(held.weights), 1.0 if lin.dt else 0.0)
-    margin = held.margin & fixed.margin
+    basis, pivots = echelon(conserved.T @ part.controllable, size, np.tile(driven, 2))
+    zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
+    margin = conserved.margin & fixed.margin
     doubts = undecided(lin, margin, "controllable", basis.shape[1])
     if not len(zero):
         doubts += unsettled(lin, fixed.settling, "stabilizable")
+    groups = np.array([name.partition(".")[0] for name in lin.state_names[: len(lin.M)]])
+    titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
+    weighted = (basis * size[:, None])[: len(groups)]
+    momenta = momentum_names(lin, conserved)
     return Controllability(
         dimension=basis.shape[1],
         controllable=tuple(lin.state_names[i] for i in pivots),
-        uncontrollable=(*momentum_names(lin, held), *part.names),
-        rows=np.vstack((held.momenta, held.coordinates, others)),
+        uncontrollable=(*momenta, *names),
+        rows=np.vstack((conserved.momenta, conserved.coordinates, others)),
         basis=basis,
         fixed_poles=np.concatenate((zero, fixed.poles)),
         stabilizable=not len(zero) and fixed.decays,
-        reach=_reach(lin, basis * size[:, None]),
+        reach={
+            title: image(unit_columns(weighted[groups == group]), 1e-8)[0].shape[1]
+            for group, title in titles.items()
+            if group in groups
+        },
         method=part.method,
         margin=margin,
-        notes=(*_notes(lin, held), *doubts),
+        notes=(*_notes(lin, conserved, momenta), *doubts),
         robot=lin.robot,
     )
 
@@ -190,76 +213,74 @@ def controllability(lin: LinearModel) -> Controllability:
 class _Part(NamedTuple):
     """The split of what is left without the conserved momenta, in its own coordinates."""
 
-    reached: Array
-    rows: Array
-    names: tuple[str, ...]
+    controllable: Array  # (2 r, d), a basis
+    rows: Array  # (2 r - d, 2 r) with rows @ z what no input acts on
+    names: tuple[str, ...] | None  # of the rows; None if they are named after their states
     method: str
     fixed: FixedPoles
 
 
-def _by_poles(lin: LinearModel, held: ConservedMomenta) -> _Part:
-    z, R = held.selected, held.rates
-    found = split_by_poles(mechanics.slopes(lin)[z] @ held.T, lin.B[z], R.T @ lin.M @ R, lin.dt)
-    rows, names = _labels(lin, found.rows, held)
-    return _Part(found.reached, rows, names, "eigenvalues", found.fixed.seen(R))
+def _by_poles(lin: LinearModel, conserved: ConservedMomenta) -> _Part:
+    z, R = conserved.selected, conserved.rates
+    X, M = mechanics.slopes(lin)[z] @ conserved.T, R.T @ lin.M @ R
+    found = split_by_poles(X, lin.B[z], M, lin.dt)
+    return _Part(found.inside, found.rows, None, "eigenvalues", found.fixed.transformed(R))
 
 
-def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
-    source, R = mechanics.at_rest(lin), held.rates
+def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | None:
+    source, R = mechanics.at_rest(lin), conserved.rates
     if source is None:
         return None
-    system, r = mechanics.second_order(source).restricted(R), len(held.kept)
+    system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
     idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
     if not system.acting or (not idle.shape[1] and not lin.dt):
         # Inputs reach every momentum that is not conserved, and so the coordinates.
-        everything, fixed = np.eye(2 * r), FixedPoles(margin=margin.seen(R / system.size))
+        everything, fixed = np.eye(2 * r), FixedPoles(margin=margin.transformed(R / system.size))
         return _Part(everything, everything[:0], (), "closed form", fixed)
-    found = hidden(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
+    found = unobservable(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
     if found is None:
         return None
     # By symmetry a motion (s, v) that S^T s does not show is a row that no input moves.
     s, v = np.split(found.motions, 2)
-    pushed = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
+    rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
+    # The controllable subspace is orthogonal to those rows.
     size = np.tile(system.size, 2)
-    # An orthonormal basis of what is orthogonal to those rows.
-    across = pushed / size
-    across = np.linalg.qr((across / np.linalg.norm(across, axis=1, keepdims=True)).T, "complete")[0]
-    reached = across[:, len(pushed) :] / size[:, None]
-    to_s = np.linalg.inv((mechanics.rates_of_positions(mechanics.slopes(source)) @ R)[held.kept])
-    reached[:r] = np.linalg.solve(to_s, reached[:r])
+    normal = rows / size
+    normal = np.linalg.qr((normal / np.linalg.norm(normal, axis=1, keepdims=True)).T, "complete")[0]
+    controllable = normal[:, len(rows) :] / size[:, None]
+    to_s = np.linalg.inv(
+        (mechanics.rates_of_positions(mechanics.slopes(source)) @ R)[conserved.kept]
+    )
+    controllable[:r] = np.linalg.solve(to_s, controllable[:r])
+    fixed = found.fixed.transformed(R)
     if system.D.values.any():
-        rows, names = _labels(lin, np.hstack((pushed[:, :r] @ to_s, pushed[:, r:])), held)
-        method = "eigenvalues"
-    else:
-        rows, names = _vibration_rows(found, system, to_s, lin, held)
-        method = "modes"
-    return _Part(reached, rows, names, method, found.fixed.seen(R))
+        rows = np.hstack((rows[:, :r] @ to_s, rows[:, r:]))
+        return _Part(controllable, rows, None, "eigenvalues", fixed)
+    # Without damping, the rows read the positions and rates of vibrations that no input drives.
+    members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
+    read, names = [np.zeros((0, 2 * r))], list[str]()
+    for pole, shapes in found.shapes:
+        if pole.real < 0.0:  # the positive one of the pair has the same shapes
+            continue
+        momenta = shapes.real.T @ system.M
+        zero = np.zeros_like(momenta)
+        read += [np.hstack((momenta @ to_s, zero)), np.hstack((zero, momenta))]
+        kind = "vibration" if pole.imag else "instability"
+        for what in ("", "rate of "):
+            for each in shapes.real.T * system.size:
+                shape = combination(each / np.abs(each).max(), members, np.ones(r))
+                names.append(f"{what}{kind} at {abs(pole):.4g} rad/s ({shape})")
+    return _Part(controllable, np.vstack(read), tuple(names), "modes", fixed)
 
 
-def _labels(lin: LinearModel, rows: Array, held: ConservedMomenta) -> tuple[Array, tuple[str, ...]]:
-    """Return the same rows in echelon form, and their names."""
-    names = tuple(np.array(lin.state_names)[held.selected])
-    size = 1.0 / mechanics.state_sizes(lin)[held.selected]
-    rows = echelon(rows.T, size)[0].T
-    return rows, tuple(combination(row, names, size) for row in rows)
-
-
-def _reach(lin: LinearModel, weighted: Array) -> dict[str, int]:
-    groups = [name.partition(".")[0] for name in lin.state_names[: len(lin.M)]]
-    titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
-    rows = {title: np.array(groups) == group for group, title in titles.items() if group in groups}
-    return {
-        title: image(unit_columns(weighted[: len(groups)][chosen]), 1e-8)[0].shape[1]
-        for title, chosen in rows.items()
-    }
-
-
-def _notes(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
+def _notes(
+    lin: LinearModel, conserved: ConservedMomenta, momenta: tuple[str, ...]
+) -> tuple[str, ...]:
     notes = []
-    turned = any("angular momentum" in name for name in momentum_names(lin, held))
-    if turned and any(lin.state_names[i].startswith("q_m.") for i in held.kept):
+    rotates = any("angular momentum" in name for name in momenta)
+    if rotates and any(lin.state_names[i].startswith("q_m.") for i in conserved.kept):
         notes.append(_LOOPS)
-    if len(held.weights):
+    if momenta:
         notes.append("fflin.momentum_reduction removes the conserved momenta")
     if not lin.is_equilibrium():
         notes.append(
@@ -268,28 +289,133 @@ def _notes(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _vibration_rows(
-    found: Hidden,
-    system: SecondOrder,
-    to_s: Array,
-    lin: LinearModel,
-    held: ConservedMomenta,
-) -> tuple[Array, tuple[str, ...]]:
-    """Return the rows that read the undriven modes of an undamped model, and their names."""
-    r = len(system.M)
-    rows, labels = [np.zeros((0, 2 * r))], []
-    rates = (lin.state_names[len(lin.M) + i] for i in held.kept)
-    members = tuple(name.split(".", 1)[-1] for name in rates)
-    for pole, missed in found.shapes:
-        if pole.real < 0.0:  # the positive one of the pair has the same shapes
-            continue
-        shapes = missed.real
-        momenta = shapes.T @ system.M
-        zero = np.zeros_like(momenta)
-        rows += [np.hstack((momenta @ to_s, zero)), np.hstack((zero, momenta))]
-        kind = "vibration" if pole.imag else "instability"
-        for what in ("", "rate of "):
-            for s in shapes.T * system.size:
-                shape = combination(s / np.abs(s).max(), members, np.ones(r))
-                labels.append(f"{what}{kind} at {abs(pole):.4g} rad/s ({shape})")
-    return np.vstack(rows), tuple(labels)
+@dataclass(frozen=True, eq=False)
+class Observability(FrozenArrays):
+    """Observability of a linear model; prints in words.
+
+    Attributes
+    ----------
+    dimension : int
+        nx minus the dimension of the unobservable subspace.
+    unobservable : tuple of str
+        Names of the unobservable motions; each is a state or a combination of states.
+    basis : ndarray (nx, nx - dimension)
+        Unobservable motions, one column each.
+    rows : ndarray (dimension, nx)
+        Observable combinations of states. The unobservable subspace is the set of all x with
+        ``rows @ x = 0``.
+    fixed_poles : ndarray (nx - dimension,)
+        Poles of the estimation error that no observer can move: [1/s] for a continuous model,
+        discrete-time poles z for a sampled one.
+    detectable : bool
+        Whether all fixed poles are stable.
+    method : str
+        Method that determined the dimension: "closed form" or "eigenvalues".
+    margin : Margin
+        Certainty of the rank decisions, as in `Controllability`.
+    notes : tuple of str
+        Ranks that rounding error leaves undecided.
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", outputs=[fflin.Gyroscope("base")])
+    >>> fflin.observability(fflin.linearize(robot)).unobservable[:3]
+    ('q_b.x', 'q_b.y', 'q_b.z')
+    """
+
+    dimension: int
+    unobservable: tuple[str, ...]
+    basis: Array
+    rows: Array
+    fixed_poles: Values
+    detectable: bool
+    method: str
+    margin: Margin
+    notes: tuple[str, ...]
+    robot: str
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.robot}: {self.dimension} of {len(self.basis)} states are observable "
+            f"({self.method}); {'' if self.detectable else 'not '}detectable"
+        ]
+        if self.unobservable:
+            lines.append(f"unobservable: {with_rates(self.unobservable)}")
+        lines += [f"note: {note}" for note in self.notes]
+        return folded(lines)
+
+
+def observability(lin: LinearModel) -> Observability:
+    r"""Determine the observable subspace from C and the structure of A.
+
+    At rest, observability is tested in second-order form, :math:`M a + D v + K s = 0`, by the null
+    space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. All poles p = 0 are tested
+    together. At nonzero velocity, observability is tested as the controllability of the dual pair
+    :math:`(A^T, C^T)`, with states scaled to units of energy, as in `controllability`. The
+    unobservable subspace is the orthogonal complement of the controllable subspace of this pair.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Linear model: continuous or sampled, full or reduced. A model loaded from a file is also
+        accepted.
+
+    Returns
+    -------
+    Observability
+        Dimension, basis, and named unobservable motions.
+
+    Raises
+    ------
+    InputError
+        If `lin` is not a linear model of positions and their rates.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", outputs=[fflin.JointPositions()])
+    >>> found = fflin.observability(fflin.linearize(robot))
+    >>> found.dimension, found.detectable
+    (6, False)
+    """
+    lin = mechanics.checked(lin)
+    motions, fixed, method = _unobservable(lin)
+    size = mechanics.state_sizes(lin)
+    basis, _ = echelon(motions, size)
+    nx, count = basis.shape
+    complement = np.linalg.qr(basis * size[:, None], mode="complete")[0][:, count:]
+    return Observability(
+        dimension=nx - count,
+        unobservable=tuple(combination(column, lin.state_names, size) for column in basis.T),
+        basis=basis,
+        rows=complement.T * size,
+        fixed_poles=fixed.poles,
+        detectable=fixed.decays,
+        method=method,
+        margin=fixed.margin,
+        notes=(
+            *undecided(lin, fixed.margin, "observable", nx - count),
+            *unsettled(lin, fixed.settling, "detectable"),
+        ),
+        robot=lin.robot,
+    )
+
+
+def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
+    """Return the motions (nx, k) that the outputs miss, their poles, and the method."""
+    source, nv = mechanics.at_rest(lin), len(lin.M)
+    if source is not None:
+        system = mechanics.second_order(source)
+        N = mechanics.rates_of_positions(mechanics.slopes(source))
+        C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
+        size = np.tile(system.size, 2)
+        each = np.linalg.norm(C / size, axis=1)
+        units = np.where(each > 0.0, each, 1.0)
+        shown = without_rounding(Noisy(C, 4.0 * EPS * np.abs(C)), units, size)
+        position, velocity = shown.columns(slice(0, nv)), shown.columns(slice(nv, None))
+        found = unobservable(system, position, velocity, lin.dt)
+        if found is not None:
+            motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
+            return motions, found.fixed, "eigenvalues" if system.acting else "closed form"
+    # The uncontrollable subspace of the dual pair (A^T, C^T).
+    part = split_by_poles(mechanics.slopes(lin), lin.C.T, lin.M, lin.dt, dual=True)
+    return part.outside, part.fixed, "eigenvalues"

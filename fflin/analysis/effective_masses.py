@@ -9,9 +9,8 @@ import numpy as np
 
 from fflin.analysis.mechanics import floating_inertia
 from fflin.base.errors import InputError
-from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import counted, grid, width
-from fflin.base.validation import Array
+from fflin.base.validation import Array, FrozenArrays
 from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.frozen import FrozenArrays
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, FrozenArrays, number
 from fflin.linear.model import LinearModel
 
 # A pole that decays less, relative to the fastest, may be one at zero that rounding moved.
@@ -122,21 +121,15 @@ def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
     steps = round(duration / dt)
     if not steps or abs(steps * dt - duration) > 1e-9 * duration:
         raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
-    return _summed(A, Q, steps)
-
-
-def _summed(A: Array, Q: Array, steps: int) -> Array:
-    """Return the sum of A^k Q A^kT over k < steps, by the binary digits of their number."""
-    W, power = np.zeros_like(Q), np.eye(len(A))
-    block, leap = Q, A
+    # The sum of A^k Q A^kT over k < steps, by the binary digits of their number.
+    total, power = np.zeros_like(Q), np.eye(len(A))
     while steps:
         if steps & 1:
-            W = W + power @ block @ power.T
-            power = power @ leap
-        block = block + leap @ block @ leap.T
-        leap = leap @ leap
+            total = total + power @ Q @ power.T
+            power = power @ A
+        Q, A = Q + A @ Q @ A.T, A @ A
         steps >>= 1
-    return W
+    return total
 
 
 def held_cost(F: Array, W: Array, h: float) -> Array:

@@ -1,16 +1,31 @@
-"""A linear model as a mechanical system: Jacobians, forces and conserved momenta."""
+"""A linear model as a mechanical system M a + D v + K s = S u, and its conserved momenta."""
+
+from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fflin.analysis.ranks import EPS, Margin, Noisy, echelon, null_space, stacked, without_rounding
-from fflin.analysis.second_order import SecondOrder
+from fflin.analysis.ranks import (
+    EPS,
+    Margin,
+    Noisy,
+    Values,
+    echelon,
+    null_space,
+    stacked,
+    without_rounding,
+)
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
+
+# Springs or dampers with a larger relative asymmetry are not symmetric.
+_SYMMETRIC = 1e-8
 
 # A momentum with a larger relative residual is not the rate of a coordinate: the model moves.
 _CONSISTENT = 1e-8
@@ -71,27 +86,67 @@ def floating_inertia(M: Array, kept: Any, others: Any) -> Array:
 
 
 @dataclass(frozen=True)
-class ConservedMomenta:
-    """The momenta that no input, spring or damper changes, and what follows from them."""
+class SecondOrder:
+    """The forces of a model, in coordinates s whose rates are the velocities."""
 
-    # W (k, nv) with W M nu conserved, in echelon form: a unit vector is one coordinate's momentum.
-    weights: Array
-    # L1, L2 (k, nx) with L1 A = 0, L2 A = L1, L B = 0 (sampled: of (A - E)/dt).
-    momenta: Array
-    coordinates: Array
-    kept: Array  # (r,), coordinates that, with their rates, say the rest where L1 x = L2 x = 0
-    T: Array  # (nx, 2 r), the states with L1 x = L2 x = 0 of those coordinates and rates
-    margin: Margin  # of the decision on r
+    M: Array
+    K: Noisy
+    D: Noisy
+    S: Noisy  # (nv, nu)
+
+    @cached_property
+    def size(self) -> Array:
+        """Roots of the diagonal of M (nv,), which make forces and speeds comparable."""
+        return np.sqrt(self.M.diagonal())
+
+    def restricted(self, R: Array) -> SecondOrder:
+        """Return the system of the motions R z; what holds them to it does no work."""
+        M = R.T @ self.M @ R
+        K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
+        return SecondOrder(M, K, D, self.S.after(R.T))
 
     @property
-    def selected(self) -> Array:
-        """The states (2 r,) of the kept coordinates and their rates."""
-        return np.concatenate((self.kept, self.kept + len(self.T) // 2))
+    def acting(self) -> bool:
+        """Whether there are springs or dampers."""
+        return bool(self.K.values.any() or self.D.values.any())
 
-    @property
-    def rates(self) -> Array:
-        """All velocities (nv, r) of the rates of the kept coordinates."""
-        return self.T[len(self.T) // 2 :, len(self.kept) :]
+    @cached_property
+    def symmetric(self) -> bool:
+        """Whether springs are symmetric, and dampers are and all take energy, or all give it."""
+        units = np.outer(self.size, self.size)
+        for matrix in (self.K.values / units, self.D.values / units):
+            if np.abs(matrix - matrix.T).max(initial=0.0) > _SYMMETRIC * np.abs(matrix).max():
+                return False
+        drag = np.linalg.eigvalsh(self.D.values / units)
+        return min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max()
+
+    @cached_property
+    def poles(self) -> tuple[Values, Margin]:
+        """The poles that are not zero, one of each pair, as eigenvalues approximate them."""
+        rigid, margin = self._null(self.K, self.D)
+        still, other = self._null(self.K)
+        R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
+        part = self.restricted(R / self.size[:, None])
+        r = len(part.M)
+        if not r:
+            return np.zeros(0, dtype=complex), margin & other
+        L = np.linalg.inv(np.linalg.cholesky(part.M))
+        K, D = L @ part.K.values @ L.T, L @ part.D.values @ L.T
+        zeros = still.shape[1] - rigid.shape[1]
+        if D.any():
+            fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
+            A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])
+            found = np.linalg.eigvals(A) * fastest
+        else:
+            roots = np.sqrt(-np.linalg.eigvalsh((K + K.T) / 2.0).astype(complex))
+            found, zeros = np.concatenate((roots, -roots)), 2 * zeros
+        found = found[np.argsort(np.abs(found))][zeros:]
+        return found[found.imag >= 0.0], margin & other
+
+    def _null(self, *matrices: Noisy) -> tuple[Array, Margin]:
+        stack = stacked([[matrix] for matrix in matrices]) @ np.diag(1.0 / self.size)
+        basis, margin = null_space(stack)
+        return basis / self.size[:, None], margin.transformed(1.0 / self.size)
 
 
 def second_order(lin: LinearModel) -> SecondOrder:
@@ -141,6 +196,31 @@ def rates_of_positions(X: Array) -> Array:
     return N if np.linalg.cond(N) < 1e6 else np.eye(nv)
 
 
+@dataclass(frozen=True)
+class ConservedMomenta:
+    """The momenta that no input, spring or damper changes, and what follows from them."""
+
+    # W (k, nv) with W M nu conserved, in echelon form: a unit vector is one coordinate's momentum.
+    weights: Array
+    # L1, L2 (k, nx) with L1 A = 0, L2 A = L1, L B = 0 (sampled: of (A - E)/dt).
+    momenta: Array
+    coordinates: Array
+    # (r,), coordinates that, with their rates, determine the others where L1 x = L2 x = 0
+    kept: NDArray[np.intp]
+    T: Array  # (nx, 2 r), the states with L1 x = L2 x = 0 of those coordinates and rates
+    margin: Margin  # of the decision on r
+
+    @property
+    def selected(self) -> NDArray[np.intp]:
+        """The states (2 r,) of the kept coordinates and their rates."""
+        return np.concatenate((self.kept, self.kept + len(self.T) // 2))
+
+    @property
+    def rates(self) -> Array:
+        """All velocities (nv, r) of the rates of the kept coordinates."""
+        return self.T[len(self.T) // 2 :, len(self.kept) :]
+
+
 def conserved(lin: LinearModel) -> ConservedMomenta:
     """Find the conserved momenta (9.2): :math:`W M [A_{21}, A_{22}, B_2] = 0`."""
     lin = lin.generator or lin  # it conserves the same momenta
@@ -165,7 +245,7 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
         T[nv + pivots, r:] = -np.linalg.solve(momenta[:, pivots], momenta[:, kept])
     zero = np.zeros((k, nv))
     L1, L2 = np.hstack((zero, momenta)), np.hstack((coordinates, zero))
-    return ConservedMomenta(W, L1, L2, kept, T, margin.seen(1.0 / size))
+    return ConservedMomenta(W, L1, L2, kept, T, margin.transformed(1.0 / size))
 
 
 def _driven(X: Array, momenta: Array) -> Array | None:

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.analysis.eigenpairs import natural_modes
-from fflin.analysis.modal_energy import energy_by_body
+from fflin.analysis.reduction import ReducedModel
 from fflin.base.errors import InputError
-from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import counted, grid, width
-from fflin.base.validation import Array
+from fflin.base.validation import Array, FrozenArrays
+from fflin.dynamics.chart import Chart
+from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
+from fflin.robot.appendage_bodies import effective_shares
+from fflin.robot.joints import ROOT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from fflin.robot.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +41,9 @@ class Mode(FrozenArrays):
         Whether the real part of the pole is positive by more than its rounding error.
     margin : float
         Real part of the pole as a multiple of its rounding error; infinite if that error is zero.
+    strain : mapping of str to float
+        Fraction of the mode's elastic energy in the spring of each joint, the largest first. Empty
+        if there are no springs, or for a model loaded from a file.
     energy : mapping of str to float
         Fraction of the mode's kinetic energy in each body, the largest first. The fractions are
         nonnegative and sum to 1. A body is named after the joint that carries it; the root body is
@@ -68,6 +77,7 @@ class Mode(FrozenArrays):
     unstable: bool
     margin: float
     energy: Mapping[str, float]
+    strain: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def oscillates(self) -> bool:
@@ -208,7 +218,36 @@ class Modes:
             row[-1] = _percents(mode.energy, width() - left)
         if self.modes:
             parts.append(grid(rows, "rrrll"))
-        return "\n\n".join(parts)
+        return "\n\n".join((*parts, *self._of_appendages()))
+
+    def _of_appendages(self) -> list[str]:
+        """Return the modes of appendages, free and clamped, and their effective masses."""
+        robot = self.lin._robot
+        if robot is None or not robot.modes:
+            return []
+        clamped = {
+            joint.name: joint.oscillation(robot.stiffness[joint.name], 0.0)[0]
+            for joint in robot.modes
+            if robot.stiffness.get(joint.name)
+        }
+        rows = [["rad/s", "clamped", "mode", "elastic energy"]]
+        for mode in self.vibrations:
+            name = next(iter(mode.strain), "")
+            if name in clamped:
+                shares = _percents(mode.strain, 60)
+                rows.append([f"{mode.frequency:.6g}", f"{clamped[name]:.6g}", name, shares])
+        of_masses = [["mode", "clamped", *"xyz", "xx", "yy", "zz"]]
+        for name, parts in effective_shares(robot._bare.model, robot.appendages).items():
+            cells = [f"{100.0 * share:.1f}" if share > 1e-12 else "." for share in parts]
+            of_masses.append([name, f"{clamped[name]:.6g}" if name in clamped else ".", *cells])
+        title = (
+            "effective masses and moments of inertia in % of the body that carries the appendage, "
+            "or of its file's inertia, about the appendage's frame"
+        )
+        return [
+            f"modes of appendages, with the link free and clamped\n{grid(rows, 'rrll')}",
+            f"{textwrap.fill(title, width())}\n{grid(of_masses, 'lrrrrrrr')}",
+        ]
 
 
 def modes(lin: LinearModel) -> Modes:
@@ -264,13 +303,20 @@ def modes(lin: LinearModel) -> Modes:
     if nx != 2 * nv:
         raise InputError(f"the model has {nx} states, expected {nv} positions and their velocities")
     found = natural_modes(lin)
-    triples = sorted(found.triples, key=lambda triple: (abs(triple[0]), triple[0].real))
-    shapes = [_normalised(x) for _, x, _ in triples]
+    pairs = sorted(found.pairs, key=lambda pair: (abs(pair.pole), pair.pole.real))
+    shapes = []
+    for pair in pairs:
+        positions = np.abs(pair.shape[:nv])
+        # Of several that move equally, such as symmetric panels, the first.
+        largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
+        shapes.append(np.asarray(pair.shape / pair.shape[largest], dtype=complex))
     energies = energy_by_body(lin._robot, lin, shapes)
     return Modes(
         tuple(
-            Mode(pole, shape, margin > 1.0, margin, energy)
-            for (pole, _, margin), shape, energy in zip(triples, shapes, energies, strict=True)
+            Mode(pole, shape, margin > 1.0, margin, energy, strain)
+            for (pole, _, margin), shape, energy, strain in zip(
+                pairs, shapes, energies, strain_by_joint(lin._robot, lin, shapes), strict=True
+            )
         ),
         found.rigid_body,
         found.zeros,
@@ -281,13 +327,6 @@ def modes(lin: LinearModel) -> Modes:
         lin.robot,
         lin,
     )
-
-
-def _normalised(shape: Array) -> NDArray[np.complexfloating[Any]]:
-    positions = np.abs(shape[: len(shape) // 2])
-    # Of several that move equally, such as symmetric panels, the first.
-    largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
-    return np.asarray(shape / shape[largest], dtype=complex)
 
 
 def _percents(energy: Mapping[str, float], room: int) -> str:
@@ -301,3 +340,59 @@ def _percents(energy: Mapping[str, float], room: int) -> str:
         if len(text) <= room:
             break
     return text
+
+
+def energy_by_body(
+    robot: Robot | None, lin: LinearModel, shapes: Sequence[Any]
+) -> list[Mapping[str, float]]:
+    """Return {body: fraction of the kinetic energy} of shapes (nx,), see `Mode`.
+
+    Without a robot the mappings are empty.
+    """
+    if robot is None:
+        return [{} for _ in shapes]
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    chart, data = state.chart(lin.q), robot.create_data()
+    names = ("base", *list(robot.model.names)[ROOT + 1 :])
+    inertias = robot.model.inertias.tolist()[ROOT:]
+    found: list[Mapping[str, float]] = []
+    for shape in shapes:
+        # All velocities of a mode are its pole times the displacements.
+        moved = displacement(lin, chart, shape)
+        energies = np.zeros(len(names))
+        for part in (moved.real, moved.imag):
+            pin.forwardKinematics(robot.model, data, lin.q, state.spread(part))
+            twists = data.v.tolist()[ROOT:]
+            energies += [body.vtiv(V) for body, V in zip(inertias, twists, strict=True)]
+        fractions = energies / (energies.sum() or 1.0)
+        order = np.argsort(-fractions.round(9), kind="stable").tolist()
+        found.append({names[i]: float(fractions[i]) for i in order})
+    return found
+
+
+def strain_by_joint(
+    robot: Robot | None, lin: LinearModel, shapes: Sequence[Any]
+) -> list[Mapping[str, float]]:
+    """Return {joint: fraction of the elastic energy} of shapes (nx,), see `Mode`."""
+    if robot is None:
+        return [{} for _ in shapes]
+    chart = StateMap(robot, reference=lin.reference, frame=lin.frame).chart(lin.q)
+    found: list[Mapping[str, float]] = []
+    for shape in shapes:
+        moved = np.abs(displacement(lin, chart, shape)[6:])
+        energies = robot.springs.stiffness * moved**2
+        order = np.argsort(-energies, kind="stable").tolist()
+        total = energies.sum()
+        found.append(
+            {robot.joint_names[i]: float(energies[i] / total) for i in order if energies[i] > 0.0}
+        )
+    return found
+
+
+def displacement(lin: LinearModel, chart: Chart, shape: Any) -> Any:
+    """Return the displacements (6 + n,) of a shape: rotation and translation in base axes."""
+    moved = shape[: len(shape) // 2]
+    if isinstance(lin, ReducedModel):
+        moved = lin.T[: len(lin.T) // 2, : len(moved)] @ moved
+    turned, shifted = chart.J @ moved[:3], chart.R.T @ moved[3:6]
+    return np.concatenate((turned, shifted, moved[6:]))

@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from fflin.analysis.mechanics import ConservedMomenta
-from fflin.analysis.ranks import Margin
+from fflin.analysis.ranks import Margin, Values
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
@@ -19,7 +19,7 @@ _OTHER = ("momentum of", "position of")
 _AXIS = re.compile(r"(?<!\S)[xyz](?!\S)")
 
 
-def momentum_names(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
+def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, ...]:
     """Name the conserved momenta, and then the coordinates that they drive."""
     nv = len(lin.M)
     size = np.sqrt(lin.M.diagonal())
@@ -29,12 +29,14 @@ def momentum_names(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
         for i in (0, 1)
     )
     # A coordinate cannot be moved while the others are held; with them it can.
-    only_joints = all(rates[i][0] == "qdot_m" for i in held.kept)
-    of_base = all(not row[i] for row in held.weights for i in range(nv) if rates[i][0] == "qdot_m")
+    only_joints = all(rates[i][0] == "qdot_m" for i in conserved.kept)
+    of_base = all(
+        not row[i] for row in conserved.weights for i in range(nv) if rates[i][0] == "qdot_m"
+    )
     rest = "the joints" if only_joints and of_base else "the rest"
     return (
-        *(combination(row, momenta, size) for row in held.weights),
-        *(f"{combination(row, driven, size)} with {rest} fixed" for row in held.weights),
+        *(combination(row, momenta, size) for row in conserved.weights),
+        *(f"{combination(row, driven, size)} with {rest} fixed" for row in conserved.weights),
     )
 
 
@@ -101,7 +103,7 @@ def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
     )
 
 
-def shape(lin: LinearModel, at: Array) -> str:
+def shape(lin: LinearModel, at: Values) -> str:
     """Name the coordinates that rates (nv,) move, real or complex, by the largest."""
     size = np.sqrt(lin.M.diagonal())
     largest = at[int(np.abs(at * size).argmax())]

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.analysis.modes import Mode, Modes
+from fflin.analysis.ranks import Values
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, drawing, letters_of
 from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted, rounding
-from fflin.linear.check import Check
+from fflin.linear.check import Check, Row
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
@@ -135,9 +136,10 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
         with drawing(path, 6.5, 1.0) as figure:
             figure.suptitle(f"{title}\nno mode to draw; give a joint a stiffness")
         return figure
-    bodies = [body for body in modes.modes[0].energy if max(_energies(modes, body)) >= _LEAST]
-    places = {name: place for place, name in enumerate(names)}
-    bodies.sort(key=lambda body: places.get(f"q_m.{body}", -1))
+    energies = {body: [mode.energy[body] for mode in modes.modes] for body in modes.modes[0].energy}
+    bodies = [body for body, fractions in energies.items() if max(fractions) >= _LEAST]
+    columns = {name: column for column, name in enumerate(names)}
+    bodies.sort(key=lambda body: columns.get(f"q_m.{body}", -1))
     with drawing(path, 5.0 + 0.2 * half + 0.3 * len(bodies), 2.6 + 0.36 * count) as figure:
         from matplotlib.patches import Patch
 
@@ -146,13 +148,23 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
             1, len(widths), squeeze=False, sharey=True, gridspec_kw={"width_ratios": widths}
         )[0]
         colors = dict(zip(dict.fromkeys(units), COLORS, strict=False))
-        for place, mode in enumerate(modes.modes):
-            _bars(axes, place, mode.shape[:half], [colors[unit] for unit in units])
+        for line, mode in enumerate(modes.modes):
+            _draw_shape(axes, line, mode.shape[:half], [colors[unit] for unit in units])
         axes.set_xticks(range(half), names, rotation=90, fontsize=8)
-        axes.set_yticks(range(count), [_said(mode) for mode in modes.modes], fontsize=8)
+        axes.set_yticks(range(count), [_label(mode) for mode in modes.modes], fontsize=8)
         axes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
-        for beside in others:
-            _percentages(beside, modes, bodies)
+        for table in others:
+            # The percentage of the kinetic energy of each mode that each body has.
+            fractions = np.array([energies[body] for body in bodies]).T
+            table.imshow(fractions, cmap="Blues", vmin=0.0, vmax=1.6, aspect="auto")
+            for (line, column), fraction in np.ndenumerate(fractions):
+                if fraction >= _LEAST:
+                    text = f"{100.0 * fraction:.0f}"
+                    table.text(column, line, text, ha="center", va="center", fontsize=7)
+            table.grid(visible=False)
+            table.set_xticks(range(len(bodies)), bodies, rotation=90, fontsize=8)
+            table.tick_params("y", labelleft=False)
+            table.set_title("kinetic energy [%]", fontsize=8)
         figure.legend(
             handles=[Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()],
             title="largest entry: 1; outline: modulus of an entry out of phase",
@@ -163,36 +175,18 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def _energies(modes: Modes, body: str) -> list[float]:
-    return [mode.energy[body] for mode in modes.modes]
-
-
-def _percentages(axes: Axes, modes: Modes, bodies: Sequence[str]) -> None:
-    """Write the percentage of the kinetic energy of each mode that each body has."""
-    fractions = np.array([_energies(modes, body) for body in bodies]).T
-    axes.imshow(fractions, cmap="Blues", vmin=0.0, vmax=1.6, aspect="auto")
-    for (line, column), fraction in np.ndenumerate(fractions):
-        if fraction >= _LEAST:
-            text = f"{100.0 * fraction:.0f}"
-            axes.text(column, line, text, ha="center", va="center", fontsize=7)
-    axes.grid(visible=False)
-    axes.set_xticks(range(len(bodies)), bodies, rotation=90, fontsize=8)
-    axes.tick_params("y", labelleft=False)
-    axes.set_title("kinetic energy [%]", fontsize=8)
-
-
-def _bars(axes: Axes, place: int, shape: Any, colors: Sequence[str]) -> None:
-    """Draw a shape as bars about its line: filled what is in phase, outlined the modulus."""
-    x, tall = np.arange(len(shape)), -0.45  # for the axis points down
-    axes.axhline(place, color="#888888", lw=0.5)
-    axes.bar(x, tall * shape.real, 0.7, place, color=colors)
+def _draw_shape(axes: Axes, line: int, shape: Values, colors: Sequence[str]) -> None:
+    """Draw a shape as bars about its line: filled the part in phase, outlined the modulus."""
+    x, height = np.arange(len(shape)), -0.45  # the axis points down
+    axes.axhline(line, color="#888888", lw=0.5)
+    axes.bar(x, height * shape.real, 0.7, line, color=colors)
     late = np.flatnonzero(np.abs(shape.imag) > 0.02 * np.abs(shape))
-    whole = tall * np.where(shape.real < 0.0, -1.0, 1.0) * np.abs(shape)
+    modulus = height * np.where(shape.real < 0.0, -1.0, 1.0) * np.abs(shape)
     outline = [colors[i] for i in late.tolist()]
-    axes.bar(x[late], whole[late], 0.7, place, fill=False, edgecolor=outline, lw=0.6)
+    axes.bar(x[late], modulus[late], 0.7, line, fill=False, edgecolor=outline, lw=0.6)
 
 
-def _said(mode: Mode) -> str:
+def _label(mode: Mode) -> str:
     if not mode.oscillates:
         return f"real, {'grows' if mode.unstable else 'decays'} in {mode.time_constant:.3g} s"
     return (
@@ -223,30 +217,31 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
         )
     rows = [row for row in check.rows if row.error != 0.0]
     tests = list(dict.fromkeys(row.test for row in rows))
-    names = list(dict.fromkeys(_place(row) for row in rows))
+    labels = {row: _block_of(row) for row in rows}
+    names = list(dict.fromkeys(labels.values()))
     with drawing(path, 7.5, 2.2 + 0.2 * len(names)) as figure:
         axes = figure.add_subplot()
         for shift, test, color in zip(_SHIFTS, tests, COLORS, strict=False):
             shown = [row for row in rows if row.test == test]
-            places = [names.index(_place(row)) + shift for row in shown]
-            axes.plot([row.error for row in shown], places, "o", color=color, ms=4, label=test)
-            axes.plot([row.tolerance for row in shown], places, "|", color=color, ms=7)
+            lines = [names.index(labels[row]) + shift for row in shown]
+            axes.plot([row.error for row in shown], lines, "o", color=color, ms=4, label=test)
+            axes.plot([row.tolerance for row in shown], lines, "|", color=color, ms=7)
         bad = [row for row in rows if not row.ok]
-        axes.plot([row.error for row in bad], [names.index(_place(row)) for row in bad], "rx")
+        axes.plot([row.error for row in bad], [names.index(labels[row]) for row in bad], "rx")
         axes.set_yticks(range(len(names)), names, fontsize=8)
         axes.set(xscale="log", ylim=(max(len(names), 1) - 0.5, -0.5))
         axes.set_xlabel("relative error (dot) and tolerance (bar)")
-        held = (
+        verdict = (
             f"FAILED: {len(bad)} of {len(check.rows)} exceed their tolerance"
             if bad
             else (f"OK: {len(check.rows)} errors within tolerance")
         )
         exact = len(check.rows) - len(rows)
-        axes.set_title(f"{check.title}\n{held}; {exact} are zero, not drawn", loc="left")
+        axes.set_title(f"{check.title}\n{verdict}; {exact} are zero, not drawn", loc="left")
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)
     return figure
 
 
-def _place(row: Any) -> str:
+def _block_of(row: Row) -> str:
     both = ("ABA derivatives", "differences")
     return row.block if row.test in both else f"{row.test}: {row.block}"

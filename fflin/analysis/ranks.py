@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from fflin.base.validation import Array
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Values: TypeAlias = NDArray[np.inexact[Any]]  # real or complex
+else:
+    Values = np.ndarray
 
 EPS = float(np.finfo(float).eps)
 
@@ -27,7 +34,7 @@ class Decision(NamedTuple):
     """Whether a singular value counts: where its ratio to the tolerance is above 1."""
 
     ratio: float
-    at: Any = None  # its direction; None where there was nothing to decide
+    at: Values = np.zeros(0)  # its direction; empty if there was nothing to decide
     states: int = 1  # that hang on it: two on a pair of poles, or a momentum and what it drives
 
 
@@ -55,11 +62,11 @@ class Margin(NamedTuple):
             max(left_out, key=lambda decision: decision.ratio),
         )
 
-    def moved(self, change: Callable[[Any], Any]) -> Margin:
+    def moved(self, change: Callable[[Values], Values]) -> Margin:
         """Return it with its directions changed."""
-        return Margin(*(d if d.at is None else d._replace(at=change(d.at)) for d in self))
+        return Margin(*(d._replace(at=change(d.at)) if d.at.size else d for d in self))
 
-    def seen(self, change: Array) -> Margin:
+    def transformed(self, change: Array) -> Margin:
         """Return it with the directions in other coordinates, ``change * v`` or ``change @ v``."""
         return self.moved(lambda v: change * v if change.ndim == 1 else change @ v)
 
@@ -68,7 +75,7 @@ class Margin(NamedTuple):
         return self.moved(lambda v: max(np.split(v, 2), key=np.linalg.norm))
 
     @property
-    def doubts(self) -> tuple[tuple[float, Any, int], ...]:
+    def doubts(self) -> tuple[tuple[float, Values, int], ...]:
         """The decisions within rounding: ratios, directions, and how many states more they are."""
         counted, left_out = self
         near = [(counted.ratio, counted.at, -counted.states)] * (self.kept < CLEAR)
@@ -76,7 +83,7 @@ class Margin(NamedTuple):
         return tuple(near)
 
 
-def decided(ratio: float, direction: Any, states: int = 1) -> Margin:
+def decided(ratio: float, direction: Values, states: int = 1) -> Margin:
     """Return the margin of one decision."""
     one = Decision(ratio, direction, states)
     return Margin(counted=one) if ratio > 1.0 else Margin(left_out=one)
@@ -85,27 +92,27 @@ def decided(ratio: float, direction: Any, states: int = 1) -> Margin:
 class FixedPoles(NamedTuple):
     """The poles of what inputs do not reach, or outputs do not show."""
 
-    poles: Any = np.zeros(0)  # (k,) [1/s], or of the sampled model
+    poles: Values = np.zeros(0)  # (k,) [1/s], or of the sampled model
     decays: bool = True  # whether all of them do, beyond rounding
     margin: Margin = Margin()  # of what is reached or shown
     settling: Margin = Margin()  # of whether the slowest of these poles decays
 
-    def seen(self, change: Array) -> FixedPoles:
+    def transformed(self, change: Array) -> FixedPoles:
         """Return it with the directions of its margins in other coordinates."""
-        margin, settling = self.margin.seen(change), self.settling.seen(change)
+        margin, settling = self.margin.transformed(change), self.settling.transformed(change)
         return self._replace(margin=margin, settling=settling)
 
 
 class Noisy(NamedTuple):
     """A matrix and what rounding may have done to each of its entries."""
 
-    values: Any
+    values: Any  # real or complex
     noise: Array
 
     @classmethod
-    def exact(cls, values: Array) -> Noisy:
+    def exact(cls, values: Values) -> Noisy:
         """Return a matrix without rounding."""
-        return cls(values, np.zeros_like(values))
+        return cls(values, np.zeros(values.shape))
 
     def columns(self, part: slice) -> Noisy:
         """Return some of its columns."""
@@ -162,7 +169,7 @@ def right_vectors(matrix: Noisy, states: int = 1) -> tuple[Array, Any, int, Marg
     return singular, vectors, rank, judged(singular / tolerance, vectors, rank, states)
 
 
-def judged(ratios: Array, vectors: Any, rank: int, states: int = 1) -> Margin:
+def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin:
     """Return the margin of a rank, of singular values as ratios to the tolerance."""
     margin = Margin()
     for index in range(max(rank - 1, 0), min(rank + 1, len(ratios))):
@@ -192,7 +199,9 @@ def unit_columns(matrix: Array) -> Array:
     return matrix[:, real] / sizes[real]
 
 
-def echelon(columns: Array, weights: Array, preferred: Array | None = None) -> tuple[Array, Array]:
+def echelon(
+    columns: Array, weights: Array, preferred: Array | None = None
+) -> tuple[Array, NDArray[np.intp]]:
     """Return a basis of independent columns (m, r), the identity at r pivots, and these."""
     from scipy.linalg import qr
 

@@ -10,12 +10,11 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, SingularInertiaError
-from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import grid
-from fflin.base.validation import Array
+from fflin.base.validation import Array, FrozenArrays
 from fflin.dynamics.names import frame_of
 from fflin.dynamics.orbital import field_of, mean_motion
-from fflin.robot.frames import ROOT
+from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from fflin.analysis.controllability import controllability
+from fflin.analysis.controllability import controllability, observability
 from fflin.analysis.mechanics import conserved
 from fflin.analysis.names import grouped, with_rates
-from fflin.analysis.observability import observability
-from fflin.analysis.ranks import Margin, judged
-from fflin.analysis.wheels import damped_wheels
+from fflin.analysis.ranks import Margin, Values, judged
+from fflin.analysis.reduction import damped_wheels
 from fflin.base.errors import (
     DetectabilityError,
     FflinError,
@@ -32,15 +31,37 @@ def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names what no input can hold."""
     if len(lin.A) < 2 * len(lin.M):  # with speeds of wheels without their angles
         missed = f"the inputs cannot stabilise {{}}{damped_wheels(lin) or '; add inputs'}"
-        _check_reach(lin, lin.A, lin.B, "stabilised by the inputs", missed, StabilizabilityError)
+        try:
+            kind = StabilizabilityError
+            _check_reach(lin, lin.A, lin.B, "stabilised by the inputs", missed, kind)
+        except StabilizabilityError as error:
+            error.args = (f"{error}{_pendulums(lin, str(error))}",)
+            raise
         return
     found, words = controllability(lin), ""
     if not found.stabilizable:
         weights = conserved(lin).weights
         forces = _forces_missing(lin, weights) if len(weights) else None
         lost = forces or f"{', '.join(grouped(found.uncontrollable))}; add inputs"
-        words = f"the inputs cannot stabilise {lost}"
+        words = f"the inputs cannot stabilise {lost}{_pendulums(lin, lost)}"
     _conclude(StabilizabilityError, words, found.notes, found.margin)
+
+
+def _pendulums(lin: LinearModel, lost: str) -> str:
+    """Say what to do about pendulums of slosh without gravity or thrust among what is lost."""
+    robot = lin._robot
+    hanging = [
+        f"'{joint.name}'"
+        for joint in (robot.modes if robot else ())
+        if not joint.prismatic and joint.kind == "slosh" and f".{joint.name}" in lost
+    ]
+    if not hanging:
+        return ""
+    return (
+        f"; slosh {', '.join(hanging)} is a pendulum, which does not swing back without gravity or "
+        "thrust: linearise it under the thrust (u=, moving=True), or give the slosh a frequency "
+        "and no length"
+    )
 
 
 def require_detectable(lin: LinearModel) -> None:
@@ -111,12 +132,25 @@ def _check_reach(
     for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:
         if all(abs(pole - other) > 1e-3 * size for other in candidates):
             candidates.append(complex(pole))
-    missed, margin = [], Margin()
+    missed, margin = list[Values](), Margin()
     for pole in candidates:
         shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
-        vectors, decision = _left_null(np.column_stack((shifted, B)))
-        missed += list(vectors)
-        margin &= decision
+        matrix = np.column_stack((shifted, B))
+        # Rows and columns have unlike units; they are brought to comparable sizes.
+        rows, columns, scaled = np.ones(len(matrix)), np.ones(matrix.shape[1]), matrix
+        for _ in range(4):
+            sizes = np.sqrt(np.abs(scaled).max(axis=1))
+            rows /= np.where(sizes > 0.0, sizes, 1.0)
+            sizes = np.sqrt(np.abs(scaled).max(axis=0))
+            columns /= np.where(sizes > 0.0, sizes, 1.0)
+            scaled = rows[:, None] * matrix * columns
+        left, values, _ = np.linalg.svd(scaled)
+        vectors: Values = left.conj().T * rows
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        ratios = values / (_RANK * values[0])
+        rank = int((ratios > 1.0).sum())
+        missed += list(vectors[rank:])
+        margin &= judged(ratios, vectors.T, rank)
     doubts = tuple(
         f"undecided: {_dominant(at[None], lin.state_names)} is taken as "
         f"{'' if change < 0 else 'not '}{what}; the test value is "
@@ -125,24 +159,6 @@ def _check_reach(
     )
     words = complaint.format(_dominant(np.array(missed), lin.state_names)) if missed else ""
     _conclude(error, words, doubts, margin, 5)
-
-
-def _left_null(matrix: Array) -> tuple[Array, Margin]:
-    """Return the left null space (k, rows) of a matrix, its rows and columns of unlike units."""
-    rows, columns = np.ones(len(matrix)), np.ones(matrix.shape[1])
-    scaled = matrix
-    for _ in range(4):
-        sizes = np.sqrt(np.abs(scaled).max(axis=1))
-        rows /= np.where(sizes > 0.0, sizes, 1.0)
-        sizes = np.sqrt(np.abs(scaled).max(axis=0))
-        columns /= np.where(sizes > 0.0, sizes, 1.0)
-        scaled = rows[:, None] * matrix * columns
-    left, values, _ = np.linalg.svd(scaled)
-    vectors: Array = left.conj().T * rows
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    ratios = values / (_RANK * values[0])
-    rank = int((ratios > 1.0).sum())
-    return vectors[rank:], judged(ratios, vectors.T, rank)
 
 
 def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
@@ -155,7 +171,11 @@ def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
     if names[:6] != _BASE_VELOCITIES:
         return None
     involved = np.abs(weights).max(axis=0) > 0.0
-    base = [f"{word}{_axes(involved[rows])}" for word, rows in _BASE_WORDS if involved[rows].any()]
+    base = []
+    for word, rows in _BASE_WORDS:
+        axes = [axis for axis, x in zip("xyz", involved[rows], strict=True) if x]
+        if axes:
+            base.append(word if len(axes) == 3 else f"{word} {'/'.join(axes)}")
     joints = [name.partition(".")[2] for name, x in zip(names[6:], involved[6:], strict=True) if x]
     if joints:
         moved = f"joint{'s' * (len(joints) > 1)} {listed(joints)}, which no input moves"
@@ -169,15 +189,11 @@ def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
     )
 
 
-def _axes(involved: Array) -> str:
-    return "" if involved.all() else " " + "/".join(np.array(list("xyz"))[involved])
-
-
 _BASE_VELOCITIES = tuple(f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz")
 _BASE_WORDS = (("base attitude", slice(0, 3)), ("base position", slice(3, 6)))
 
 
-def _dominant(vectors: Array, names: Sequence[str]) -> str:
+def _dominant(vectors: Values, names: Sequence[str]) -> str:
     """Name the states that vectors (k, nx) stand on most, one each at least."""
     sizes = np.abs(vectors)
     large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)

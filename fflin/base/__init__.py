@@ -3,3 +3,5 @@
 Errors, files and records, rotations, tables and figures, checks of arguments. Imports no other
 room.
 """
+
+__version__ = "0.1.0"

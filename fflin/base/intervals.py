@@ -30,6 +30,19 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
     return Estimate(successes / count if count else math.nan, float(low), float(high))
 
 
+def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
+    """Return figures of runs (N,) that start ever farther away.
+
+    They are the number of runs before the first failure, a lower bound on the success rate of these
+    starts, and the interval of the success rate of all runs.
+    """
+    count = len(failed)
+    inside = int(failed.argmax()) if failed.any() else count
+    bound = (1.0 - confidence) ** (1.0 / inside) if inside else 0.0
+    _, low, high = clopper_pearson(count - int(failed.sum()), count, confidence)
+    return inside, bound, (low, high)
+
+
 def quantile(values: Array, p: float, confidence: float) -> Estimate:
     """Return the p-quantile between two order statistics; infinite if there are too few draws."""
     from scipy.special import bdtr

@@ -31,7 +31,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from fflin.base.errors import FileError, InputError
-from fflin.base.frozen import FrozenArrays
+from fflin.base.validation import FrozenArrays
 from fflin.base.writing import as_path, check_ending, read_file, reason, shown, write_whole
 
 SEAL = "sha256"
@@ -122,11 +122,16 @@ def figures(value: Any) -> dict[str, float]:
 
 
 def content_digest(entries: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of arrays with their names, kinds and shapes, 4 MiB by 4 MiB."""
+    """Return the SHA-256 of arrays or bytes with their names, types and shapes.
+
+    Every file whose content has several parts is checked by it. The bytes of a part are hashed in
+    blocks of 4 MiB.
+    """
     digest = hashlib.sha256()
     with ThreadPoolExecutor() as pool:
         for key, value in sorted(entries.items()):
-            array = np.asarray(value)
+            binary = isinstance(value, bytes)
+            array = np.frombuffer(value, np.uint8) if binary else np.asarray(value)
             digest.update(f"{key} {array.dtype.str} {array.shape}\n".encode())
             data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             blocks = [data[at : at + _BLOCK] for at in range(0, len(data), _BLOCK)]
@@ -269,13 +274,7 @@ class Design(FrozenArrays):
         InputError
             If a value is not finite.
         """
-        record: Record = {"kind": type(self).__name__}
-        for item in _saved(type(self)):
-            value = getattr(self, item.name)
-            if item.name in self.OPEN:
-                value = np.nan_to_num(value, nan=np.nan)
-            record[item.name] = list(value) if isinstance(value, tuple) else value
-        write_record(as_path(path), record, sealed=self.verified)
+        write_record(as_path(path), _record_of(self), sealed=self.verified)
 
     @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:
@@ -303,6 +302,21 @@ class Design(FrozenArrays):
                 if item.name in record or item.default_factory is MISSING
             }
             return cls(**given, **values, verified=verified)
+
+
+def json_text(design: Design) -> str:
+    """Return the text that `Design.save` writes to a .json file."""
+    return _to_json(_record_of(design), design.verified).decode()
+
+
+def _record_of(design: Design) -> Record:
+    record: Record = {"kind": type(design).__name__}
+    for item in _saved(type(design)):
+        value = getattr(design, item.name)
+        if item.name in design.OPEN:
+            value = np.nan_to_num(value, nan=np.nan)
+        record[item.name] = list(value) if isinstance(value, tuple) else value
+    return record
 
 
 def _saved(cls: type[Design]) -> list[Field[Any]]:

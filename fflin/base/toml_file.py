@@ -1,12 +1,15 @@
-"""TOML files, and the line number of each of their keys."""
+"""TOML files: their values, the kinds of values, and the line number of each key."""
 
 import re
+import reprlib
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from fflin.base.errors import FflinError, InputError, UnknownNameError
+from fflin.base.errors import FflinError, InputError
+from fflin.base.names import stands_for_any
 from fflin.base.writing import read_file
 
 if sys.version_info >= (3, 11):
@@ -36,6 +39,33 @@ _TEXTS = re.compile(
 _PART = r"""(?:[\w-]+|"[^"]*"|'[^']*')"""
 _KEY = rf"({_PART}(?:\s*\.\s*{_PART})*)\s*"
 _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of TOML is a finite number."""
+    # The limit keeps lengths finite, and integers that no float can hold out.
+    return type(value) in (int, float) and abs(value) < 1e100
+
+
+def is_vector(value: Any) -> bool:
+    """Whether a value of TOML is a list of three finite numbers."""
+    return isinstance(value, list) and len(value) == 3 and all(map(is_number, value))
+
+
+class Kind(NamedTuple):
+    """Kind of value in a TOML file: the test of a value, and what a message expects."""
+
+    fits: Callable[[Any], bool]
+    expected: str
+
+
+NAME = Kind(lambda value: isinstance(value, str) and value != "", "a name in quotes")
+NUMBER = Kind(is_number, "a finite number")
+VECTOR = Kind(is_vector, "three finite numbers, [x, y, z]")
+NUMBERS = Kind(
+    lambda value: is_number(value) or is_vector(value), "a finite number or three of them"
+)
+TRUTH = Kind(lambda value: isinstance(value, bool), "true or false")
 
 
 class TomlFile:
@@ -77,13 +107,44 @@ class TomlFile:
             way = way.rpartition(".")[0]
         return self._lines.get(way, 1)
 
-    def error(self, message: str, *place: str | int) -> InputError:
-        """Build an error that names the file and the line of a key."""
-        return InputError(f"{self.path}:{self.line(*place)}: {message}")
+    def error(self, problem: FflinError | str, *place: str | int) -> FflinError:
+        """Build an error that names the file and the line of a key, of the problem's own type."""
+        kind = type(problem) if isinstance(problem, FflinError) else InputError
+        return kind(f"{self.path}:{self.line(*place)}: {problem}")
 
-    def unknown(self, problem: FflinError | str, *place: str | int) -> UnknownNameError:
-        """Build the same for a name that does not exist."""
-        return UnknownNameError(f"{self.path}:{self.line(*place)}: {problem}")
+    def require(self, kind: Kind, value: Any, *place: str | int, of: str = "") -> None:
+        """Raise `InputError` if a value is not of a kind; `of` names its table in the message."""
+        if not kind.fits(value):
+            name = of or ".".join(map(str, place))
+            raise self.error(f"{name} is {reprlib.repr(value)}, expected {kind.expected}", *place)
+
+    @contextmanager
+    def located(self, *table: str | int) -> Iterator[None]:
+        """Put file and line in front of errors that name a key, or a text, of a table."""
+        try:
+            yield
+        except FflinError as error:
+            raise self.error(error, *self._named_in(str(error), *table)) from None
+
+    def _named_in(self, message: str, *table: str | int) -> tuple[str | int, ...]:
+        """Return the place of the first key, text or pattern of a table that a message names."""
+        head = ".".join(map(str, table)) + "."
+        keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]
+        names = [
+            name.strip("'")
+            for pair in re.findall(r"('[^']+')| (\S+) is ", message)
+            for name in pair
+        ]
+        names = [name for name in names if name]
+        for name in names:
+            for place, value in _values(self.record):
+                if value == name and place[: len(table)] == table:
+                    return place
+            for key in keys:
+                if f".{key}".endswith(f".{name}") or key.rpartition(".")[0] == name:
+                    return *table, key
+        names += [name.rpartition(".")[0] for name in names]
+        return *table, *[key for key in keys if stands_for_any(key, names)][:1]
 
 
 def flat(table: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,10 +1,11 @@
-"""Checks of arguments, made once at the beginning of a public call."""
+"""Checks of arguments, made once at the beginning of a public call, and read-only arrays."""
 
 from __future__ import annotations
 
 import math
 import sys
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -153,3 +154,27 @@ def _as_array(name: str, value: Any) -> Any:
         return np.asarray(value)
     except ValueError:
         raise InputError(f"{name} is not an array: its rows differ in length") from None
+
+
+class FrozenArrays:
+    """Mixin of frozen dataclasses: makes their arrays read-only, and copies writable ones."""
+
+    def __post_init__(self) -> None:
+        this: Any = self
+        for item in fields(this):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                object.__setattr__(self, item.name, frozen(value.copy()))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # NumPy makes arrays anew, and writeable, for deepcopy and most of pickle's protocols.
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                frozen(value)
+        vars(self).update(state)
+
+
+def frozen(array: Array) -> Array:
+    """Return the array itself, read-only."""
+    array.setflags(write=False)
+    return array

@@ -6,23 +6,29 @@ import warnings
 from collections.abc import Mapping
 from functools import cached_property, partial
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from fflin.base.errors import FflinError, FflinWarning, InputError
 from fflin.base.validation import Array
-from fflin.batch.dispatch import ChunkResult
 from fflin.batch.rows import Points
+from fflin.batch.run import ChunkResult
+from fflin.dynamics.chart import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.inertia import Inertia
+from fflin.dynamics.rnea import Rates
 from fflin.kernel.compiled import checked_engine
-from fflin.linear.linearization import Linearizer
+from fflin.kernel.tree import LANES
+from fflin.linear.linearization import LARGEST, Linearizer, Prepared
+from fflin.linear.state_equations import assemble, drift
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.batch.equations import BatchEquations
+    from fflin.kernel.accelerations import Mask
 
+RowNumbers: TypeAlias = NDArray[np.integer[Any]]
 
 # Python has one set of warning filters for the whole process, so that threads take turns.
 _TURN = Lock()
@@ -118,11 +124,64 @@ class ChunkJob:
         prepared = self.linearizer.prepared
         if self._engine == "python" or prepared.sensing is not None or prepared.not_compilable:
             return None
-        from fflin.batch.equations import BatchEquations
-
         return BatchEquations(prepared, only_inertia=self.only_inertia)
 
     @cached_property
     def _inertia(self) -> tuple[Inertia, pin.Data]:
         data = self.linearizer.robot.create_data()
         return Inertia(self.linearizer.prepared.map, data), data
+
+
+class BatchEquations:
+    """Equations of a robot's linear models about many points, for the arrays that vary."""
+
+    def __init__(self, prepared: Prepared, *, only_inertia: bool) -> None:
+        self._prepared, self._only_inertia = prepared, only_inertia
+        self._kernel = prepared.kernel()
+
+    def write(self, points: Points, out: Mapping[str, Array]) -> RowNumbers:
+        """Write the arrays that vary between points, and return the rows not computed."""
+        count = len(points.q)
+        if count < LANES:
+            more = {key: np.empty((LANES, *array.shape[1:])) for key, array in out.items()}
+            left = self.write(points.each(_filled), more)
+            for key, array in out.items():
+                array[:] = more[key][:count]
+            return left[left < count]
+        with np.errstate(all="ignore"):
+            if self._only_inertia:
+                judged = self._kernel.write_inverse(points.q, out["B_lower"])
+                return np.flatnonzero(~self._kernel.sound(points.q, judged))
+            return np.flatnonzero(~self._anywhere(points, out))
+
+    def _anywhere(self, points: Points, out: Mapping[str, Array]) -> Mask:
+        """Write A, B, f0 and x0 about any points, and return where they are sound."""
+        ready, (q, v, u), A, B = self._prepared, points, out["A"], out["B_lower"]
+        state, actuation, count = ready.map, ready.actuation, len(q)
+        v = np.zeros((count, state.robot.nv)) if v is None else v
+        u = np.zeros((count, len(actuation.names))) if u is None else u
+        own = ready.own_reference
+        chart: Chart = Standing(count) if own else state.charts(q)
+        r_b: Array = np.zeros((count, 3)) if own else state.positions(q)
+        nu, q_m = state.velocities(v), state.joint_positions(q)
+        u = actuation.in_base_axes(chart, u)
+        nv = nu.shape[1]
+        A[:, :nv] = ready.rest["A"][:nv]
+        c, judged = self._kernel.write(q, nu, q_m, u, A, B)
+        rates = Rates(c, A[:, nv:], B, state.gravity(q))
+        f0 = assemble(state, actuation, chart, nu, u, rates, A, moving=ready.moving)
+        out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
+        out["f0"][:] = 0.0 if ready.moving else f0
+        if ready.moving:
+            out["_drift"][:] = drift(state, f0, rates.gravity)
+        # NaN compares false.
+        good = self._kernel.sound(q, judged) & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
+        for array in (A, B, f0):
+            flat = array.reshape(count, -1)
+            good &= np.vecdot(flat, flat) < LARGEST
+        return good
+
+
+def _filled(rows: Array) -> Array:
+    """Return as many rows as lanes, the last of them repeated."""
+    return np.pad(rows, ((0, LANES - len(rows)), (0, 0)), mode="edge")

@@ -7,7 +7,6 @@ those and of all other content.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +27,7 @@ FORMATS = (".npz", ".h5")
 # can crash the process.
 CHECKED = ("v108", "v108")
 
-CHUNK_SEALS = f"chunk_{SEAL}"
+CHUNK_CHECKSUMS = f"chunk_{SEAL}"
 _CHUNK_BYTES = 2**22
 
 
@@ -79,37 +78,34 @@ def write_rows(
                 count = len(next(iter(arrays.values())))
                 row = sum(value.nbytes // count for value in varying.values())
                 chunk = max(1, _CHUNK_BYTES // row)
-                seals = _chunk_seals(varying, count, chunk)
-                file.create_dataset(CHUNK_SEALS, data=seals)
-                file.create_dataset(SEAL, data=whole_seal(texts, chunk, seals, constants))
+                checksums = _chunk_checksums(varying, count, chunk)
+                file.create_dataset(CHUNK_CHECKSUMS, data=checksums)
+                file.create_dataset(SEAL, data=file_checksum(texts, chunk, checksums, constants))
                 file.attrs["chunk"] = chunk
 
 
-def chunk_seal(arrays: Mapping[str, Array]) -> bytes:
+def chunk_checksum(arrays: Mapping[str, Array]) -> bytes:
     """Return the SHA-256 of the rows of some points."""
-    digest = hashlib.sha256()
-    for _, rows in sorted(arrays.items()):
-        digest.update(np.ascontiguousarray(rows).data)
-    return digest.digest()
+    return bytes.fromhex(content_digest(arrays))
 
 
-def _chunk_seals(varying: Mapping[str, Array], count: int, chunk: int) -> NDArray[np.uint8]:
+def _chunk_checksums(varying: Mapping[str, Array], count: int, chunk: int) -> NDArray[np.uint8]:
     """Return the SHA-256 (chunks, 32) of the rows of each chunk."""
 
     def seal(start: int) -> bytes:
-        return chunk_seal({key: value[start : start + chunk] for key, value in varying.items()})
+        return chunk_checksum({key: value[start : start + chunk] for key, value in varying.items()})
 
     # hashlib releases the interpreter's lock, so that threads hash at the same time.
     with ThreadPoolExecutor() as pool:
-        seals = b"".join(pool.map(seal, range(0, count, chunk)))
-    return np.frombuffer(seals, np.uint8).reshape(-1, 32)
+        checksums = b"".join(pool.map(seal, range(0, count, chunk)))
+    return np.frombuffer(checksums, np.uint8).reshape(-1, 32)
 
 
-def whole_seal(
-    texts: Mapping[str, str], chunk: int, seals: Any, constants: Mapping[str, Array]
+def file_checksum(
+    texts: Mapping[str, str], chunk: int, checksums: Any, constants: Mapping[str, Array]
 ) -> NDArray[np.uint8]:
     """Return the SHA-256 (32,) of a file's content, with the checksums of its chunks of rows."""
-    whole = content_digest({**texts, "chunk": chunk, CHUNK_SEALS: seals, **constants})
+    whole = content_digest({**texts, "chunk": chunk, CHUNK_CHECKSUMS: checksums, **constants})
     return np.frombuffer(bytes.fromhex(whole), np.uint8)
 
 
@@ -140,15 +136,15 @@ def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, st
         texts = {key: str(value) for key, value in file.attrs.items() if isinstance(value, str)}
         arrays = {key: _mapped(path, file[key]) for key in file}
         chunk = int(file.attrs.get("chunk", 0))
-    seal, seals = arrays.pop(SEAL, None), arrays.pop(CHUNK_SEALS, None)
-    if seal is None or seals is None or not verify:
+    seal, checksums = arrays.pop(SEAL, None), arrays.pop(CHUNK_CHECKSUMS, None)
+    if seal is None or checksums is None or not verify:
         return arrays, texts, False
     constants = {key: arrays[key] for key in json.loads(texts["constant"])}
     varying = {key: value for key, value in arrays.items() if key not in constants}
     sealed = {key: value for key, value in texts.items() if key != "request"}
-    whole = chunk > 0 and np.array_equal(seal, whole_seal(sealed, chunk, seals, constants))
+    whole = chunk > 0 and np.array_equal(seal, file_checksum(sealed, chunk, checksums, constants))
     count = len(next(iter(varying.values())))
-    if not whole or not np.array_equal(seals, _chunk_seals(varying, count, chunk)):
+    if not whole or not np.array_equal(checksums, _chunk_checksums(varying, count, chunk)):
         raise ValueError(DAMAGED)
     return arrays, texts, True
 

@@ -14,12 +14,11 @@ from fflin.base.record import Design
 from fflin.base.validation import Array, vector
 from fflin.batch.files import is_constant
 from fflin.batch.linear_batch import LinearBatch
-from fflin.batch.riccati import gains_at_rest
 from fflin.batch.rows import column, positions
 from fflin.control.lqr import lqr
+from fflin.control.policies import Feedback
 from fflin.control.weights import weight
-from fflin.dynamics.state import StateMap
-from fflin.linear.fit import line_up, require_fit
+from fflin.linear.fit import line_up
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
@@ -31,6 +30,12 @@ _BLOCK = 256
 
 # Largest relative residual of a Riccati equation; a gain beyond it is computed by `lqr` instead.
 _SOUND = 1e-11
+
+# Newton steps that refine P, in the coordinates of the closed loop's motions.
+_REFINEMENTS = 2
+
+# Relative size of the odd coefficients, up to which they are rounding errors of zero.
+_ODD = 1e-12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,16 +120,14 @@ class GainBatch(Design):
 
     @cached_property
     def _axes(self) -> dict[str, Array]:
-        axes = {
-            name: np.unique(column)
-            for name, column in zip(self.joint_names, self.joint_positions.T, strict=True)
-            if np.ptp(column) > 0.0
-        }
+        columns = dict(zip(self.joint_names, self.joint_positions.T, strict=True))
+        axes = {name: np.unique(column) for name, column in columns.items() if np.ptp(column) > 0.0}
         if not axes:
             raise InputError(
                 "all points of the batch are the same, expected a grid; make one with fflin.grid"
             )
-        if np.prod([len(values) for values in axes.values()]) != len(self):
+        points = np.unique(self.joint_positions, axis=0)
+        if not len(points) == len(self) == np.prod([len(values) for values in axes.values()]):
             raise InputError(
                 f"the {len(self)} points are not on a grid over {', '.join(axes)}, which "
                 "interpolation needs; make the points with fflin.grid"
@@ -135,22 +138,11 @@ class GainBatch(Design):
     def _interpolator(self) -> Any:
         from scipy.interpolate import RegularGridInterpolator
 
-        at = [
-            np.searchsorted(values, self.joint_positions[:, self.joint_names.index(name)])
-            for name, values in self._axes.items()
-        ]
-        shape = tuple(len(values) for values in self._axes.values())
-        order = np.ravel_multi_index(at, shape)
-        if len(np.unique(order)) != len(self):
-            raise InputError(
-                f"the points are not on a grid over {', '.join(self._axes)}, which interpolation "
-                "needs; make the points with fflin.grid"
-            )
-        K = np.empty_like(self.K)
-        K[order] = self.K
-        return RegularGridInterpolator(
-            tuple(self._axes.values()), K.reshape(*shape, *K.shape[1:]), method="linear"
-        )
+        # On a whole grid, points in the order of their joint positions have the last vary fastest.
+        order = np.lexsort(self.joint_positions.T[::-1])
+        shape = [len(values) for values in self._axes.values()]
+        K = self.K[order].reshape(*shape, *self.K.shape[1:])
+        return RegularGridInterpolator(tuple(self._axes.values()), K, method="linear")
 
 
 def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
@@ -208,7 +200,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         for start in range(0, len(batch), _BLOCK):
             rows = slice(start, start + _BLOCK)
             with np.errstate(all="ignore"):
-                K[rows], residual[rows], margin[rows] = gains_at_rest(
+                K[rows], residual[rows], margin[rows] = _gains_at_rest(
                     rates, batch.B_lower[rows], Q, R
                 )
     # NaN compares false, so that it is among them.
@@ -232,8 +224,73 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class ScheduledFeedback:
+def _gains_at_rest(rates: Array, L: Array, Q: Array, R: Array) -> tuple[Array, Array, Array]:
+    """Return K, residuals and margins of a block; what it cannot do has a NaN residual."""
+    count, m, nu = L.shape
+    nothing = np.full((count, nu, 2 * m), np.nan), *np.full((2, count), np.nan)
+    factor = np.linalg.cholesky(R)
+    white = np.linalg.solve(factor, np.swapaxes(L, 1, 2))
+    # L R^-1 L' = Ls Ls', without squaring its condition; R^-1 L' Ls^-T takes p'' to u.
+    unit, upper = np.linalg.qr(white)
+    Ls = np.swapaxes(upper, 1, 2)
+    drive = np.linalg.solve(factor.T, unit)
+    T = np.zeros((count, 2 * m, 2 * m))
+    T[:, :m, :m], T[:, m:, m:] = rates[:, None] * Ls, Ls
+    cost = np.swapaxes(T, 1, 2) @ Q @ T
+    S, D, mixed = cost[:, :m, :m], cost[:, m:, m:], cost[:, :m, m:]
+    odd = np.abs(mixed - np.swapaxes(mixed, 1, 2)).max(axis=(1, 2))
+    try:
+        G = np.linalg.cholesky(S)
+        C = np.zeros((count, 2 * m, 2 * m))
+        C[:, :m, m:], C[:, m:, :m], C[:, m:, m:] = np.swapaxes(G, 1, 2), -G, D
+        squares, motions = np.linalg.eig(C)
+        poles = -np.sqrt(squares.astype(complex))
+        a = motions[:, m:] * np.ones(1, dtype=complex)
+        motions = T @ np.concatenate((a / squares[:, None], a / poles[:, None]), axis=1)
+        inverse = np.linalg.inv(motions)
+    except np.linalg.LinAlgError:
+        return nothing
+    # K x = -u of the motions.
+    P = _cost_to_go(rates, L, Q, R, -(drive @ (a @ inverse).real))
+    for _ in range(_REFINEMENTS):
+        left, _ = _riccati(rates, L, Q, R, P)
+        turned = np.swapaxes(motions, 1, 2) @ left @ motions
+        turned /= -(poles[:, :, None] + poles[:, None])
+        P = P + (np.swapaxes(inverse, 1, 2) @ turned @ inverse).real
+    left, scale = _riccati(rates, L, Q, R, P)
+    residual = np.linalg.norm(left, axis=(1, 2)) / scale
+    residual[odd > _ODD * np.abs(cost).max(axis=(1, 2))] = np.nan
+    K = np.linalg.solve(R, np.swapaxes(L, 1, 2) @ P[:, m:])
+    # The squares of the poles that K was made from lose the digits of slow ones beside fast ones.
+    moved = np.concatenate((rates[:, None] * motions[:, m:], -L @ (K @ motions)), axis=1)
+    poles = np.einsum("nij,nji->ni", inverse, moved)
+    return K, residual, -poles.real.max(axis=1)
+
+
+def _cost_to_go(rates: Array, L: Array, Q: Array, R: Array, K: Array) -> Array:
+    """Return the P (count, nx, nx) of optimal gains."""
+    m = len(rates)
+    lower = np.linalg.pinv(np.swapaxes(L, 1, 2)) @ (R @ K)
+    spent = np.swapaxes(K, 1, 2) @ R @ K
+    upper = (spent[:, :m, m:] - Q[:m, m:]) / rates
+    across = np.swapaxes(lower[:, :, :m], 1, 2)
+    P: Array = np.concatenate((np.concatenate((upper, across), axis=2), lower), axis=1)
+    return 0.5 * (P + np.swapaxes(P, 1, 2))
+
+
+def _riccati(rates: Array, L: Array, Q: Array, R: Array, P: Array) -> tuple[Array, Array]:
+    """Return ``Q + A'P + P A - P B R^-1 B'P`` and the sum of the norms of its terms."""
+    m = len(rates)
+    PA = np.zeros_like(P)
+    PA[:, :, m:] = P[:, :, :m] * rates
+    BP = np.swapaxes(L, 1, 2) @ P[:, m:]
+    spent = np.swapaxes(BP, 1, 2) @ np.linalg.solve(R, BP)
+    scale = np.linalg.norm(Q) + sum(np.linalg.norm(term, axis=(1, 2)) for term in (PA, PA, spent))
+    return Q + PA + np.swapaxes(PA, 1, 2) - spent, scale
+
+
+@dataclass(eq=False)
+class ScheduledFeedback(Feedback):
     """Gain-scheduled feedback ``u = u0 - K(q_m) (x - x0)``, interpolated over a grid.
 
     Parameters
@@ -276,7 +333,7 @@ class ScheduledFeedback:
             joint_names=tuple(by.joint_names[k] for k in here),
             joint_positions=by.joint_positions[:, here],
         )
-        object.__setattr__(self, "gains", lined)
+        self.gains = lined
         _ = lined.grid
 
     def table(self) -> tuple[dict[str, Array], Array]:
@@ -287,8 +344,7 @@ class ScheduledFeedback:
     def bind(self, robot: Robot) -> Any:
         """Return policy(t, q, v) -> u for a robot; see `StateFeedback.bind` for errors."""
         lin, gains = self.lin, self.gains
-        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-        require_fit(lin, robot, state)
+        state = self.state_map(robot)
         columns = [column(robot.joint(name)) for name in gains.joint_names]
 
         def policy(_: float, q: Array, v: Array) -> Array:

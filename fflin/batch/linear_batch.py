@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import numpy as np
 
 from fflin.base.errors import InputError, unknown
-from fflin.base.frozen import FrozenArrays, frozen
-from fflin.base.record import NOT_VERIFIED
-from fflin.base.validation import Array, number, refuse_masked
+from fflin.base.record import NOT_VERIFIED, reading
+from fflin.base.validation import Array, FrozenArrays, frozen, number, refuse_masked
 from fflin.base.writing import as_path
-from fflin.batch.batch_record import read_batch, texts_of
-from fflin.batch.files import is_constant, write_rows
+from fflin.batch.files import is_constant, read_rows, write_rows
 from fflin.batch.rows import Column, away, positions, values
+from fflin.dynamics.orbital import mean_motion
+from fflin.linear.files import given
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
@@ -62,9 +64,10 @@ class LinearBatch(FrozenArrays):
         SHA-256 of the URDF, and versions of the packages that made the batch.
     locked : tuple of str
         Names of the locked joints.
-    columns : tuple of (int, int)
+    columns : tuple of (int, int, float)
         Indices of each joint's entries in q: (index, -1) for one angle or length, or the indices of
-        cos and sin for a continuous joint.
+        cos and sin for a continuous joint; and the entry for a unit of q_m, which is 1 except for
+        modal amplitudes.
     verified : bool
         Whether the data is known to be unchanged. False for a file without a checksum, or if the
         checksum was not verified.
@@ -108,13 +111,9 @@ class LinearBatch(FrozenArrays):
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # What models ask their robot for, by the names of their fields.
+    # Fields of the models that the robot computes, by name.
     _asked: Mapping[str, Any]
     verified: bool = True
-
-    def __post_init__(self) -> None:
-        for name, value in self._arrays().items():
-            object.__setattr__(self, name, frozen(value.view()))
 
     def __len__(self) -> int:
         return len(self.q)
@@ -151,7 +150,7 @@ class LinearBatch(FrozenArrays):
         rows: dict[str, Any] = {
             key: np.broadcast_to(value[0], (count, *value.shape[1:]))
             if is_constant(value)
-            else value[index]
+            else frozen(value[index])
             for key, value in self._arrays().items()
         }
         return replace(self, **rows)
@@ -180,9 +179,7 @@ class LinearBatch(FrozenArrays):
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the n independent joints in state order."""
-        return tuple(
-            name.removeprefix("q_m.") for name in self.state_names if name.startswith("q_m.")
-        )
+        return _joints(self.state_names)
 
     @property
     def joint_positions(self) -> Array:
@@ -252,8 +249,7 @@ class LinearBatch(FrozenArrays):
         """
         if not len(self):
             raise InputError("the batch has no points; there is nothing to save")
-        texts = texts_of(self, len(self))
-        write_rows(as_path(path), self._arrays(), texts, sealed=self.verified)
+        write_rows(as_path(path), self._arrays(), self.header(len(self)), sealed=self.verified)
 
     @staticmethod
     def load(path: str | Path, robot: Robot | None = None, *, verify: bool = True) -> LinearBatch:
@@ -278,26 +274,61 @@ class LinearBatch(FrozenArrays):
         MissingPackageError
             If h5py is needed and not installed.
         """
-        return LinearBatch(**read_batch(as_path(path), robot, verify=verify))
+        source = as_path(path)
+        with reading(source, "batch"):
+            arrays, constant, texts, verified = read_rows(source, verify=verify)
+            header = json.loads(texts["header"])
+            found = _checked_fields(arrays, header, constant)
+            ignorable = tuple(header["_ignorable"])
+            n = float(header.get("mean_motion", 0.0))
+        if robot is None:
+            asked = {
+                "_certify": partial(_refuse, "certificate", found["robot"]),
+                "_inertia": partial(_refuse, "inertia M", found["robot"]),
+                "_ignorable": partial(given, ignorable),
+                "_limits": dict,
+                "weights": {},
+                "mean_motion": n,
+                "dt": 0.0,
+            }
+            return LinearBatch(**found, _asked=asked, verified=verified)
+        own = robot.urdf_sha256, robot.locked, robot.joint_names, mean_motion(robot)
+        if own != (found["urdf_sha256"], found["locked"], _joints(found["state_names"]), n):
+            raise InputError(
+                f"robot '{robot.name}' differs from the robot '{found['robot']}' of the batch in "
+                "its URDF, joints or orbit; give the robot that the batch was made of"
+            )
+        from fflin.linear.linearization import prepare
+
+        common = prepare(robot, frame=found["frame"], reference=None, moving=found["moving"]).common
+        return LinearBatch(**found, _asked=fields_of_model(common), verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
-        """Return the arrays that are held, all with N rows, by the fields' names."""
-        held = ((item.name, getattr(self, item.name)) for item in fields(self))
-        return {name: value for name, value in held if isinstance(value, np.ndarray)}
+        """Return the arrays that vary or may vary between the points, by name."""
+        held = {key: getattr(self, key) for key in (*_ARRAYS, *_OPTIONAL_ARRAYS)}
+        return {key: value for key, value in held.items() if value is not None}
+
+    def header(self, count: int) -> dict[str, str]:
+        """Return the header of a file with so many points, as one JSON document."""
+        first = self[0]
+        header = {key: getattr(self, key) for key in _TEXTS}
+        header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}
+        return {"header": json.dumps({**header, "points": count, "columns": self.columns})}
 
     def _model(self, index: int) -> LinearModel:
-        common = {item.name: vars(self).get(item.name) for item in fields(LinearModel)}
+        common: dict[str, Any] = dict.fromkeys(_MODEL)  # None unless it is set below
+        common |= {key: getattr(self, key) for key in (*_TEXTS, "verified")}
         # A row of a file is read here, so that no model keeps the file open.
         rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
         lower, root = rows.pop("B_lower"), rows.pop("_root")
-        B = frozen(np.concatenate((np.zeros_like(lower), lower)))
-        x0 = rows.pop("_x0", None)
-        if x0 is None:
-            x0 = self._states_at_rest(rows["q"][None])[0]
-        made = {"B": B, "x0": x0, "y0": rows.pop("_y0", x0), "dt": 0.0}
-        if "_reference" not in rows:
-            made["_reference"] = _in_world(root, rows["q"][:7])
-        return LinearModel.from_fields({**common, **rows, **made, **self._asked})
+        rows["B"] = frozen(np.concatenate((np.zeros_like(lower), lower)))
+        rows["x0"] = (
+            self._states_at_rest(rows["q"][None])[0] if self._x0 is None else rows.pop("_x0")
+        )
+        rows["y0"] = rows.pop("_y0", rows["x0"])
+        if self._reference is None:
+            rows["_reference"] = _in_world(root, rows["q"][:7])
+        return LinearModel.from_fields({**common, **rows, **self._asked})
 
     def _states_at_rest(self, q: Array) -> Array:
         q_m = positions(q, self.columns)
@@ -312,6 +343,58 @@ class LinearBatch(FrozenArrays):
             if name not in self.joint_names:
                 raise unknown("joint", name, self.joint_names)
         return {self.joint_names.index(name): value for name, value in joints.items()}
+
+
+# The fields of a batch by kind, in their order: texts are the same at all points and stand in the
+# header of a file, arrays have one row per point.
+_KINDS = {item.name: str(item.type) for item in fields(LinearBatch)}
+_MODEL = {item.name for item in fields(LinearModel)} - {"verified"}
+_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array"]
+_OPTIONAL_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array | None"]
+_TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
+
+
+def fields_of_model(common: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields that are the same for all models and that a batch does not have."""
+    return {key: value for key, value in common.items() if key not in _KINDS}
+
+
+def _checked_fields(
+    arrays: dict[str, Array], header: dict[str, Any], constant: list[str]
+) -> dict[str, Any]:
+    """Return the fields of a batch from the content of its file, or raise `ValueError`."""
+    count = int(header["points"])
+    found: dict[str, Any] = dict.fromkeys(_OPTIONAL_ARRAYS)
+    for key in (*_ARRAYS, *(arrays.keys() & set(_OPTIONAL_ARRAYS))):
+        array = arrays[key]
+        if key in constant:
+            array = np.broadcast_to(array, (count, *array.shape))
+        if array.dtype != np.float64 or len(array) != count:
+            raise ValueError(f"{key} has {len(array)} rows of {array.dtype}, expected {count}")
+        found[key] = frozen(array)
+    for key in _TEXTS:
+        found[key] = tuple(header[key]) if isinstance(header[key], list) else header[key]
+    found["columns"] = tuple(
+        (int(first), int(second), float(scale[0]) if scale else 1.0)
+        for first, second, *scale in header["columns"]
+    )
+    nx, nu, ny = (len(found[f"{kind}_names"]) for kind in ("state", "input", "output"))
+    shapes = {"A": (nx, nx), "B_lower": (nx // 2, nu), "C": (ny, nx), "D": (ny, nu), "f0": (nx,)}
+    for key, shape in shapes.items():
+        if found[key].shape[1:] != shape:
+            raise ValueError(f"{key} has shape {found[key].shape[1:]} a point, expected {shape}")
+    return found
+
+
+def _joints(state_names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name.removeprefix("q_m.") for name in state_names if name.startswith("q_m."))
+
+
+def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:
+    raise InputError(
+        f"the {what} is not in the file and is computed from the robot; load the batch with "
+        f"LinearBatch.load(path, robot), with the unchanged robot '{name}'"
+    )
 
 
 def _in_world(root: Array, base: Array) -> Array:

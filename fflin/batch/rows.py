@@ -9,12 +9,12 @@ import numpy as np
 
 from fflin.base.errors import FflinError, InputError
 from fflin.base.validation import NORM_TOLERANCE, Array, as_double, dimension, vector
-from fflin.robot.coordinates import ROUND_OFF
-from fflin.robot.joints import Joint
+from fflin.robot.joints import ROUND_OFF, Joint
 from fflin.robot.robot import Robot
 
-# Where a joint stands in q: (index, -1), or, where it is stored so, those of (cos, sin).
-Column: TypeAlias = tuple[int, int]
+# Where a joint stands in q: (index, -1), or, where it is stored so, those of (cos, sin); and the
+# entry for a unit of its value.
+Column: TypeAlias = tuple[int, int, float]
 
 # Rows that are checked at once, which bounds the memory of what is computed on the way.
 _BLOCK = 2048
@@ -35,14 +35,14 @@ class Points(NamedTuple):
 
 def column(joint: Joint) -> Column:
     """Return where a joint stands in q."""
-    return joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1
+    return joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1, joint.scale
 
 
 def values(q: Array, column: Column) -> Array:
     """Return a joint's angle or length (N,) at configurations (N, nq)."""
-    first, second = column
+    first, second, scale = column
     at: Array = q[:, first] if second < 0 else np.arctan2(q[:, second], q[:, first])
-    return at
+    return at / scale
 
 
 def positions(q: Array, columns: Sequence[Column]) -> Array:

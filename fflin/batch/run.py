@@ -1,24 +1,82 @@
 """Run of a job over rows, chunk by chunk, into a store that may already hold some chunks.
 
-This module is independent of the meaning of the rows and of the job's results.
+Chunks run on threads of this process, or on the workers of an executor; a chunk is repeated if its
+worker dies. This module is independent of the meaning of the rows and of the job's results.
 """
 
 from __future__ import annotations
 
+import hashlib
+import pickle
 import warnings
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from typing import Any
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
-from fflin.base.validation import whole
-from fflin.batch.dispatch import Dispatch, Done, Job, Rows, Span
+from fflin.base.validation import Array, whole
 from fflin.batch.store import FileStore, MemoryStore
+from fflin.batch.workers import NoWorkers, WorkerDied
 
+# A chunk whose worker dies is given to another, up to this many times.
+_ATTEMPTS = 3
+
+# Chunks that are submitted for each worker at a time, so that none is idle between two.
+_QUEUED = 2
+
+# How often the worker processes are checked while no chunk is finished [s].
+_POLL_PERIOD = 1.0
+
+# Assumed of an executor that does not tell how many workers it has.
+_UNKNOWN_WORKERS = 16
+
+Rows = Callable[[int, int], Any]
 Progress = Callable[[int, int], object]
+
+
+class Span(NamedTuple):
+    """The rows of a chunk, start up to but not including stop."""
+
+    start: int
+    stop: int
+
+
+class ChunkResult(NamedTuple):
+    """The result of a chunk: its arrays by name, and the warnings on the way."""
+
+    arrays: dict[str, Array]
+    notes: list[str]
+
+
+class Job(Protocol):
+    """Computation on rows; it is pickled, and sent to every worker once."""
+
+    @property
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        """Shape of each array that it makes, for one row."""
+
+    def run(self, rows: Any, start: int, out: Mapping[str, Array] | None = None, /) -> ChunkResult:
+        """Do the rows from number `start` on, into arrays `out` or new ones; on any thread."""
+
+
+class Done(NamedTuple):
+    """Finished chunk: its result, or the reason of its failure."""
+
+    span: Span
+    result: ChunkResult | None
+    reason: str
 
 
 def check_workers(executor: Any, workers: Any, threads: Any, chunk: Any, progress: Any) -> None:
@@ -88,7 +146,7 @@ def failure(
     for (start, stop), *_ in failed:
         kept[start:stop] = False
     numbers = listed(f"{start} to {stop - 1}" for (start, stop), *_ in failed)
-    said = (
+    message = (
         f"{len(failed)} of {-(-store.count // store.chunk)} chunks "
         f"{'has' if len(failed) == 1 else 'have'} failed, {of_what} {numbers}: "
         f"{failed[0].reason}"
@@ -97,19 +155,19 @@ def failure(
     if not kept.any():
         store.discard()
     elif store.part is not None:
-        said += f"; the other chunks are in {store.part}, and the same call resumes from them"
+        message += f"; the other chunks are in {store.part}, and the same call resumes from them"
     else:
         batch = made(kept)
-        said += "; the other chunks are in the `batch` of this error"
-    return SweepError(said, tuple((*span, reason) for span, _, reason in failed), batch)
+        message += "; the other chunks are in the `batch` of this error"
+    return SweepError(message, tuple((*span, reason) for span, _, reason in failed), batch)
 
 
 def _run_here(
     job: Job, rows: Rows, store: FileStore | MemoryStore, spans: list[Span], threads: int
 ) -> Iterator[Done]:
     def run(span: Span) -> Done:
-        place = store.place(*span)
-        out = None if place is None else {key: place[key] for key in job.shapes}
+        view = store.view(*span)
+        out = None if view is None else {key: view[key] for key in job.shapes}
         try:
             return Done(span, job.run(rows(*span), span.start, out), "")
         except FflinError as error:
@@ -130,3 +188,144 @@ def _run_here(
     finally:
         # Without waiting, so that Ctrl-C ends a compilation too.
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+class Dispatch:
+    """Waiting and running chunks, the number of attempts for each, and the workers."""
+
+    def __init__(self, job: Job, rows: Rows, spans: list[Span], workers: Executor) -> None:
+        content = pickle.dumps(job)
+        self._parcel = Parcel(hashlib.sha256(content).hexdigest(), content)
+        self._rows, self._workers, self._ahead = rows, workers, _QUEUED * _count(workers)
+        self._waiting = spans[::-1]
+        self._running: dict[Future[ChunkResult | None], Span] = {}
+        self._attempts: Counter[Span] = Counter()
+        self._broken: BaseException | None = None
+        self._known = False
+
+    def __iter__(self) -> Iterator[Done]:
+        try:
+            while self._waiting or self._running:
+                while self._waiting and len(self._running) < self._ahead and not self._broken:
+                    self._submit(self._waiting.pop(), None if self._known else self._parcel.content)
+                if self._running:
+                    yield from self._finished()
+                if self._broken:
+                    yield from self._given_up(self._broken)
+        finally:
+            for future in self._running:
+                future.cancel()
+
+    def _submit(self, span: Span, content: bytes | None) -> None:
+        """Begin a chunk, or put it back where the executor is dead."""
+        arguments = self._parcel._replace(content=content), self._rows(*span), span.start
+        try:
+            future = self._workers.submit(work, *arguments)
+        except Exception as error:  # broken, shut down, or of its own
+            self._waiting.append(span)
+            self._broken = error
+        else:
+            self._attempts[span] += 1
+            self._running[future] = span
+
+    def _finished(self) -> Iterator[Done]:
+        """Wait for a chunk and yield what is finished."""
+        for future in self._wait():
+            span = self._running.pop(future)
+            try:
+                chunk = future.result()
+            except FflinError as error:
+                yield Done(span, None, str(error))
+            except WorkerDied as error:
+                yield from self._lost(span, str(error))
+            except (BrokenExecutor, CancelledError) as error:
+                self._broken = self._broken or error
+                self._waiting.append(span)
+            except Exception as error:
+                # Executors have errors of their own, such as of a scheduler that lost a worker.
+                yield from self._lost(span, f"{type(error).__name__}: {error}")
+            else:
+                if chunk is None:
+                    self._attempts[span] -= 1
+                    self._submit(span, self._parcel.content)
+                else:
+                    self._known = True
+                    yield Done(span, chunk, "")
+
+    def _wait(self) -> set[Future[ChunkResult | None]]:
+        pool = self._workers if isinstance(self._workers, ProcessPoolExecutor) else None
+        hung = False
+        while not (
+            done := wait(self._running, _POLL_PERIOD if pool else None, FIRST_COMPLETED).done
+        ):
+            assert pool is not None
+            processes = list((pool._processes or {}).values())
+            if hung:
+                # It waits for the rest of a result whose worker was killed as it sent it, as long
+                # as anybody could still write to the pipe that all workers and this process share.
+                # Where nobody can, it finds itself broken, and its futures with it.
+                for process in processes:
+                    process.kill()
+                channel: Any = pool._result_queue
+                channel._writer.close()
+            hung = any(process.exitcode not in (None, 0) for process in processes)
+        return done
+
+    def _lost(self, span: Span, reason: str) -> Iterator[Done]:
+        """Put a chunk back whose worker died, or give it up."""
+        if self._attempts[span] < _ATTEMPTS:
+            self._waiting.append(span)
+        else:
+            yield Done(span, None, reason)
+
+    def _given_up(self, error: BaseException) -> Iterator[Done]:
+        """Yield the chunks that an executor took with it when it died."""
+        reason = f"the executor failed: {type(error).__name__}: {error}".rstrip(": ")
+        if isinstance(error, NoWorkers):
+            reason = str(error)
+        running, self._running = self._running, {}
+        waiting, self._waiting = self._waiting, []
+        for future, span in running.items():
+            # Some were finished before it died.
+            good = future.done() and not future.cancelled() and future.exception() is None
+            chunk = future.result() if good else None
+            yield Done(span, chunk, "" if chunk is not None else reason)
+        for span in reversed(waiting):
+            yield Done(span, None, reason)
+
+
+class Parcel(NamedTuple):
+    """A job as it is sent: under a key, and its content only where a worker may not have it."""
+
+    key: str
+    content: bytes | None
+
+
+# The jobs that this worker has received; the oldest is dropped first.
+_JOBS: dict[str, Job] = {}
+_KEPT = 4
+
+
+def work(parcel: Parcel, rows: Any, start: int) -> ChunkResult | None:
+    """Do a chunk in a worker, or return None where the worker does not have the job."""
+    job = _JOBS.get(parcel.key)
+    if job is None:
+        if parcel.content is None:
+            return None
+        job = pickle.loads(parcel.content)
+        while len(_JOBS) >= _KEPT:
+            _JOBS.pop(next(iter(_JOBS)), None)
+        _JOBS[parcel.key] = job
+    return job.run(rows, start)
+
+
+def _count(executor: Executor) -> int:
+    """Return the number of workers of an executor, or a default if it is not known."""
+    for name in ("_max_workers", "num_workers"):
+        count = getattr(executor, name, None)
+        if isinstance(count, int) and count > 0:
+            return count
+    client = getattr(executor, "_client", None)
+    if client is not None and hasattr(client, "nthreads"):
+        return max(1, sum(client.nthreads().values()))
+    return _UNKNOWN_WORKERS

@@ -15,7 +15,14 @@ from fflin.base.errors import FileError, InputError
 from fflin.base.record import SEAL
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_place, install, reason, reserve
-from fflin.batch.files import CHECKED, CHUNK_SEALS, check_format, chunk_seal, hdf5, whole_seal
+from fflin.batch.files import (
+    CHECKED,
+    CHUNK_CHECKSUMS,
+    check_format,
+    chunk_checksum,
+    file_checksum,
+    hdf5,
+)
 
 # Allowance for what a file has besides its rows: names, constant arrays, digests [bytes].
 _OVERHEAD = 2**16
@@ -37,15 +44,15 @@ class MemoryStore:
 
     def read(self, stop: int) -> dict[str, Array]:
         """Return the rows before one."""
-        return self.place(0, stop)
+        return self.view(0, stop)
 
-    def place(self, start: int, stop: int) -> dict[str, Array]:
+    def view(self, start: int, stop: int) -> dict[str, Array]:
         """Return where the rows of a chunk are, to be written."""
         return {key: value[start:stop] for key, value in self.arrays.items()}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
         """Keep a finished chunk."""
-        for key, rows in self.place(start, stop).items():
+        for key, rows in self.view(start, stop).items():
             if not np.may_share_memory(rows, arrays[key]):
                 rows[:] = arrays[key]
         self._written.add(start)
@@ -99,7 +106,7 @@ class FileStore:
                 _reserve(self._file, key, (self.count, *shape))
             for key, value in self._constants.items():
                 self._file.create_dataset(key, data=value)
-            self._file[CHUNK_SEALS] = np.zeros((-(-self.count // self.chunk), 32), np.uint8)
+            self._file[CHUNK_CHECKSUMS] = np.zeros((-(-self.count // self.chunk), 32), np.uint8)
             self._file[SEAL] = np.zeros(32, np.uint8)
             self._file.attrs.update({**self._texts, "chunk": self.chunk, "request": request})
             self._file.flush()
@@ -143,8 +150,8 @@ class FileStore:
     def finished(self, start: int, stop: int) -> bool:
         """Whether a chunk is there, and is what was written."""
         with self._readable():
-            kept = self._file[CHUNK_SEALS][start // self.chunk]
-            return bool(kept.any()) and kept.tobytes() == chunk_seal(
+            kept = self._file[CHUNK_CHECKSUMS][start // self.chunk]
+            return bool(kept.any()) and kept.tobytes() == chunk_checksum(
                 {key: self._file[key][start:stop] for key in self.names}
             )
 
@@ -153,7 +160,7 @@ class FileStore:
         with self._readable():
             return {key: self._file[key][:stop] for key in self.names}
 
-    def place(self, start: int, stop: int) -> None:
+    def view(self, start: int, stop: int) -> None:
         """Return where the rows of a chunk are, to be written: nowhere in memory."""
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
@@ -162,15 +169,15 @@ class FileStore:
             for key in self.names:
                 self._file[key][start:stop] = arrays[key]
             self._file.flush()
-            seal = chunk_seal({key: arrays[key] for key in self.names})
-            self._file[CHUNK_SEALS][start // self.chunk] = np.frombuffer(seal, np.uint8)
+            seal = chunk_checksum({key: arrays[key] for key in self.names})
+            self._file[CHUNK_CHECKSUMS][start // self.chunk] = np.frombuffer(seal, np.uint8)
             self._file.flush()
 
     def complete(self) -> None:
         """Add the hash of all and, where the target is HDF5 too, take its place."""
         with self._writable():
-            seals = self._file[CHUNK_SEALS][:]
-            self._file[SEAL][:] = whole_seal(self._texts, self.chunk, seals, self._constants)
+            checksums = self._file[CHUNK_CHECKSUMS][:]
+            self._file[SEAL][:] = file_checksum(self._texts, self.chunk, checksums, self._constants)
             self._file.close()
             if self.path.suffix == ".h5":
                 install(self.part, self.path)

@@ -3,31 +3,77 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from fflin.base import intervals
 from fflin.base.errors import InputError, unknown
-from fflin.base.frozen import FrozenArrays
 from fflin.base.intervals import Estimate
 from fflin.base.record import reading
-from fflin.base.validation import Array, share, whole
+from fflin.base.validation import Array, FrozenArrays, share, whole
 from fflin.base.writing import as_path
 from fflin.batch.files import read_rows, write_rows
-from fflin.campaign.conditions import Bound, bounds_of
 from fflin.campaign.report import campaign_report
 from fflin.campaign.spreads import SEED
-from fflin.campaign.tally import KINDS
+from fflin.campaign.statistics import KINDS
 
 if TYPE_CHECKING:
     from fflin.campaign.runs import CampaignJob
     from fflin.simulation.motion import Motion
 
-NOT_RUN = -1.0  # where `stop` is this, a file has no run
+NOT_RUN = -1.0  # value of `stop` in the rows of a file that contain no run
+
+_COMPARED = re.compile(r"\s*(.+?)\s*(<=|>=|<|>)\s*([-+.\de]+)\s*(.*?)\s*")
+_COMPARE = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}
+_DEGREE = math.pi / 180.0
+_FACTORS = {  # from the unit of a condition to the unit of a figure
+    ("deg", "rad"): _DEGREE,
+    ("rad", "deg"): 1.0 / _DEGREE,
+    ("deg/s", "rad/s"): _DEGREE,
+    ("mm", "m"): 1e-3,
+    ("mm/s", "m/s"): 1e-3,
+}
+
+
+class Bound(NamedTuple):
+    """Comparison in a condition, and which runs (N,) meet it."""
+
+    name: str
+    sign: str
+    limit: float
+    met: Any
+
+
+def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> list[Bound]:
+    """Return the comparisons in a condition such as ``attitude < 1 deg and settle < 40 s``.
+
+    `figure` returns the values (N,) and the unit of a name.
+    """
+    bounds = []
+    for part in condition.split(" and "):
+        match = _COMPARED.fullmatch(part)
+        try:
+            name, sign, bound, unit = match.groups() if match else ("", "", "", "")
+            limit = float(bound)
+        except ValueError:
+            raise InputError(
+                f"condition {part!r} cannot be read, expected NAME < NUMBER UNIT, such as "
+                "'attitude < 1 deg'"
+            ) from None
+        values, own = figure(name)
+        factors = [_FACTORS.get((unit, each), 0.0) for each in own.split("|")]
+        factor = 1.0 if unit in ("", own, *own.split("|")) else max(factors)
+        if not factor:
+            raise InputError(f"condition {part!r} has the unit {unit}, expected {own or 'no unit'}")
+        limit *= factor
+        bounds.append(Bound(name, sign, limit, _COMPARE[sign](values, limit)))
+    return bounds
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -284,7 +330,7 @@ class Campaign(FrozenArrays):
 
     def courses(self, runs: Sequence[int], most: int) -> list[Array]:
         """Return up to `most` + 1 evenly spaced configurations (.., nq) of each given run."""
-        return self._flown().courses(np.array(self.drawn[list(runs)]), most)
+        return self._flown().paths(np.array(self.drawn[list(runs)]), most)
 
     def _flown(self) -> CampaignJob:
         if self._job is None:

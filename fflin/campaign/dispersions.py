@@ -1,64 +1,81 @@
-"""Dispersions: the spreads by name, and the robots and starts that their draws give."""
+"""Dispersions: random draws by name, and the robots and initial states that they give."""
 
 from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import replace
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import ChartError, InputError, UnknownNameError
 from fflin.base.names import by_name, input_keys
-from fflin.base.progress import Progress
+from fflin.base.process import Progress
 from fflin.base.validation import Array, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
-from fflin.campaign.sensing import Bound, misled, noise_of
 from fflin.campaign.spreads import SEED, deviation_of, inverse_of, is_closed_form, whole_number
 from fflin.control.linear_controller import LinearController
-from fflin.control.output_feedback import TrajectoryOutputFeedback
-from fflin.control.policies import Allocation, StateFeedback, bound
+from fflin.control.policies import Allocation, Policy, StateFeedback, bound
+from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
-from fflin.kernel.accelerations import loads_of
-from fflin.kernel.tree import Tree
-from fflin.robot.frames import ROOT
-from fflin.robot.link_masses import Piece, pieces_of, with_share
-from fflin.robot.mass_properties import stretched, with_inertias
-from fflin.simulation.plant import Drives, Plant
+from fflin.kernel.forward import ActuatorFaults
+from fflin.kernel.tree import Tree, loads_of
+from fflin.robot.joints import ROOT
+from fflin.robot.mass_properties import Piece, varied, with_changed
+from fflin.robot.robot import Robot
+from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
+from fflin.uncertainty.parameters import bodies_named
 
 _BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
 _GLANCE = 0.3  # seconds of drawing from one look at its progress to the next
-_OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz"}  # with their axes
+_OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
 _AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
 _OF_SENSORS = ("sensor", "noise")
-_FACTORS = ("mass", "inertia", "density", *_OF_SPRINGS)
+_FACTORS = ("mass", "inertia", "density", "frequency", *_OF_SPRINGS)
 
 
 class Column(NamedTuple):
-    """A number that is drawn for each run, what it changes and of whom; of several if tied."""
+    """A number that is drawn for each run, and the quantities that it changes."""
 
     name: str
-    kind: str  # "state", "delay", "seed" of noise, or what a name ends with
-    at: tuple[tuple[int, int], ...]  # each state, body, joint, input or sensor, and which axis
+    kind: str  # "state", "delay", "seed" of noise, or the ending of a name
+    at: tuple[tuple[int, int], ...]  # index of each state, body, joint, input or sensor, and axis
     inverse: Callable[[Array], Array]  # of the distribution function
 
 
 class Draws(NamedTuple):
-    """Rows of what is drawn: the values (N, k), and the numbers of the runs (N,)."""
+    """Drawn values (N, k) of some runs, and the numbers of these runs (N,)."""
 
     drawn: Array
     run: Array
 
+    def part(self, start: int, stop: int) -> Draws:
+        """Return the runs from `start` up to `stop`."""
+        return Draws(self.drawn[start:stop], self.run[start:stop])
+
+
+class Bound(NamedTuple):
+    """A policy that a function makes for a robot."""
+
+    bind: Callable[[Robot], Policy]
+
+
+def noise_generator(seed: float) -> np.random.Generator:
+    """Return the generator of the noise of a run."""
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
+
 
 class Dispersions:
-    """Dispersions of `monte_carlo`, and the robots and starts x0 (nx,) that their draws give."""
+    """Dispersions of `monte_carlo`: draws, and the robots and initial states that they give."""
 
     def __init__(
         self, given: Any, plant: Plant, policy: Any, x0: Array, seed: int, times: Times
@@ -66,8 +83,6 @@ class Dispersions:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
         self._model = plant.robot._bare.model
-        bodies = ["base", *list(self._model.names)[ROOT + 1 :]]
-        self._links = {n: each for n, each in pieces_of(plant.robot)[0].items() if not each.whole}
         self._sensors: tuple[str, ...] = ()
         if isinstance(policy, StateFeedback | LinearController):
             lin = policy.lin
@@ -78,11 +93,15 @@ class Dispersions:
         known = {
             "state": plant.state.names,
             **dict.fromkeys(_OF_SENSORS, self._sensors),
-            **dict.fromkeys(_OF_BODIES, bodies),
-            "density": tuple(self._links),
+            **dict.fromkeys(_OF_BODIES, tuple(plant.robot.pieces)),
             **dict.fromkeys((*_OF_INPUTS, "misalignment"), input_keys(plant.actuation)),
             **dict.fromkeys(_OF_SPRINGS, plant.robot.joint_names),
         }
+        modes = tuple(each.name for each in plant.robot.modes)
+        if modes:
+            known["frequency"] = modes
+        # Joints of the modes, in the order of the names.
+        self._modes = [plant.robot.joint_names.index(name) for name in modes]
         by_kind: dict[str, dict[str, Any]] = {}
         self.columns: list[Column] = []
         for key, spread in mapping("dispersions", given, "name").items():
@@ -106,15 +125,19 @@ class Dispersions:
         if not self.columns:
             raise InputError("dispersions is empty; give at least one, such as {'q_b': 0.05}")
         self._kinds = {column.kind for column in self.columns}
-        # What distributions of other packages gave, by name and block; closed forms are quick.
+        # Draws of slow distributions, by name and block.
         self._kept: dict[tuple[str, int], Array] = {}
-        heavier = {at + ROOT: self.names[column] for column, at in self._changed("mass")}
-        for column, _, at in self._densities():
-            if at in heavier:
-                one, other = heavier[at], self.names[column]
-                raise InputError(
-                    f"'{one}' and '{other}' disperse the same mass; give only one of them"
-                )
+        self._refuse_same_mass()
+
+    def _refuse_same_mass(self) -> None:
+        """Refuse masses or densities of one link twice, or of a body and of a link in it."""
+        pieces = [*self._plant.robot.pieces.values()]
+        masses = [*self._changed("mass"), *self._changed("density")]
+        for (column, at), (other, of) in combinations(masses, 2):
+            one, two = pieces[at], pieces[of]
+            if at == of or (one.joint == two.joint and (one.whole or two.whole)):
+                names = f"'{self.names[column]}' and '{self.names[other]}'"
+                raise InputError(f"{names} disperse the same mass; give only one of them")
 
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:
@@ -128,7 +151,11 @@ class Dispersions:
                 f"{kind} is dispersed, which needs a sampled policy, but this policy is "
                 "continuous; give sample=, a multiple of dt (--dt on the command line)"
             )
+        label = dict(zip(names, names, strict=True))
         try:
+            if kind in _OF_BODIES:
+                spreads, written = self._by_piece(kind, spreads)
+                label |= written
             found = by_name(f"{kind} to disperse", spreads, names)
         except UnknownNameError as error:
             raise UnknownNameError(
@@ -136,8 +163,10 @@ class Dispersions:
             ) from None
         draws: dict[str, tuple[Any, list[int]]] = {}
         for at, (inverse, tied) in sorted(found.items()):
-            own = names[at] if kind in ("state", "delay") else f"{names[at]}.{kind}"
-            if kind in _OF_SPRINGS and not getattr(self._plant.robot.springs, kind)[at]:
+            own = names[at] if kind in ("state", "delay") else f"{label[names[at]]}.{kind}"
+            nominal = self._plant.robot.springs
+            of_spring = kind in _OF_SPRINGS and not getattr(nominal, kind)[at]
+            if of_spring or (kind == "frequency" and not nominal.stiffness[self._modes[at]]):
                 raise InputError(
                     f"'{own}' is dispersed by a factor, but its nominal value is 0; leave it out "
                     "or give the robot a value"
@@ -151,8 +180,26 @@ class Dispersions:
                 where = tuple((at, axis) for at in places)
                 self.columns.append(Column(name, kind, where, inverse))
 
+    def _by_piece(
+        self, kind: str, spreads: Mapping[str, Any]
+    ) -> tuple[dict[str, Any], dict[str, str]]:
+        """Return {link or body: spread}, and {link or body: name} where it is named alone."""
+        robot, found, named = self._plant.robot, dict[str, Any](), dict[str, str]()
+        alone = {*robot.pieces, *robot.link_of}
+        for key in sorted(spreads, key=lambda key: key in alone):  # names go before patterns
+            for name in bodies_named(robot, f"{kind} to disperse", key):
+                if name in named:
+                    raise InputError(
+                        f"'{named[name]}' and '{key}' are one link; give its {kind} only once"
+                    )
+                found[name] = spreads[key]
+                named |= {name: key} if key in alone else {}
+        whole = {robot.pieces[name].joint for name in named if robot.pieces[name].whole}
+        links = {name for name in found if robot.pieces[name].joint in whole}
+        return {name: x for name, x in found.items() if name in named or name not in links}, named
+
     def _changed(self, *kinds: str) -> list[tuple[int, int]]:
-        """Return (column, which state, body, joint, input or sensor) of kinds."""
+        """Return (column, index of the state, body, joint, input or sensor) of these kinds."""
         columns = enumerate(self.columns)
         return [(i, at) for i, each in columns if each.kind in kinds for at, _ in each.at]
 
@@ -162,7 +209,7 @@ class Dispersions:
         return tuple(column.name for column in self.columns)
 
     def rows(self, start: int, stop: int) -> Draws:
-        """Return what is drawn for some runs; it depends on seed, name and run alone."""
+        """Return the draws of some runs, which depend on seed, name and run alone."""
         drawn = np.empty((stop - start, len(self.columns)))
         for at, column in enumerate(self.columns):
             for first in range(start // _BLOCK * _BLOCK, stop, _BLOCK):
@@ -219,7 +266,7 @@ class Dispersions:
             bar.close()
 
     def require_possible(self, runs: int) -> None:
-        """Raise `InputError` where a draw of so many runs makes no robot or no attitude."""
+        """Raise `InputError` if a draw gives an invalid robot or attitude."""
         for column in self.columns:
             if not is_closed_form(column.inverse):
                 self._draw_all(column, runs)
@@ -243,7 +290,7 @@ class Dispersions:
                 raise InputError(f"{said}: {error}; take a smaller spread") from None
 
     def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
-        """Return the draws (N, size, axes) of a kind, zero where nothing is drawn."""
+        """Return the draws (N, size, axes) of a kind; zero if not dispersed."""
         found = np.zeros((len(drawn), size, axes))
         for values, column in zip(drawn.T, self.columns, strict=True):
             for at in column.at if column.kind == kind else ():
@@ -251,63 +298,74 @@ class Dispersions:
         return found
 
     def starts(self, drawn: Array) -> tuple[Array, Array]:
-        """Return configurations and velocities (N, nq), (N, nv) to begin at."""
+        """Return the initial configurations and velocities (N, nq), (N, nv)."""
         x = self._x0 + self._of("state", drawn, len(self._x0))[..., 0]
         return self._plant.state.points(x)[1:]
 
-    def _densities(self) -> Iterator[tuple[int, Piece, int]]:
-        """Yield columns of densities, the link of each, and its joint without wheels."""
-        links, joints = list(self._links.values()), self._plant.robot.model.names
-        for column, at in self._changed("density"):
-            joint = links[at].joint
-            own = self._model.getJointId(joints[joint]) if joint > ROOT else ROOT
-            yield column, links[at], own
-
     def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
-        """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of bodies that are drawn."""
-        size, found = self._model.njoints - ROOT, {}
-        of = [self._of(kind, drawn, size, len(axes)) for kind, axes in _OF_BODIES.items()]
+        """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of the dispersed bodies."""
+        robot, model = self._plant.robot, self._model
+        pieces = [*robot.pieces.values()]
+        mass, com, inertia, density = (
+            self._of(kind, drawn, len(pieces), len(axes)) for kind, axes in _OF_BODIES.items()
+        )
+        changed: dict[int, list[tuple[Piece, tuple[Array, Array, Array]]]] = {}
         for at in sorted({at for _, at in self._changed(*_OF_BODIES)}):
-            found[ROOT + at] = stretched(self._model.inertias[ROOT + at], *(x[:, at] for x in of))
-        none = np.zeros((len(drawn), 3))
-        for column, link, at in self._densities():
-            body = found.get(at) or stretched(self._model.inertias[at], none[:, :1], none, none)
-            found[at] = with_share(body, link, drawn[:, column])
-        return found
+            joint = pieces[at].joint
+            own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
+            properties = varied(
+                pieces[at],
+                mass=mass[:, at, 0],
+                density=density[:, at, 0],
+                com=com[:, at],
+                inertia=inertia[:, at],
+            )
+            changed.setdefault(own, []).append((pieces[at], properties))
+        return {joint: with_changed(model.inertias[joint], x) for joint, x in changed.items()}
 
     def _springs(self, kind: str, drawn: Array) -> Array:
         robot = self._plant.robot
         factor: Array = 1.0 + self._of(kind, drawn, robot.n)[..., 0]
+        # The damping ratio of a mode stays where its frequency changes.
+        frequency = 1.0 + self._of("frequency", drawn, len(self._modes))[..., 0]
+        factor[:, self._modes] *= frequency ** (2 if kind == "stiffness" else 1)
         return factor * getattr(robot.springs, kind)
 
-    def _drives(self, drawn: Array) -> Drives:
+    @property
+    def _springs_of(self) -> tuple[str, ...]:
+        """Which of stiffness and damping are dispersed."""
+        if "frequency" in self._kinds:
+            return _OF_SPRINGS
+        return tuple(kind for kind in _OF_SPRINGS if kind in self._kinds)
+
+    def _faults(self, drawn: Array) -> ActuatorFaults:
         gain, bias, until = (
-            self._of(kind, drawn, len(self._plant.drives.gain))[..., 0] for kind in _OF_INPUTS
+            self._of(kind, drawn, len(self._plant.faults.gain))[..., 0] for kind in _OF_INPUTS
         )
         safe = np.ones(until.shape[1], dtype=bool)
         safe[[at for _, at in self._changed("fails")]] = False
         until[:, safe] = np.inf
         turn = columns_of(self._plant.robot, self._angles(drawn))
-        return Drives(1.0 + gain, bias, until, turn)
+        return ActuatorFaults(1.0 + gain, bias, until, turn)
 
     def _angles(self, drawn: Array) -> Array:
-        return self._of("misalignment", drawn, len(self._plant.drives.gain), 2)
+        return self._of("misalignment", drawn, len(self._plant.faults.gain), 2)
 
     def _sensing(self, drawn: Array) -> tuple[Array, Array, Array]:
-        """Return bias and deviation (N, ny) of what is sensed, and the seed (N,) of its noise."""
+        """Return bias and deviation (N, ny) of the sensors, and the seed (N,) of their noise."""
         bias, noise = (self._of(key, drawn, len(self._sensors))[..., 0] for key in _OF_SENSORS)
         return bias, noise, self._of("seed", drawn, 1)[:, 0, 0]
 
     def delays(self, drawn: Array) -> Array:
-        """Return the steps (N,) from a sample to its effect."""
+        """Return the delays (N,) in steps."""
         late = self._of("delay", drawn, 1)[:, 0, 0] / self._times.dt
         return np.maximum(0.0, np.rint(self._times.delay + late))
 
     def in_lanes(self, drawn: Array, tree: Tree) -> dict[str, Array]:
-        """Return what differs from run to run, as the compiled loop takes it."""
+        """Return the arrays of the compiled loop that differ from run to run."""
         plant, (q, v) = self._plant, self.starts(drawn)
-        runs = {"q": q, "nu": plant.state.velocities(v), **self._drives(drawn)._asdict()}
-        if self._kinds & {*_OF_BODIES, "density"}:
+        runs = {"q": q, "nu": plant.state.velocities(v), **self._faults(drawn)._asdict()}
+        if self._kinds & {*_OF_BODIES}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (len(drawn), 1, 1))
             for at, body in self.bodies(drawn).items():
                 # In the tree wheels stand between the joints.
@@ -317,7 +375,7 @@ class Dispersions:
                 # Linear in these, so that wheels in the body stay as they are.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(len(drawn), -1)
-        runs |= {kind: self._springs(kind, drawn) for kind in _OF_SPRINGS if kind in self._kinds}
+        runs |= {kind: self._springs(kind, drawn) for kind in self._springs_of}
         if "misalignment" in self._kinds:
             loads = loads_of(plant.robot, plant.actuation, tree)
             turned = in_lanes(plant.robot, tree, loads, self._angles(drawn))
@@ -337,32 +395,50 @@ class Dispersions:
         return runs
 
     def one(self, drawn: Array) -> tuple[Plant, Any, Array, Array]:
-        """Return the robot of a run (k,) with its inputs, its policy, and q and v to begin at."""
+        """Return the robot of a run (k,) with its inputs, its policy, and the initial q and v."""
         plant, policy, rows = self._plant, self._policy, drawn[None]
         robot, (q, v) = plant.robot, self.starts(rows)
         if bodies := self.bodies(rows):
-            robot = with_inertias(robot, {k: [x[0] for x in body] for k, body in bodies.items()})
-        for kind in self._kinds & {*_OF_SPRINGS}:
+            robot = robot.with_bodies(
+                {
+                    joint: pin.Inertia(float(mass[0]), com[0], inertia[0])
+                    for joint, (mass, com, inertia) in bodies.items()
+                }
+            )
+        for kind in self._springs_of:
             values = self._springs(kind, rows)[0].tolist()
             of: Any = {kind: dict(zip(robot.joint_names, values, strict=True))}
             robot = replace(robot, **of)
         if "misalignment" in self._kinds:
             robot = misaligned(robot, self._angles(rows)[0])
-            if isinstance(policy, Allocation):  # which does not know of it
+            if isinstance(policy, Allocation):  # it allocates to the nominal directions
                 given = policy
                 policy = Bound(lambda _: bound(given, plant.robot))
         if self._kinds & {*_OF_SENSORS}:
-            error = noise_of(*(each[0] for each in self._sensing(rows)))
-            if isinstance(policy, StateFeedback):
-                policy = misled(policy, error)
-            else:
-                noise = policy.noise or np.zeros_like
-                policy = copy(policy)
-                vars(policy)["noise"] = lambda t: error(t) + np.asarray(noise(t))
+            policy = _with_sensor_errors(policy, *(each[0] for each in self._sensing(rows)))
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
-        drives = Drives(*(x[0] for x in self._drives(rows)))
-        faulty = drives if self._kinds & {*_OF_INPUTS, "misalignment"} else None
+        faults = ActuatorFaults(*(x[0] for x in self._faults(rows)))
+        faulty = faults if self._kinds & {*_OF_INPUTS, "misalignment"} else None
         return Plant(state, plant.disturbance, faulty), policy, q[0], v[0]
+
+
+def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: float) -> Any:
+    """Return a policy that reads its states or outputs (ny,) with these errors."""
+    generator, given = noise_generator(seed), getattr(policy, "noise", None)
+
+    def error(t: float) -> Array:
+        found: Array = bias + deviation * generator.standard_normal(len(bias))
+        return found if given is None else found + np.asarray(given(t))
+
+    def bind(robot: Robot) -> Policy:
+        inner = bound(policy, robot)
+        return lambda t, q, v: np.asarray(inner(t, q, v)) - policy.K @ error(t)
+
+    if isinstance(policy, StateFeedback):
+        return Bound(bind)
+    noisy = copy(policy)
+    noisy.noise = error
+    return noisy
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:

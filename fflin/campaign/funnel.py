@@ -2,129 +2,262 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, unknown
+from fflin.base.intervals import until_failure
+from fflin.base.record import Design
+from fflin.base.tables import folded, grid
 from fflin.base.validation import (
     Array,
     as_double,
     by_name,
     dimension,
+    instance,
+    number,
     numbers,
     share,
     vector,
     whole,
 )
-from fflin.batch.dispatch import ChunkResult
+from fflin.base.writing import as_path
 from fflin.batch.run import Progress, check_workers
 from fflin.batch.workers import OwnWorkers
 from fflin.campaign.dispersions import Draws
-from fflin.campaign.reach import Funnel, spread
-from fflin.campaign.runs import CampaignJob, done_by
-from fflin.campaign.tally import KINDS
+from fflin.campaign.runs import CampaignJob, completed
+from fflin.campaign.statistics import KINDS
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
-from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import moved_by, moving_errors
+from fflin.dynamics.points import point_of
+from fflin.dynamics.state import StateMap, moved_by, moving_error, moving_errors, unwound
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
 _MOST = 1_000_000
+_ROUNDING = 1e-12  # eigenvalues of P, relative to the largest, that count as zero
 
-# Starts that are tried at a level to find those worth sampling, and how often it is halved.
+# Number of starts tried at a level in the search for the largest one, and of its halvings.
 _PILOTS, _HALVINGS = 16, 40
-# A turn [deg] at which an error leaves its chart, and the widest starts [rad], [m].
-_EDGE, _WIDEST_TURN, _WIDEST = 176.0, 170.0, (np.pi, 1e3)
+# Attitude error [deg] at which a run counts as stopped, and the largest attitude error [deg], joint
+# error [rad] and position or sliding joint error [m] of a start.
+_EDGE, _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 176.0, 170.0, np.pi, 1e3
 
 
-@dataclass
-class FunnelJob:
-    """The knots of a funnel, by their numbers in `Draws.run`, each with all its runs; see `Job`."""
+def ellipsoid_axes(P: Array) -> Array:
+    """Return W (nx, r) whose W W' is the pseudoinverse of P, each error in its own scale."""
+    scale = np.sqrt(P.diagonal().clip(min=0.0))
+    unit = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
+    values, axes = np.linalg.eigh(unit[:, None] * P * unit)
+    kept = values > _ROUNDING * values.max()
+    found: Array = unit[:, None] * axes[:, kept] / np.sqrt(values[kept])
+    return found
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Funnel(Design):
+    """Ellipsoids ``e' P(t) e <= rho`` of errors relative to a trajectory; prints as a table.
+
+    Errors are defined as in `linearize_trajectory`; P is the schedule's cost to go. Errors in
+    directions in which P is zero are not tested.
+
+    Attributes
+    ----------
+    t : ndarray (m,)
+        Times [s] of the knots.
+    tried : ndarray (m,)
+        Largest level rho of the tested initial errors. The square roots of the levels of all tested
+        errors are evenly spread.
+    outcomes : ndarray (m, N)
+        Outcome of each run, sorted by ascending level: 0 if it reached the goal, 1 if it was
+        stopped early, 2 if it exceeded `within`, 3 if it missed the goal.
+    rho : ndarray (m,)
+        Largest level up to which every run succeeded.
+    inside : ndarray (m,)
+        Number of runs that start at or below the level `rho`.
+    inside_rate : ndarray (m,)
+        Lower bound, at confidence level `confidence`, on the success rate of runs that start at or
+        below the level `rho`.
+    rate : ndarray (m, 2)
+        Clopper-Pearson interval of the success rate of all runs. All of them start at or below the
+        level `tried`.
+    attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
+        Half-axes of the ellipsoids in base attitude [deg], base position [m] and each joint
+        [rad|m].
+    goal, within : str
+        Bounds on the final errors of a run, and on its errors at any time.
+    confidence : float
+        Confidence level of the intervals.
+    at, P : ndarray (M,), (M, nx, nx)
+        Times [s] and cost to go of the schedule.
+    knots, q, v, u, hold, frame
+        The followed trajectory, see `trajectory`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> reach = fflin.funnel(robot, fflin.tvlqr(along), {"attitude": 5.0}, samples=4, knots=2)
+    >>> bool(reach.contains(0.0, q=motion.q[0], v=motion.v[0]))
+    True
+    """
+
+    VECTORS: ClassVar = ("t", "tried", "at", "knots")
 
     robot: Robot
-    feedback: TrajectoryFeedback
-    goal: Any  # level, or bounds of kinds
-    within: dict[str, float]
-    places: list[tuple[int, int]]  # of knots in the trajectory and in the schedule
-    samples: int
-    seed: int
-    options: dict[str, Any]
-    engine: str = ""
+    t: Array
+    tried: Array
+    outcomes: Array
+    goal: str
+    within: str
+    confidence: float
+    at: Array
+    P: Array
+    knots: Array
+    q: Array
+    v: Array
+    u: Array
+    hold: str
+    frame: str
 
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of each array of a knot."""
-        return {"tried": (), "outcomes": (self.samples,)}
+    @cached_property
+    def _counts(self) -> list[tuple[int, float, tuple[float, float]]]:
+        return [until_failure(row != 0.0, self.confidence) for row in self.outcomes]
 
-    def campaign(self, knot: int) -> CampaignJob:
-        """Return what flies from a knot to the end."""
-        k, first = self.places[knot]
-        motion, schedule = self.feedback.trajectory, self.feedback.schedule
-        kept: Any = {name: getattr(motion, name) for name in ("hold", "frame", "verified")}
-        rest: Any = [getattr(motion, name)[k:] for name in ("t", "q", "v", "u")]
-        cut = {name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")}
-        policy = replace(
-            self.feedback,
-            trajectory=Trajectory(motion.robot, *rest, **kept),
-            schedule=replace(schedule, **cut),
-        )
-        none = dict.fromkeys(StateMap(self.robot).names, 0.0)
-        # A chart about where it begins, which may be turned by any angle itself.
-        options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), **self.options}
-        return CampaignJob(self.robot, policy, none, 0, self.engine, options)
+    @cached_property
+    def inside(self) -> Array:
+        """Number of runs (m,) that start at or below the level `rho`."""
+        return np.array([inside for inside, *_ in self._counts])
 
-    def run(self, rows: Draws, start: int = 0, _: Any = None) -> ChunkResult:
-        """Do some knots."""
-        tried, outcomes = zip(*map(self._sampled, rows.run.astype(int).tolist()), strict=True)
-        return ChunkResult({"tried": np.array(tried), "outcomes": np.array(outcomes)}, [])
+    @cached_property
+    def inside_rate(self) -> Array:
+        """Lower bound (m,) on the success rate of runs that start at or below the level `rho`."""
+        return np.array([bound for _, bound, _ in self._counts])
 
-    def _sampled(self, knot: int) -> tuple[float, Array]:
-        """Return the largest level tried at a knot, and how the runs from up to there ended."""
-        job, W = self.campaign(knot), spread(self.feedback.schedule.P[self.places[knot][1]])
-        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(knot,)))
+    @cached_property
+    def rate(self) -> Array:
+        """Clopper-Pearson interval (m, 2) of the success rate of all runs."""
+        return np.array([interval for *_, interval in self._counts])
 
-        def flown(sizes: Array) -> Array:
-            z = rng.normal(size=(len(sizes), W.shape[1]))
-            e = (sizes / np.linalg.norm(z, axis=1))[:, None] * z @ W.T
-            x = moved_by("local", np.tile(job.x0, (len(e), 1)), e)
-            return self._judged(job, job.run(Draws(x - job.x0, np.zeros(len(e))), 0).arrays)
+    @cached_property
+    def rho(self) -> Array:
+        """Largest level (m,) up to which every run succeeded."""
+        count = self.outcomes.shape[1]
+        level: Array = self.tried * ((self.inside - 0.5).clip(min=0.0) / count) ** 2
+        return level
 
-        widest = _widest(W, self.robot)
-        size, count = widest, self.samples
-        if not flown(np.zeros(1)).any():
-            for _ in range(_HALVINGS):
-                if not flown(np.full(_PILOTS, size)).any():
-                    break
-                size /= 2.0
-            size *= 2.0 if size < widest and not flown(np.full(_PILOTS, 1.4 * size)).any() else 1.4
-        size = min(size, widest)
-        return size**2, flown(size * (np.arange(count) + 0.5) / count)
+    @cached_property
+    def attitude(self) -> Array:
+        """Half-axes (m, 3) of the ellipsoids in base attitude [deg]."""
+        sines = np.array([_half_axes(W[:3]) for W in self._roots])
+        return np.degrees(2.0 * np.arcsin(np.minimum(sines, 1.0)))
 
-    def _judged(self, job: CampaignJob, ended: Mapping[str, Array]) -> Array:
-        """Return how runs ended, as `Funnel.outcomes` says it."""
-        kinds, goal = list(KINDS), self.goal
+    @cached_property
+    def position(self) -> Array:
+        """Half-axes (m, 3) of the ellipsoids in base position [m]."""
+        return np.array([_half_axes(W[3:6]) for W in self._roots])
 
-        def beyond(sizes: Array, bounds: Mapping[str, float]) -> Any:
-            of = [~(sizes[:, kinds.index(key)] <= bound) for key, bound in bounds.items()]
-            return np.any([np.zeros(len(sizes), dtype=bool), *of], axis=0)
+    @cached_property
+    def joints(self) -> Array:
+        """Half-axes (m, n) of the ellipsoids in each joint [rad|m]."""
+        return np.array([np.linalg.norm(W[6 : 6 + self.robot.n], axis=1) for W in self._roots])
 
-        if isinstance(goal, float):
-            e = moving_errors("local", ended["x"], job.home[-1:])
-            turns = 6 + job.plant.state.unbounded
-            e[:, turns] -= 2.0 * np.pi * np.round(e[:, turns] / (2.0 * np.pi))
-            missed = ~((e @ self.feedback.schedule.P[-1] * e).sum(axis=1) <= goal)
-        else:
-            missed = beyond(ended["errors"], goal)
-        lost = (ended["stop"] != 0.0) | beyond(ended["largest"], {"attitude": _EDGE})
-        return np.select([lost, beyond(ended["largest"], self.within), missed], [1.0, 2.0, 3.0])
+    @cached_property
+    def _roots(self) -> list[Array]:
+        return [self.root(t) for t in self.t.tolist()]
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The followed trajectory."""
+        values: Any = (self.robot, self.knots, self.q, self.v, self.u)
+        return Trajectory(*values, hold=self.hold, frame=self.frame)
+
+    def level(self, t: float) -> float:
+        """Return rho at time t; between two knots, the smaller of their two levels."""
+        t = number("t", t)
+        if not self.t[0] <= t <= self.t[-1]:
+            raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
+        near = [self.t.searchsorted(t, side) - (side == "right") for side in ("right", "left")]
+        return float(self.rho[near].min())
+
+    def cost(self, t: float) -> Array:
+        """Return P (nx, nx) at time t by linear interpolation of the schedule."""
+        k = int(np.clip(self.at.searchsorted(t, "right") - 1, 0, len(self.at) - 2))
+        part = float(np.clip((t - self.at[k]) / (self.at[k + 1] - self.at[k]), 0.0, 1.0))
+        P: Array = (1.0 - part) * self.P[k] + part * self.P[k + 1]
+        return P
+
+    def root(self, t: float, *, smooth: bool = False) -> Array:
+        """Return W (nx, r): the ellipsoid at time t is the set of all W z with norm(z) <= 1.
+
+        With `smooth`, the level is interpolated between knots, as figures show it.
+        """
+        size = np.interp(t, self.t, np.sqrt(self.rho)) if smooth else np.sqrt(self.level(t))
+        return size * ellipsoid_axes(self.cost(t))
+
+    def contains(self, t: float, x: Any = None, *, q: Any = None, v: Any = None) -> bool:
+        """Return whether a state is inside the funnel at time t.
+
+        Parameters
+        ----------
+        t : float
+            Time [s], from the first to the last knot.
+        x : array_like (nx,), optional
+            State of ``StateMap(robot, frame="local")``.
+        q, v : array_like (nq,), (nv,), optional
+            Configuration and velocity in Pinocchio's order, instead of x. If v is omitted, the
+            robot is at rest.
+        """
+        rho, state = self.level(t), StateMap(self.robot, frame="local")
+        if x is None and q is None:
+            raise InputError("no state is given; give x, or q and v")
+        q, v = point_of(state, x, q, v, lambda: (q, v))
+        e = moving_error(state, *self.trajectory.flow.at(float(t))[:2], q, v)
+        return bool(e @ self.cost(t) @ e <= rho)
+
+    def __repr__(self) -> str:
+        m, count = self.outcomes.shape
+        return f"Funnel('{self.robot.name}', {m} knots of {count} runs, goal '{self.goal}')"
+
+    def __str__(self) -> str:
+        count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
+        head = f"{self.robot.name}: errors from which every run ends with {self.goal}"
+        head += f", and on the way {self.within}" * bool(self.within) + f"; {count} runs per knot"
+        tail = [
+            "base, joint: largest half-axes",
+            "runs: number of starts inside, all of which succeeded (+: all starts that were tried)",
+            f"inside: lower bound of the success rate of starts inside ({sure} confidence)",
+            "tried: interval of the success rate of starts up to the largest level that was tried",
+        ]
+        rows = [["t [s]", "rho", "base [deg]", "base [m]", "joint", "runs", "inside", "tried"]]
+        wide = (self.attitude, self.position, self.joints)
+        for k, (low, high) in enumerate(100.0 * self.rate):
+            reach = [f"{each[k].max(initial=0.0):.3g}" for each in wide]
+            many = f"{self.inside[k]}{' +' if self.inside[k] == count else ''}"
+            shares = [f"{100.0 * self.inside_rate[k]:.1f} %", f"{low:.0f}-{high:.0f} %"]
+            rows.append([f"{self.t[k]:.4g}", f"{self.rho[k]:.3g}", *reach, many, *shares])
+        return "\n".join([folded([head]), "", grid(rows, "r"), "", folded(tail)])
+
+    @classmethod
+    def load(cls, path: str | Path, robot: Robot) -> Funnel:  # type: ignore[override]
+        """Read a funnel of a robot from a file that `save` wrote; errors as in `Gain.load`."""
+        return cls._read(as_path(path), robot=robot)
+
+
+def _half_axes(W: Array) -> Array:
+    """Return the half-axes (3,) of the ellipsoid that W (3, r) makes of the unit sphere."""
+    return np.linalg.svd(np.hstack((W, np.zeros((3, 3)))))[1]
 
 
 def funnel(
@@ -172,7 +305,7 @@ def funnel(
     confidence : float
         Confidence level of the intervals.
     executor, workers, threads, engine : optional
-        As in `monte_carlo`; each task is one knot.
+        As in `monte_carlo`.
     progress : callable, optional
         Function ``progress(done, total)``, called with the number of finished knots and the number
         of all knots.
@@ -212,38 +345,57 @@ def funnel(
     >>> len(reach.rho)
     2
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+    instance("robot", robot, Robot, "a fflin.Robot")
     feedback = followed(schedule, robot)
-    if not isinstance(feedback, TrajectoryFeedback):
-        raise InputError(
-            f"schedule is a {type(schedule).__name__}, expected a GainSchedule or a "
-            "TrajectoryFeedback"
-        )
+    expected = "a GainSchedule or a TrajectoryFeedback"
+    instance("schedule", feedback, TrajectoryFeedback, expected)
     for name in options:
         if name not in _OPTIONS:
             raise unknown("option of funnel", name, list(_OPTIONS))
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
-    confidence, level = share("confidence", confidence), not isinstance(goal, Mapping)
-    aim: Any = _bounds("goal", *(({"level": goal}, ["level"]) if level else (goal,)))
-    aim = aim["level"] if level else aim
-    bounds = _bounds("within", {} if within is None else within)
+    confidence = share("confidence", confidence)
+    if isinstance(goal, Mapping):
+        final = _bounds("goal", goal, KINDS)
+        goal_text = _shown(final)
+    else:
+        final = _bounds("goal", {"level": goal}, ["level"])
+        goal_text = f"e' P e up to {final['level']:g}"
+    limits = _bounds("within", {} if within is None else within, KINDS)
     check_workers(executor, workers, threads, None, progress)
     motion, by = feedback.trajectory, feedback.schedule
-    places = _places(motion, by, knots)
-    job = FunnelJob(robot, feedback, aim, bounds, places, samples, seed, options)
-    first = job.campaign(0)
-    first.choose(engine)
-    job.engine = first.engine
+    indices = _indices(motion, by, knots)
+    jobs = [runs_from(robot, feedback, *pair, options) for pair in indices]
+    for job in jobs:
+        job.choose(engine)
+    tried, outcomes = np.empty(len(jobs)), np.empty((len(jobs), samples))
     with OwnWorkers(workers) if workers else nullcontext(executor) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
-        arrays = done_by(job, _rows, len(places), progress=progress, least=1, **how)
+        for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
+            axes = ellipsoid_axes(by.P[first])
+
+            def simulate(
+                roots: Array, job: CampaignJob = job, axes: Array = axes, rng: Any = rng
+            ) -> Array:
+                """Return the outcomes of runs from random errors at roots (N,) of the levels."""
+                z = rng.normal(size=(len(roots), axes.shape[1]))
+                e = (roots / np.linalg.norm(z, axis=1))[:, None] * z @ axes.T
+                x = moved_by("local", np.tile(job.x0, (len(e), 1)), e)
+                starts = Draws(x - job.x0, np.arange(len(e), dtype=float))
+                return _judged(job, completed(job, starts.part, len(e), **how), final, limits, by)
+
+            root = _largest_root(simulate, _widest(axes, robot))
+            tried[knot] = root**2
+            outcomes[knot] = simulate(root * (np.arange(samples) + 0.5) / samples)
+            if progress:
+                progress(knot + 1, len(jobs))
     return Funnel(
         robot=robot,
-        t=np.array([motion.t[k] for k, _ in places]),
-        **arrays,
-        goal=f"e' P e up to {aim:g}" if level else _said(aim),
-        within=_said(bounds),
+        t=np.array([motion.t[k] for k, _ in indices]),
+        tried=tried,
+        outcomes=outcomes,
+        goal=goal_text,
+        within=_shown(limits),
         confidence=confidence,
         at=by.t - by.t[0] + motion.t[0],
         P=by.P,
@@ -252,12 +404,63 @@ def funnel(
     )
 
 
-def _rows(start: int, stop: int) -> Draws:
-    return Draws(np.zeros((stop - start, 0)), np.arange(start, stop, dtype=float))
+def runs_from(
+    robot: Robot, feedback: TrajectoryFeedback, k: int, first: int, options: Mapping[str, Any]
+) -> CampaignJob:
+    """Return the runs from knot k of the trajectory, which is time `first` of the schedule.
+
+    The drawn values of a run are the deviation of its initial state from the knot's.
+    """
+    motion, schedule = feedback.trajectory, feedback.schedule
+    rest = {name: getattr(motion, name)[k:] for name in ("t", "q", "v", "u")}
+    later = {name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")}
+    policy = replace(
+        feedback, trajectory=replace(motion, **rest), schedule=replace(schedule, **later)
+    )
+    deviations = dict.fromkeys(StateMap(robot).names, 0.0)
+    # The chart is centred at the knot, whose attitude may be any.
+    options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), **options}
+    return CampaignJob(robot, policy, deviations, 0, "python", options)
 
 
-def _bounds(name: str, given: Any, kinds: Iterable[str] = KINDS) -> dict[str, float]:
-    """Return {kind: largest error}, checked."""
+def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
+    """Return the root of the largest level to try, at which about one run in sixteen fails."""
+    root = widest
+    if simulate(np.zeros(1)).any():
+        return root  # even without an error the goal is missed
+    for _ in range(_HALVINGS):
+        if not simulate(np.full(_PILOTS, root)).any():
+            break
+        root /= 2.0
+    further = root < widest and not simulate(np.full(_PILOTS, 1.4 * root)).any()
+    return min(root * (2.0 if further else 1.4), widest)
+
+
+def _judged(
+    job: CampaignJob,
+    ended: Mapping[str, Array],
+    goal: Mapping[str, float],
+    within: Mapping[str, float],
+    schedule: GainSchedule,
+) -> Array:
+    """Return the outcomes of runs, as `Funnel.outcomes` has them."""
+
+    def exceeded(sizes: Array, bounds: Mapping[str, float]) -> Any:
+        columns = [list(KINDS).index(kind) for kind in bounds]
+        return ~(sizes[:, columns] <= np.array([*bounds.values()])).all(axis=1)
+
+    if "level" in goal:
+        e = moving_errors("local", ended["x"], job.target[-1:])
+        unwound(job.plant.state, e)
+        missed = ~((e @ schedule.P[-1] * e).sum(axis=1) <= goal["level"])
+    else:
+        missed = exceeded(ended["errors"], goal)
+    stopped = (ended["stop"] != 0.0) | exceeded(ended["largest"], {"attitude": _EDGE})
+    return np.select([stopped, exceeded(ended["largest"], within), missed], [1.0, 2.0, 3.0])
+
+
+def _bounds(name: str, given: Any, kinds: Iterable[str]) -> dict[str, float]:
+    """Return the checked bounds {kind: largest error}."""
     for key in by_name(name, given, "kind"):
         if key not in kinds:
             raise unknown(f"kind of error in {name}", str(key), list(kinds))
@@ -270,12 +473,12 @@ def _bounds(name: str, given: Any, kinds: Iterable[str] = KINDS) -> dict[str, fl
     return found
 
 
-def _said(bounds: Mapping[str, float]) -> str:
+def _shown(bounds: Mapping[str, float]) -> str:
     return ", ".join(f"{key} up to {bound:g} {KINDS[key]}" for key, bound in bounds.items())
 
 
-def _places(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int, int]]:
-    """Return where some knots stand in the trajectory and in the schedule."""
+def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int, int]]:
+    """Return the indices of the chosen knots in the trajectory and in the schedule."""
     t, own = motion.t - motion.t[0], by.t - by.t[0]
     at = own.searchsorted(t - 1e-6 * (by.dt or t[-1])).clip(max=len(own) - 1)
     both = np.flatnonzero(np.abs(own[at] - t) <= 1e-6 * (by.dt or t[-1]))
@@ -296,11 +499,11 @@ def _places(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int,
 
 
 def _widest(W: Array, robot: Robot) -> float:
-    """Return the root of the level at which errors are as large as errors may be."""
-    most = np.array([_WIDEST[joint.prismatic] for joint in robot.joints])
+    """Return the root of the level at which errors are as large as a start may have."""
+    largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in robot.joints]
     reach = [
-        np.linalg.norm(W[:3], 2) / np.sin(np.radians(_WIDEST_TURN / 2.0)),
-        np.linalg.norm(W[3:6], 2) / _WIDEST[1],
-        *np.linalg.norm(W[6 : 6 + robot.n], axis=1) / most,
+        np.linalg.norm(W[:3], 2) / np.sin(np.radians(_LARGEST_ATTITUDE / 2.0)),
+        np.linalg.norm(W[3:6], 2) / _LARGEST_LENGTH,
+        *np.linalg.norm(W[6 : 6 + robot.n], axis=1) / np.array(largest),
     ]
     return float(1.0 / max(reach))

@@ -1,34 +1,90 @@
-"""Eight parallel runs in the compiled loop, each with its own robot and start."""
+"""Eight parallel runs in the compiled loop: their robots, initial states and statistics."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from fflin.base.rotation import product_matrix
 from fflin.base.validation import Array
-from fflin.campaign.sensing import normals
-from fflin.campaign.tally import STOPS, stop_of
+from fflin.campaign.dispersions import noise_generator
+from fflin.campaign.statistics import STOPS, stop_of
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.simulation.conservation import Conserved
-from fflin.simulation.packing import SLOTS, CompiledLoop, kept_at, noise_of, noises, packed
+from fflin.simulation.packing import (
+    SLOTS,
+    CompiledLoop,
+    kept_at,
+    noise_of,
+    noises,
+    packed,
+)
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import ending_of
 
 _DIVERGED = float(STOPS.index("diverged"))
 
-# Takes the first step of some, and their rows (steps, LANES, ..) of q, nu, u, momentum and centre.
+# Called with the first step of a slice and its rows (steps, LANES, ..) of q, nu, u, momentum and
+# centre of mass.
 Watcher = Callable[[int, list[Array]], None]
+
+
+class Statistics(Protocol):
+    """What is kept of eight parallel runs, slice by slice."""
+
+    span: int  # steps between checks of `over`
+
+    @property
+    def over(self) -> Any:
+        """Which runs (LANES,) may end before their time."""
+
+    def reset(self) -> None:
+        """Begin with eight other runs."""
+
+    def add(self, first: int, rows: Sequence[Array], raw: Any) -> None:
+        """Add the rows (steps, LANES, ..) of q, nu, u, .. from step `first` on, also as `raw`.
+
+        A row may be added again.
+        """
+
+    def outcome(self, done: int, stop: Array) -> Any:
+        """Return the outcomes of the runs after so many steps; `stop` are indices into STOPS."""
+
+
+def loop_arrays(plan: Plan, plant: Plant) -> dict[str, Any]:
+    """Return the arrays and numbers by which the compiled loop knows a plan, without compiling it.
+
+    Two plans with the same arrays have the same runs.
+    """
+    tree = batch_tree(plant.robot)
+    assert tree is not None
+    parts = packed(plan, plant, Conserved(plant.robot, plan.q), tree)
+    last = min(plan.times.steps, SLOTS * plan.times.sample)
+    noise = noise_of(plan)
+    samples = noises(noise, plan.times, len(parts.law.y), 0, last)[1] if noise else np.zeros(0)
+    found: dict[str, Any] = {"noise": samples}
+
+    def collect(name: str, value: Any) -> None:
+        if isinstance(value, tuple):
+            for index, each in enumerate(value):
+                collect(f"{name}.{index}", each)
+        else:
+            found[name] = value
+
+    collect("loop", parts)
+    return found
 
 
 class Lanes:
     """The compiled loop over a plan, with arrays of its own: not to be shared by threads."""
 
-    def __init__(self, plan: Plan, plant: Plant, runs: Mapping[str, Array]) -> None:
+    def __init__(
+        self, plan: Plan, plant: Plant, runs: Mapping[str, Array], statistics: Statistics
+    ) -> None:
         tree = batch_tree(plant.robot)
         assert tree is not None
         if "delay" in runs:  # so that there is room for the latest
@@ -39,9 +95,9 @@ class Lanes:
         if "seed" in runs and len(law.added) == len(law.y):
             law = law._replace(added=np.zeros(SLOTS * len(law.y)))
         # All starts are given with the base on the side of the chart where this is positive.
-        watch = parts.watch._replace(sign=np.abs(parts.watch.sign))
-        self._plan, self._state = plan, plant.state
-        self._loop = CompiledLoop(parts._replace(law=law, watch=watch))
+        stop = parts.stop._replace(sign=np.abs(parts.stop.sign))
+        self._plan, self._state, self._statistics = plan, plant.state, statistics
+        self._loop = CompiledLoop(parts._replace(law=law, stop=stop))
         robot, point = self._loop.parts.robot, self._loop.parts.point
         # Noise has room for so many samples alone.
         self._rows = self._loop.rows(SLOTS if len(law.added) > len(law.y) else plan.times.steps)
@@ -50,7 +106,7 @@ class Lanes:
             **{"q": point.q, "nu": point.nu, "delay": self._loop.parts.channel.delay},
             **{key: getattr(robot.tree, key) for key in ("bodies", "fixed")},
             **{key: getattr(robot.loads, key) for key in robot.loads._fields},
-            **robot.drives._asdict(),
+            **robot.faults._asdict(),
         }
         self._turn = product_matrix(plant.state.origin_quaternion)[3]
 
@@ -59,16 +115,17 @@ class Lanes:
     def fly(
         self,
         runs: Mapping[str, Array],
-        tally: Any,
         out: Mapping[str, Array],
         watcher: Watcher | None = None,
     ) -> list[str]:
-        """Do up to eight, whose rows differ from the plan, into `out`; say why each was stopped."""
+        """Simulate up to eight runs into `out`, and return why each was stopped."""
         plan, steps, count = self._plan, self._plan.times.steps, len(runs["q"])
         loop, rows, width = self._loop, self._rows, self._loop.width
-        robot, kept, point = loop.parts.robot, loop.parts.course, loop.parts.point
-        for array, fresh in loop.fresh:
-            array[:] = fresh
+        robot, kept, point = loop.parts.robot, loop.parts.reference, loop.parts.point
+        for array, initial in loop.fresh:
+            array[:] = initial
+        statistics = self._statistics
+        statistics.reset()
         of_lane = slice(None) if count == LANES else np.minimum(np.arange(LANES), count - 1)
         for name, values in runs.items():
             if name in self._of:
@@ -77,7 +134,7 @@ class Lanes:
         mass = robot.tree.bodies[::10].sum(axis=0)
         kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * robot.gravity[:, None]
         kept.start[9:] = point.q[:3]
-        span = min(self._most, tally.span)
+        span = min(self._most, statistics.span)
         clock, going, told = np.zeros(1, dtype=np.intp), np.ones(count, dtype=bool), [""] * count
         while clock[0] < steps and going.any():
             first = int(clock[0])
@@ -87,19 +144,19 @@ class Lanes:
             done = int(clock[0])
             taken = rows[: (done - first) * width]
             seen = loop.split(taken)
-            tally.add(first, seen, taken)
+            statistics.add(first, seen, taken)
             if watcher:
                 watcher(first, seen)
-            lost = ~(point.nu**2 < loop.parts.watch.squares[:, None]).all(axis=0)
+            lost = ~(point.nu**2 < loop.parts.stop.squares[:, None]).all(axis=0)
             if plan.chart:
                 lost |= self._turn @ point.q[3:7] < 0.0
             for lane in (lost[:count] & going).nonzero()[0]:
                 told[lane] = self._said(runs["q"][lane], lane, done)
             stop = np.array([float(stop_of(each)) if each else 0.0 for each in told])
-            ending = going & ((stop > 0.0) | (done == steps) | tally.over[:count])
+            ending = going & ((stop > 0.0) | (done == steps) | statistics.over[:count])
             if not ending.any():
                 continue
-            self._end(tally, ending, bool((ending == going).all()), done, stop[of_lane], out)
+            self._end(ending, done, stop[of_lane], out)
             going &= ~ending
             # What has ended would stop the others: it goes on as one of them.
             if going.any():
@@ -108,22 +165,23 @@ class Lanes:
                     array[:, over] = array[:, [going.argmax()]]
         return told
 
-    def _end(self, tally: Any, ending: Any, last: bool, done: int, stop: Array, out: Any) -> None:
-        """Write how some of the runs ended, which may be the last."""
-        kept, point, stages = (
-            getattr(self._loop.parts, name) for name in ("course", "point", "stages")
-        )
-        rows = np.vstack((point.q, point.nu, stages.u, kept.sums[:9]))
-        away, count = (stop == _DIVERGED)[: len(ending)], len(ending)
-        # Of what diverged the end is no number.
-        for some, whole in ((ending & away, False), (ending & ~away, True)):
-            if not some.any():
-                continue
-            if whole:
-                tally = (tally if last else tally.copy()).add(done, self._loop.split(rows), rows)
-            where = slice(None) if some.all() else some
-            for name, values in tally.outcome(done, stop)._asdict().items():
-                out[name][where] = values[:count][where]
+    def _end(self, ending: Any, done: int, stop: Array, out: Mapping[str, Array]) -> None:
+        """Write the outcomes of the runs that end after so many steps."""
+        parts, statistics, count = self._loop.parts, self._statistics, len(ending)
+        diverged = (stop == _DIVERGED)[:count]
+
+        def write(chosen: Any) -> None:
+            for name, values in statistics.outcome(done, stop)._asdict().items():
+                out[name][chosen] = values[:count][chosen]
+
+        if (ending & diverged).any():
+            write(ending & diverged)
+        if (ending & ~diverged).any():
+            # The last state is added, except if it diverged and is not finite.
+            point = parts.point
+            last = np.vstack((point.q, point.nu, parts.stages.u, parts.reference.sums[:9]))
+            statistics.add(done, self._loop.split(last), last)
+            write(ending & ~diverged)
 
     def _sensors(self, runs: Mapping[str, Array], of_lane: Any) -> Callable[[int, int], None]:
         """Return what writes the errors of all that is sensed from a step up to another."""
@@ -133,7 +191,7 @@ class Lanes:
         nothing = np.zeros((LANES, size))
         bias, deviation = (runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise"))
         rows[:] = bias
-        draws = [normals(seed) for seed in runs["seed"][of_lane]] if "seed" in runs else []
+        draws = [noise_generator(seed) for seed in runs["seed"][of_lane]] if "seed" in runs else []
 
         drawn = 0
 
@@ -150,8 +208,8 @@ class Lanes:
 
         return sense if len(rows) == SLOTS else lambda *_: None
 
-    def kept(self, t: float) -> tuple[Array, Array]:
-        """Return the momentum (6,) and the centre of mass (3,) that the first is to have."""
+    def conserved(self, t: float) -> tuple[Array, Array]:
+        """Return the momentum (6,) and centre of mass (3,) that the first run conserves."""
         momentum, center = kept_at(self._loop.parts, t)
         return momentum, center
 

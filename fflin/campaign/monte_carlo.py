@@ -17,29 +17,27 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import __version__
 from fflin.base.errors import FflinError, FileError, InputError, unknown
 from fflin.base.record import content_digest
 from fflin.base.validation import share, truth, whole
-from fflin.base.version import __version__
 from fflin.batch.files import hdf5
 from fflin.batch.run import Progress, check_workers, failure, run_chunks
 from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
 from fflin.batch.workers import OwnWorkers
 from fflin.campaign.campaign import NOT_RUN, Campaign
-from fflin.campaign.dispersion_files import placed
-from fflin.campaign.dispersions import Draws
-from fflin.campaign.runs import CampaignJob
-from fflin.campaign.tally import KINDS
+from fflin.campaign.runs import CampaignJob, chunk_size
+from fflin.campaign.spreads import placed
+from fflin.campaign.statistics import KINDS
 from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
 from fflin.simulation.plan import planned
 from fflin.simulation.report import pushed
 
-# Runs in the largest chunk, and after which it is first looked whether they are enough: chunks are
-# parts of it, so that the number of runs does not depend on them.
-_STAGE = 256
-_GROWTH = 1.25
+# With `until`, the interval is first computed after this number of runs, and again whenever their
+# number has grown by this factor. Chunks divide it, so that they do not change the number of runs.
+_STAGE, _GROWTH = 256, 1.25
 
 _OPTIONS = {*list(inspect.signature(planned).parameters)[2:]} - {
     *("duration", "events", "callback", "linear", "every", "progress")
@@ -93,18 +91,19 @@ def monte_carlo(
 
         - a state, ``q_b``, ``r_b.x``, ``q_m.*``, ``omega_b``: the drawn value is added to the
           initial state.
-        - ``BODY.mass`` and ``BODY.inertia``: relative changes d from the nominal values, as in
-          `Robot.perturbed`. BODY is ``base`` or the name of the joint that carries the body.
-          ``mass`` multiplies mass and inertia by 1 + d. ``inertia`` multiplies
-          each second moment per mass along the axes of the body's frame by 1 + d. The
-          pseudo-inertia stays positive definite.
-        - ``BODY.com`` [m]: shift of the centre of mass along each axis of the body's frame. Mass
-          and inertia about the centre of mass are unchanged, as for ``LINK.com.x`` in
-          `sensitivity` and `uncertain`.
-        - ``LINK.density``: relative change d; the mass and inertia of a link are multiplied by 1 +
-          d. LINK is a name in the URDF, and may be a link that is fixed to another link.
-          `sensitivity` and `uncertain` use the same name; their ``LINK.mass`` leaves the inertia
-          unchanged.
+        - ``LINK.mass``, ``LINK.density``: relative changes d of the parameters of `sensitivity` and
+          `uncertain`. ``mass`` is multiplied by 1 + d at constant inertia about the centre of mass;
+          ``density`` multiplies mass and inertia by 1 + d.
+        - ``LINK.com`` [m]: shift of the centre of mass along each axis of the link. Mass and
+          inertia about the centre of mass are unchanged, as for ``LINK.com.x`` in `sensitivity`
+          and `uncertain`.
+        - ``LINK.inertia``: the second moments of the mass distribution along the axes of the link's
+          frame are multiplied by 1 + d, with a d for each axis, as in `Robot.perturbed`; the mass
+          is unchanged. The pseudo-inertia stays positive definite.
+
+          LINK is a name in the URDF, and may be a link that is fixed to another link. A whole body
+          of several links has the name of its joint, or ``base``; for a body of one link, these
+          are other names of the link. A pattern stands for links.
         - ``INPUT.gain`` (relative change d) and ``INPUT.bias`` (b, in N m or N): a command u acts
           as (1 + d) u + b. ``INPUT.fails`` [s]: the input is zero from that time on. The recorded
           inputs are the commands, even after a failure.
@@ -117,6 +116,8 @@ def monte_carlo(
         - ``delay`` [s]: added to the `delay` of `simulate`. The sum is rounded to whole steps; a
           negative sum becomes 0.
         - ``JOINT.stiffness`` and ``JOINT.damping``: relative changes from the nominal values.
+        - ``MODE.frequency`` and ``MODE.damping`` of flexible appendages and slosh: relative changes
+          of the frequency and of the damping ratio.
     runs : int
         Number of runs.
     duration : float, optional
@@ -206,12 +207,11 @@ def monte_carlo(
     header["goals"] = _goals(goals, until, shapes, header)
     with placed(dispersions):
         job.dispersions.require_possible(runs)
-    request = _request(job, header) if path else ""
-    _require_own(path, overwrite, request)
-    if until is None and (flown := _found(job, path, request, header)):
-        return flown
     threads = threads or available_cores()
     size = _chunk(runs, chunk, workers or threads, until is not None)
+    request = _request(job, header, path, overwrite) if path else ""
+    if until is None and (earlier := _found(job, path, request, header)):
+        return earlier
     store = _store(path, request, header, size, shapes)
     with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
         how: Any = {"executor": others, "progress": progress}
@@ -237,8 +237,8 @@ def monte_carlo(
             return campaign
         for start in range(done, runs, store.chunk):
             stop = min(start + store.chunk, runs)
-            none = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
-            store.write(start, stop, none)
+            unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
+            store.write(start, stop, unused)
         store.complete()
         if store.path.suffix == ".npz":
             Campaign.load(store.part)._save(store.path, request=request)
@@ -271,11 +271,11 @@ def _store(
 
 
 def _require_own(path: Path | None, overwrite: bool, request: str = "") -> None:
-    """Refuse to replace a file of another call; before the request is known, of no campaign."""
+    """Refuse to replace the file of another call, whose request begins differently."""
     if overwrite or path is None or not path.is_file():
         return
     earlier = _request_of(path)
-    if earlier and earlier == (request or earlier):
+    if earlier and earlier.startswith(request):
         return
     try:
         found = Campaign.load(path)
@@ -302,13 +302,13 @@ def _request_of(path: Path) -> str:
 def _found(
     job: CampaignJob, path: Path | None, request: str, header: dict[str, Any]
 ) -> Campaign | None:
-    """Return what a file has of the same runs, all of them, whatever its goals."""
+    """Return the campaign of a file that holds all runs of this call; its goals may differ."""
     if path is None or path.suffix != ".h5" or not path.is_file() or _request_of(path) != request:
         return None
     try:
         found = Campaign.load(path)
     except FileError:
-        return None  # it is written anew
+        return None  # the file is written again
     goals = tuple(header["goals"])
     whole = len(found) == header["asked"]
     return replace(found, goals=goals, confidence=header["confidence"], _job=job) if whole else None
@@ -325,13 +325,9 @@ def _require_sendable(job: CampaignJob) -> None:
 
 
 def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
-    """Return how many runs a chunk has, so that all workers have several."""
+    """Return the number of runs per chunk."""
     if given is None:
-        shared = min(_STAGE, runs) if staged else runs
-        size = _STAGE
-        while size > LANES and size * 4 * workers > shared:
-            size //= 2
-        return size
+        return chunk_size(min(_STAGE, runs) if staged else runs, workers)
     size = -(-given // LANES) * LANES
     if staged and _STAGE % size:
         raise InputError(f"chunk is {given}, expected a divisor of {_STAGE} with until, such as 32")
@@ -341,8 +337,9 @@ def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
 def _header(job: CampaignJob) -> dict[str, Any]:
     """Return the header of a campaign: all that is not an array."""
     plan, plant = job.plan, job.plant
-    wheels = {f"q_m.{name}" for name in plant.robot.wheels}
-    steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - wheels}
+    robot = plant.robot
+    others = {f"q_m.{name}" for name in (*robot.wheels, *(mode.name for mode in robot.modes))}
+    steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - others}
     steered -= set() if pushed(plant.actuation) else {"r_b"}
     groups = zip(KINDS, ("q_b", "r_b", "q_m"), strict=False)
     return {
@@ -363,10 +360,16 @@ def _header(job: CampaignJob) -> dict[str, Any]:
     }
 
 
-def _request(job: CampaignJob, header: dict[str, Any]) -> str:
-    """Return a hash of what the result depends on, of which the first run tells most."""
+def _request(job: CampaignJob, header: dict[str, Any], path: Path, overwrite: bool) -> str:
+    """Return a hash of everything that the result depends on; another call's file is refused.
+
+    The header and the first draws are compared first, since the rest may take a run in Python.
+    """
     draws = job.dispersions.rows(0, min(header["asked"], _STAGE))
-    first = job.run(Draws(draws.drawn[:1], draws.run[:1]), 0).arrays
     kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
-    told = repr((kept, __version__, pin.__version__))
-    return content_digest({"told": told, "drawn": draws.drawn, **first})
+    call = repr((kept, __version__, pin.__version__))
+    request = content_digest({"call": call, "drawn": draws.drawn})
+    _require_own(path, overwrite, request)
+    request += job.digest(draws.part(0, 1))
+    _require_own(path, overwrite, request)
+    return request

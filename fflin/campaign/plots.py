@@ -1,4 +1,4 @@
-"""The figure of a campaign: bands over time, worst runs, histograms and rank correlations."""
+"""Figures of a campaign, of the validity of a linear model, and of a funnel."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, drawing
 from fflin.base.names import group_of, input_keys
-from fflin.base.validation import Array, whole
+from fflin.base.validation import Array, instance, whole
 from fflin.campaign.campaign import Campaign
+from fflin.campaign.funnel import Funnel
 from fflin.campaign.report import ended_of, goal_met
-from fflin.campaign.tally import KINDS
+from fflin.campaign.statistics import KINDS
+from fflin.campaign.validity import TRUSTED, Validity, shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Shares of the runs, from the widest band to the narrowest, and how dark each is.
+# Tail of the runs outside each band, from the widest band to the narrowest, name and opacity.
 _BANDS = (
     (0.0, "all runs", 0.13),
     (0.05, "90 % of runs", 0.22),
@@ -67,9 +68,7 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     >>> runs = fflin.monte_carlo(robot, policy, {"q_b": 0.02}, runs=8, duration=5.0, histories=20)
     >>> figure = fflin.plot_campaign(runs, "campaign.png")
     """
-    if not isinstance(campaign, Campaign):
-        said = f"campaign is a {type(campaign).__name__}, expected a Campaign"
-        raise InputError(f"{said}, as fflin.monte_carlo returns it")
+    instance("campaign", campaign, Campaign, "a Campaign, as fflin.monte_carlo returns it")
     top = whole("worst", worst, 0, len(_WORST))
     runs, groups = campaign.worst(top) if top else [], dict[str, list[int]]()
     for at, key in enumerate(input_keys(campaign) if campaign.times else ()):
@@ -77,7 +76,7 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     kinds = campaign.judged or ("attitude",)
     rows: list[Any] = [[(_error, kind, runs) for kind in kinds]] * bool(campaign.times)
     rows.append([(_histogram, kind) for kind in kinds])
-    last = [*((_inputs, *each, runs) for each in groups.items()), (_whence,)]
+    last = [*((_inputs, *each, runs) for each in groups.items()), (_correlations,)]
     across = math.ceil(len(last) / math.ceil(len(last) / 3))
     rows += [last[at : at + across] for at in range(0, len(last), across)]
     with drawing(path, 11.0, 0.8 + 2.6 * len(rows)) as figure:
@@ -94,11 +93,121 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     return figure
 
 
+def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
+    """Draw the prediction error of a linear model, and the numbers of runs that settled.
+
+    Parameters
+    ----------
+    validity : Validity
+        Result of `fflin.validity`.
+    path : str or Path, optional
+        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> reach = fflin.validity(robot, lin, fflin.lqr(lin), samples=4)
+    >>> figure = fflin.plot_validity(reach, "validity.png")
+    """
+    instance("validity", validity, Validity, "a Validity, as fflin.validity returns it")
+    percent = 100.0
+    with drawing(path, 9.0, 4.3) as figure:
+        left, right = figure.subplots(1, 2)
+        measured = np.isfinite(validity.prediction_error)
+        levels, errors = (each[measured] for each in (validity.levels, validity.prediction_error))
+        # Drawn is the error relative to the displacement, of an order less than the error's own.
+        order = "relative error"
+        if np.isfinite(validity.slope):
+            order += f", ~ displacement^{validity.slope - 1.0:.2f}"
+        left.loglog(percent * levels, percent * errors, "o-", color=COLORS[0], ms=3, label=order)
+        trust = f"accepted error: {percent * TRUSTED:g} %"
+        left.axhline(percent * TRUSTED, color="#888888", lw=0.8, label=trust)
+        left.set_xticks(percent * validity.levels, [f"{percent * x:.3g}" for x in validity.levels])
+        left.minorticks_off()
+        left.set(
+            title="prediction error of the linear loop",
+            xlabel="displacement [% of the largest]",
+            ylabel="error [% of the displacement]",
+        )
+
+        settled = np.array([outcome == "settled" for outcome in validity.outcomes])
+        edges = np.linspace(0.0, 1.0, 11)
+        counts = [np.histogram(validity.sampled[at], edges)[0] for at in (settled, ~settled)]
+        middles, wide = percent * (edges[1:] + edges[:-1]) / 2.0, percent * 0.09
+        right.bar(middles, counts[0], wide, color=COLORS[2], label="settled")
+        right.bar(middles, counts[1], wide, bottom=counts[0], color=COLORS[1], label="not settled")
+        low, high = validity.rate
+        right.set(
+            title=f"{validity.settled} of {len(settled)} runs settled",
+            xlabel="displacement [% of the largest]",
+            ylabel="runs",
+        )
+        right.yaxis.get_major_locator().set_params(integer=True)
+        right.set_ylim(0.0, 1.05 * float(np.add(*counts).max()))
+        figure.legend(loc="outside lower center", ncols=4)
+        figure.suptitle(
+            f"{validity.robot}, up to {shown(validity.largest, validity.joint_unit)}; "
+            f"{percent * low:.1f} to {percent * high:.1f} % of displacements settle "
+            f"({percent * validity.confidence:g} % confidence)",
+            fontsize=10,
+        )
+    return figure
+
+
+def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
+    """Draw the half-axes of a funnel at each knot, and the success rates of the runs from there.
+
+    Parameters
+    ----------
+    funnel : Funnel
+        Result of `fflin.funnel`.
+    path : str or Path, optional
+        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> reach = fflin.funnel(robot, fflin.tvlqr(along), {"attitude": 5.0}, samples=4, knots=2)
+    >>> figure = fflin.plot_funnel(reach, "funnel.png")
+    """
+    instance("funnel", funnel, Funnel, "a Funnel, as fflin.funnel returns it")
+    t, percent = funnel.t, 100.0
+    reach = {
+        "attitude [deg]": funnel.attitude,
+        "position [m]": funnel.position,
+        "joints [rad|m]": funnel.joints,
+    }
+    reach = {name: axes for name, axes in reach.items() if axes.any()}
+    with drawing(path, 9.0, 1.6 + 1.5 * (len(reach) + 1)) as figure:
+        axes = figure.subplots(len(reach) + 1, sharex=True)
+        for ax, (name, half), color in zip(axes, reach.items(), COLORS, strict=False):
+            for row in half.T:
+                ax.plot(t, row, "o-", color=color, ms=3, lw=0.7)
+            ax.fill_between(t, half.max(axis=1), color=color, alpha=0.15)
+            ax.set(ylabel=name, ylim=(0.0, None))
+        low, high = percent * funnel.rate.T
+        axes[-1].fill_between(t, low, high, color="#888888", alpha=0.3, label="all starts tried")
+        inside = percent * funnel.inside_rate
+        axes[-1].plot(t, inside, "o-", color="#000000", ms=3, label="starts inside, lower bound")
+        axes[-1].set(xlabel="t [s]", ylabel="success rate [%]", ylim=(0.0, 102.0))
+        figure.legend(loc="outside lower center", ncols=2)
+        figure.suptitle(
+            f"{funnel.robot.name}: errors from which every run ends with {funnel.goal}\n"
+            f"half-axes; {percent * funnel.confidence:g} % confidence",
+            fontsize=10,
+        )
+    return figure
+
+
 def _bands(
     axes: Axes, campaign: Campaign, values: Array, runs: list[int], of: Any = slice(None)
 ) -> None:
-    """Draw bands of values (N, M) of runs over time, and some of all runs on top."""
-    # Each bound is the value of a run, since means with what is infinite are no numbers.
+    """Draw bands of values (N, M) of the runs `of` over time, and the lines of chosen `runs`."""
+    # Each bound is the value of a run, since interpolation with infinite values is not finite.
     most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
     shown, t = np.minimum(values[of], most), campaign.times
     for tail, name, dark in _BANDS:
@@ -124,7 +233,7 @@ def _error(axes: Axes, campaign: Campaign, kind: str, runs: list[int]) -> None:
 
 
 def _goals(draw: Any, campaign: Campaign, *names: str) -> None:
-    """Draw the bounds that goals have on these figures."""
+    """Draw the bounds of the goals on these figures."""
     for bound in campaign.bounds:
         if bound.name in names:
             draw(bound.limit, ls="--", lw=1.0, color=_GOAL, label="goal or limit")
@@ -155,7 +264,7 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
 def _inputs(
     axes: Axes, campaign: Campaign, group: str, columns: list[int], runs: list[int]
 ) -> None:
-    """Draw the largest input of a group, of the runs that were not stopped, below its limit."""
+    """Draw the largest input of a group in the completed runs, and its limit."""
     largest = np.abs(campaign.input_history[..., columns]).max(axis=2)
     if not campaign.stopped.all():
         _bands(axes, campaign, largest, runs, ~campaign.stopped)
@@ -167,7 +276,7 @@ def _inputs(
     axes.set(title=f"largest |{group}|", ylabel=f"[{units}]")
 
 
-def _whence(axes: Axes, campaign: Campaign) -> None:
+def _correlations(axes: Axes, campaign: Campaign) -> None:
     """Draw rank correlations with the default figure, and the band of chance correlations."""
     found = list(campaign.sensitivity().items())[:_BARS][::-1]
     doubt = min(1.0, 3.0 / math.sqrt(len(campaign)))

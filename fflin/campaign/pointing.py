@@ -11,10 +11,9 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.kernel.accelerations import Loads
-from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree
-from fflin.robot.frames import ROOT, find_frame
+from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Loads, Tree
 from fflin.robot.inputs import Input, JointTorque, ReactionWheel, Thruster, named_inputs
+from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.robot.wheels import turned_to
 
@@ -22,7 +21,7 @@ _ALONG: dict[type[Any], str] = {Thruster: "direction", ReactionWheel: "axis"}
 
 
 def turned(direction: Any, angles: Array) -> Array:
-    """Return a direction (3,) turned by angles (N, 2) [rad] about two axes across it, (N, 3)."""
+    """Rotate a direction (3,) by angles (N, 2) [rad] about two perpendicular axes; (N, 3)."""
     first, second, along = turned_to(np.array(direction, dtype=float)).T
     size = np.linalg.norm(angles, axis=1)[:, None]
     side = angles[:, 1:] * first - angles[:, :1] * second
@@ -31,8 +30,8 @@ def turned(direction: Any, angles: Array) -> Array:
 
 
 def require_direction(robot: Robot, at: int) -> None:
-    """Raise `InputError` where an input has no direction of its own."""
-    for item, names, first in _placed(robot):
+    """Raise `InputError` if an input cannot be misaligned."""
+    for item, names, first in _indexed(robot):
         if first <= at < first + len(names) and isinstance(item, JointTorque):
             raise InputError(
                 f"'{names[0]}.misalignment' is dispersed, but a motor acts along its joint's axis; "
@@ -41,18 +40,18 @@ def require_direction(robot: Robot, at: int) -> None:
 
 
 def columns_of(robot: Robot, angles: Array) -> Array:
-    """Return along what the inputs of each vector on the base act (N, 9 vectors), see `Drives`."""
+    """Return the axes of tau_b and F_b in each run (N, 9 vectors), see `ActuatorFaults`."""
     found: list[Array] = [np.zeros((len(angles), 0))]
-    for item, names, first in _placed(robot):
+    for item, names, first in _indexed(robot):
         if len(item.ENTRIES) == len(names) == 3:
             found += [turned(axis, angles[:, first + k]) for k, axis in enumerate(np.eye(3))]
     return np.concatenate(found, axis=1)
 
 
 def misaligned(robot: Robot, angles: Array) -> Robot:
-    """Return a robot whose thrusters and wheels are turned by angles (nu, 2)."""
+    """Return a robot whose thrusters and wheels are rotated by angles (nu, 2)."""
     inputs = []
-    for item, _, at in _placed(robot):
+    for item, _, at in _indexed(robot):
         key = _ALONG.get(type(item))
         other = {key: turned(getattr(item, key), angles[at : at + 1])[0]} if key else {}
         inputs.append(replace(item, **other) if key else item)
@@ -60,7 +59,7 @@ def misaligned(robot: Robot, angles: Array) -> Robot:
 
 
 def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str, Array]:
-    """Return wrenches, stored momenta and joints of runs (N,), and what `bodies` lack of wheels."""
+    """Return wrenches, stored momenta, joints and changes of the bodies in each run (N,)."""
     model, count, names = robot._bare.model, len(angles), list(robot.model.names)
     wrench, stored, fixed, bodies = (
         np.tile(each, (count, 1)).reshape(count, -1, size)
@@ -70,7 +69,7 @@ def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str,
         )
     )
     inputs, storing = loads.input.tolist(), loads.stored_body.tolist()
-    for item, own, at in _placed(robot):
+    for item, own, at in _indexed(robot):
         if not (key := _ALONG.get(type(item))):
             continue
         any_item: Any = item
@@ -98,8 +97,8 @@ def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str,
     return {name: each.reshape(count, -1) for name, each in of.items()}
 
 
-def _placed(robot: Robot) -> Iterator[tuple[Input, tuple[str, ...], int]]:
-    """Yield the inputs with the names of their entries and the first of these in u."""
+def _indexed(robot: Robot) -> Iterator[tuple[Input, tuple[str, ...], int]]:
+    """Yield each input with the names of its entries and the index of the first in u."""
     first = 0
     for item, names in named_inputs(robot.inputs):
         yield item, names, first

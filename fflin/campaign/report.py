@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from fflin.base.tables import folded, grid
-from fflin.campaign.tally import KINDS, STOPS
+from fflin.campaign.statistics import KINDS, STOPS
 
 _SHARES = (0.5, 0.95, 0.99)
 
@@ -23,13 +23,13 @@ def campaign_report(campaign: Any) -> str:
         figures.append(quantile(f"worst {name}", 0.95).value)
         when = _when(quantile(f"settle {name}", 0.95).value)
         rows.append([name, unit, *(f"{x:.3g}" for x in figures), when])
-    told = []
-    for name, found in whence(campaign).items():
+    correlations = []
+    for name, found in influences(campaign).items():
         first = ", ".join(f"{key}\u00a0{value:+.2f}" for key, value in list(found.items())[:4])
-        told.append(f"rank correlations with {name}: {first or 'none significant'}")
+        correlations.append(f"rank correlations with {name}: {first or 'none significant'}")
     goals = [goal_met(campaign, goal) for goal in campaign.goals]
     head = folded([*goals, ended_of(campaign), f"{title}, seed {campaign.seed}{by}"])
-    return "\n".join([head, "", grid(rows, "ll"), "", folded(told)])
+    return "\n".join([head, "", grid(rows, "ll"), "", folded(correlations)])
 
 
 def ended_of(campaign: Any) -> str:
@@ -45,8 +45,8 @@ def goal_met(campaign: Any, goal: str) -> str:
     return f"{goal}: {value} % ({low} to {high} % at {100.0 * campaign.confidence:g} % confidence)"
 
 
-def whence(campaign: Any) -> dict[str, dict[str, float]]:
-    """Return what the worst errors go with beyond what is drawn alike by chance."""
+def influences(campaign: Any) -> dict[str, dict[str, float]]:
+    """Return the significant rank correlations of the worst errors with the drawn values."""
     worst, doubt = [f"worst {kind}" for kind in campaign.judged], 3.0 / math.sqrt(len(campaign))
     return {
         name: {k: x for k, x in campaign.sensitivity(name).items() if abs(x) > doubt}
@@ -55,14 +55,14 @@ def whence(campaign: Any) -> dict[str, dict[str, float]]:
 
 
 def worst_runs(campaign: Any, k: int) -> list[str]:
-    """Show the k worst runs and what, of what they go with, was drawn farthest from the middle."""
+    """Show the k worst runs, and the influential value that each drew farthest from the median."""
     if not k:
         return []
     about, (values, unit) = campaign.about, campaign.figure(campaign.about)
     rows = [["run", about, "unit", "settling [s]", "end [s]", "most influential draw"]]
     ranks = campaign.drawn.argsort(axis=0).argsort(axis=0)
     weights = {key.strip("|"): abs(x) for key, x in campaign.sensitivity().items()}
-    # The seed of a run's noise tells nothing.
+    # The seed of a run's noise has no weight.
     out = abs(ranks - ranks.mean()) * [weights.get(name, 0.0) for name in campaign.names]
     for run in campaign.worst(k):
         far = int(out[run].argmax())
@@ -75,12 +75,12 @@ def worst_runs(campaign: Any, k: int) -> list[str]:
 
 
 def _when(time: float) -> str:
-    """Show since when something has settled, as the report of a motion does."""
+    """Show a settling time as the report of a motion does."""
     return f"{time:.3g}" if math.isfinite(time) else "not yet"
 
 
 def campaign_record(campaign: Any, worst: int) -> dict[str, Any]:
-    """Return the same for programs: [value, low, high] of each, null where one is infinite."""
+    """Return the report as JSON values: [value, low, high] of each, null if one is infinite."""
 
     def plain(values: Any) -> list[float | None]:
         return [x if math.isfinite(x) else None for x in values]
@@ -98,12 +98,12 @@ def campaign_record(campaign: Any, worst: int) -> dict[str, Any]:
             for name in names
         },
         "goals": {goal: plain(campaign.fraction(goal, **sure)) for goal in campaign.goals},
-        "goes_with": whence(campaign),
+        "goes_with": influences(campaign),
         "worst": campaign.worst(worst) if worst else [],
     }
 
 
 def _stops(campaign: Any) -> dict[str, int]:
-    """Return how many runs were stopped, by why."""
+    """Return {reason: number of runs that were stopped}."""
     counts = {word: int((campaign.stop == at).sum()) for at, word in enumerate(STOPS) if at}
     return {word: number for word, number in counts.items() if number}

@@ -1,4 +1,4 @@
-"""Computation of the runs in chunks: eight at a time compiled, or one by one in Python."""
+"""Computation of runs in chunks: eight at a time in compiled code, or one by one in Python."""
 
 from __future__ import annotations
 
@@ -6,64 +6,68 @@ import warnings
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
-from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fflin.base.errors import FflinError
+from fflin.base.record import content_digest
 from fflin.base.validation import Array
-from fflin.batch.dispatch import ChunkResult, Rows
-from fflin.batch.run import Progress, run_chunks
+from fflin.batch.run import ChunkResult, Progress, Rows, run_chunks
 from fflin.batch.store import MemoryStore
-from fflin.campaign.dispersion_files import placed
 from fflin.campaign.dispersions import Dispersions, Draws
-from fflin.campaign.tally import KINDS, Outcome, Tally, stop_of
-from fflin.dynamics.state_rows import states_of
+from fflin.campaign.spreads import placed
+from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, stop_of
+from fflin.dynamics.state import states_of
 from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
 from fflin.simulation.compiled import engine_of
-from fflin.simulation.jacobi import conserved_by
+from fflin.simulation.conservation import conserved_by
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Plan, law_of, planned
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import Recording, go
 from fflin.simulation.simulate import motion_of
 
+if TYPE_CHECKING:
+    from fflin.campaign.lanes import Lanes, Statistics, Watcher
+
 ARRAYS = Outcome._fields
+_LARGEST_CHUNK = 256
 
 
 class CampaignJob:
-    """Runs of a plan with what is drawn; see `Job`."""
+    """Runs of one plan, each with its own drawn values; see `batch.run.Job`."""
 
     def __init__(
         self, robot: Robot, policy: Any, given: Any, seed: int, engine: str, options: Any
     ) -> None:
-        self._again: Any = partial(_made, robot, policy, given, seed, options=options)
+        self._arguments: tuple[Any, ...] = (robot, policy, given, seed, engine, options)
         histories = (options := dict(options)).pop("histories", 0)
         self.plan, self.plant = planned(robot, policy, linear=False, progress=False, **options)
-        self.engine, state = engine, self.plant.state
+        self.engine, state, times = engine, self.plant.state, self.plan.times
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
-        self.home, self._way = self.x0 if self.plan.target is None else self.plan.target, []
-        if follows := self.plan.reference:
-            t = self.plan.times.dt * np.arange(self.plan.times.steps + 1)
-            q, v, _ = map(np.array, zip(*map(follows, t.tolist()), strict=True))
-            self.home = states_of(state, q, nu := state.velocities(v))
-            self._way = [q.ravel(), nu.ravel()]
+        # Errors are deviations from a state (nx,), or from a moving one (steps + 1, nx).
+        self.target, self._path = self.x0 if self.plan.target is None else self.plan.target, []
+        if reference := self.plan.reference:
+            t = times.dt * np.arange(times.steps + 1)
+            q, v, _ = map(np.array, zip(*map(reference, t.tolist()), strict=True))
+            nu = state.velocities(v)
+            self.target, self._path = states_of(state, q, nu), [q.ravel(), nu.ravel()]
         with placed(given):
             self.dispersions = Dispersions(
-                given, self.plant, self.plan.policy, self.x0, seed, self.plan.times
+                given, self.plant, self.plan.policy, self.x0, seed, times
             )
-        spread = np.linspace(0.0, self.plan.times.steps, histories)
-        self.steps = np.unique(spread.round().astype(int))
+        # Steps at which histories are kept.
+        self.steps = np.unique(np.linspace(0.0, times.steps, histories).round().astype(int))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # What is bound to the robot is made anew by a worker.
-        return partial(self._again, engine=self.engine), ()
+        # A worker repeats the construction, since functions bound to a robot cannot be sent.
+        return _remade, (type(self), self._arguments, self.engine)
 
     def choose(self, engine: Any) -> None:
-        """Settle which loop does the runs."""
+        """Set the engine of the runs: the requested one, or the faster one that supports them."""
         self.engine = engine_of(engine, self.plan, self.plant, many=True)
 
     @property
@@ -74,38 +78,57 @@ class CampaignJob:
         histories = [(len(self.steps), size) for size in (len(KINDS), nu)]
         return dict(zip(ARRAYS, [*sizes, *histories, (), ()], strict=True))
 
+    def digest(self, first: Draws) -> str:
+        """Return a hash of the robot, the policy, the options and the first run.
+
+        It needs nothing to be compiled: the arrays of the compiled loop contain all of these. In
+        Python a policy may be any function, which the outcome of the first run represents.
+        """
+        if self.engine == "python":
+            return content_digest(self.run(first, 0).arrays)
+        from fflin.campaign.lanes import loop_arrays
+
+        tree = batch_tree(self.plant.robot)
+        assert tree is not None
+        runs = self.dispersions.in_lanes(first.drawn, tree)
+        return content_digest(loop_arrays(self.plan, self.plant) | runs | {"target": self.target})
+
     def run(self, rows: Draws, start: int, out: Mapping[str, Array] | None = None) -> ChunkResult:
-        """Do some runs."""
-        drawn, count = np.asarray(rows.drawn), len(rows.drawn)
-        if out is None:
-            out = {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
+        """Simulate the runs of some rows."""
+        drawn, out = np.asarray(rows.drawn), self._space(len(rows.drawn)) if out is None else out
         if self.engine == "compiled":
-            self._compiled(drawn, out)
+            self._fly(drawn, out)
         else:
-            for row in range(count):
+            for row in range(len(drawn)):
                 for key, values in self._one(drawn[row])._asdict().items():
                     out[key][row] = values[0]
         return ChunkResult(dict(out), [])
 
-    def _compiled(self, drawn: Array, out: Mapping[str, Array]) -> None:
+    def _space(self, count: int) -> dict[str, Array]:
+        return {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
+
+    def _fly(
+        self, drawn: Array, out: Mapping[str, Array], watcher: Watcher | None = None
+    ) -> tuple[Lanes, list[str]]:
+        """Simulate runs (N, k) in compiled code; say why each of the last eight was stopped."""
         from fflin.campaign.lanes import Lanes
 
-        tree = batch_tree(self.plant.robot)
+        tree, stopped = batch_tree(self.plant.robot), list[str]()
         assert tree is not None
         runs = self.dispersions.in_lanes(drawn, tree)
-        lanes, tally = Lanes(self.plan, self.plant, runs), self._tally(LANES)
+        lanes = Lanes(self.plan, self.plant, runs, self.statistics(LANES))
         for first in range(0, len(drawn), LANES):
-            eight, own = (
-                {key: each[first : first + LANES] for key, each in of.items()} for of in (runs, out)
+            eight, their_out = (
+                {key: each[first : first + LANES] for key, each in arrays.items()}
+                for arrays in (runs, out)
             )
-            lanes.fly(eight, tally.copy(), own)
+            stopped = lanes.fly(eight, their_out, watcher)
+        return lanes, stopped
 
-    def _tally(self, count: int) -> Any:
-        if count == LANES:
-            from fflin.campaign.lane_tally import LaneTally
-
-            return LaneTally(self.plan, self.plant, self.home, self.steps, self._way)
-        return Tally(self.plan, self.plant.state, self.home, count, self.steps)
+    def statistics(self, count: int) -> Statistics:
+        """Return the statistics of one run in Python, or of eight parallel runs."""
+        state, path = self.plant.state, self._path
+        return RunStatistics(self.plan, state, self.target, self.steps, path, count)
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
         """Return the plan of a run (k,), and its robot."""
@@ -114,37 +137,30 @@ class CampaignJob:
         times = plan.times._replace(delay=int(self.dispersions.delays(drawn[None])[0]))
         return replace(plan, q=q, v=v, policy=policy, law=law, times=times), plant
 
-    @np.errstate(over="ignore", invalid="ignore")  # of what diverges
-    def _one(self, drawn: Array) -> Outcome:
+    @np.errstate(over="ignore", invalid="ignore")  # a run that diverges overflows
+    def _one(self, drawn: Array) -> Any:
         plan, plant = self.plan_of(drawn)
-        run = self._gone(replace(plan, times=plan.times._replace(every=1)), plant)
-        nu = plant.state.velocities(run.v)
-        tally = self._tally(1).add(0, [each[:, None] for each in (run.q, nu, run.u)])
-        stop = np.array([float(stop_of(run.stopped))])
-        return tally.outcome(run.steps, stop)
-
-    def _gone(self, plan: Plan, plant: Plant) -> Recording:
-        run = go(plan, plant, conserved_by(plant.robot, plan.q, plant.field))
-        if run.stopped.startswith("interrupted"):
-            raise KeyboardInterrupt
-        return run
+        run = _recorded(plan, plant, every=1)
+        rows = run.q, self.plant.state.velocities(run.v), run.u, run.momentum, run.center
+        statistics = self.statistics(1)
+        statistics.add(0, [each[:, None] for each in rows], np.hstack(rows).ravel().tolist())
+        return statistics.outcome(run.steps, np.array([float(stop_of(run.stopped))]))
 
     def replay(self, drawn: Array) -> Motion:
-        """Return the motion of a run, by the same instructions."""
+        """Simulate a run (k,) again with the same arithmetic, and return its motion."""
         plan, plant = self.plan_of(drawn)
         if self.engine == "python":
-            return motion_of(plan, plant, "python", self._gone(plan, plant))
-        return motion_of(plan, plant, "compiled", self._recorded(drawn, plan, plant))
+            run = _recorded(plan, plant, plan.times.every)
+        else:
+            run = self._recorded_in_lanes(drawn, plan, plant)
+        return motion_of(plan, plant, self.engine, run)
 
-    def courses(self, drawn: Array, most: int) -> list[Array]:
-        """Return some configurations (rows, nq) on the way of runs (N, k), and the last of each."""
+    def paths(self, drawn: Array, most: int) -> list[Array]:
+        """Return up to `most` + 1 configurations (rows, nq) of each of some runs (N, k)."""
         times, found = self.plan.times, list[Array]()
         every = -(-times.steps // most)
         if self.engine == "python":
-            for plan, plant in map(self.plan_of, drawn):
-                rare = replace(plan, times=times._replace(every=every))
-                found.append(self._gone(rare, plant).q)
-            return found
+            return [_recorded(*self.plan_of(each), every).q for each in drawn]
         for first in range(0, len(drawn), LANES):
             (q, *_), out, *_ = self._watched(drawn[first : first + LANES], every)
             counts = -(-(out["end"] / times.dt).round().astype(int) // every)
@@ -152,57 +168,79 @@ class CampaignJob:
             found += [np.vstack((q[:count, lane], end)) for lane, (count, end) in enumerate(ends)]
         return found
 
-    def _watched(self, drawn: Array, every: int) -> tuple[Any, Any, str, Any]:
-        """Return rows (steps, lanes, ..) of up to eight runs, and how and why these ended."""
-        from fflin.campaign.lanes import Lanes
-
-        tree, kept = batch_tree(self.plant.robot), list[list[Array]]()
-        assert tree is not None
-        runs = self.dispersions.in_lanes(drawn, tree)
-        lanes = Lanes(self.plan, self.plant, runs)
+    def _watched(self, drawn: Array, every: int) -> tuple[list[Array], Any, Lanes, list[str]]:
+        """Return rows (steps, lanes, ..) of up to eight runs, and how they ended."""
+        kept, out = list[list[Array]](), self._space(len(drawn))
 
         def watch(first: int, rows: list[Array]) -> None:
             kept.append([each[-first % every :: every].copy() for each in rows])
 
-        out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
-        said = lanes.fly(runs, self._tally(LANES), out, watch)
-        return list(map(np.concatenate, zip(*kept, strict=True))), out, said[0], lanes
+        lanes, stopped = self._fly(drawn, out, watch)
+        return [np.concatenate(slices) for slices in zip(*kept, strict=True)], out, lanes, stopped
 
-    def _recorded(self, drawn: Array, plan: Plan, plant: Plant) -> Recording:
-        """Return the recording of a run that goes in all lanes."""
-        every, state = plan.times.every, plant.state
-        rows, out, said, lanes = self._watched(np.tile(drawn, (LANES, 1)), every)
+    def _recorded_in_lanes(self, drawn: Array, plan: Plan, plant: Plant) -> Recording:
+        """Return the recording of one run, which is simulated in all lanes."""
+        every, dt, state = plan.times.every, plan.times.dt, plant.state
+        rows, out, lanes, [stopped, *_] = self._watched(np.tile(drawn, (LANES, 1)), every)
         rows, end = [each[:, 0] for each in rows], float(out["end"][0])
-        t = every * plan.times.dt * np.arange(len(rows[0]))
-        if not said.startswith("diverged"):
-            last = out["q"][0], state.velocities(out["v"][0]), out["u"][0], *lanes.kept(end)
+        t = every * dt * np.arange(len(rows[0]))
+        if not stopped.startswith("diverged"):
+            last = out["q"][0], state.velocities(out["v"][0]), out["u"][0], *lanes.conserved(end)
             rows, t = [np.vstack(x) for x in zip(rows, last, strict=True)], np.append(t, end)
         q, nu, u, momentum, center = rows
-        parts = (t, q, state.spread(nu), u, momentum, center, round(end / plan.times.dt), said)
-        return Recording(*parts, "compiled")
+        return Recording(
+            t=t,
+            q=q,
+            v=state.spread(nu),
+            u=u,
+            momentum=momentum,
+            center=center,
+            steps=round(end / dt),
+            stopped=stopped,
+            engine="compiled",
+        )
 
 
-def _made(*arguments: Any, **more: Any) -> CampaignJob:
-    """Make a job in a worker, which has nobody to warn."""
+def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:
+    """Simulate a run in Python, and keep a row of every so many steps."""
+    plan = replace(plan, times=plan.times._replace(every=every))
+    run = go(plan, plant, conserved_by(plant.robot, plan.q, plant.field))
+    if run.stopped.startswith("interrupted"):
+        raise KeyboardInterrupt
+    return run
+
+
+def _remade(kind: type[CampaignJob], arguments: tuple[Any, ...], engine: str) -> CampaignJob:
+    """Make a job in a worker, whose warnings nobody would see."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return CampaignJob(*arguments, **more)
+        job = kind(*arguments)
+    job.engine = engine
+    return job
 
 
-def done_by(
-    job: Any,
+def chunk_size(count: int, workers: int, least: int = LANES) -> int:
+    """Return the number of runs per chunk with which each worker has several chunks."""
+    size = _LARGEST_CHUNK
+    while size > least and 4 * workers * size > count:
+        size //= 2
+    return size
+
+
+def completed(
+    job: CampaignJob,
     rows: Rows,
     count: int,
     executor: Executor | None = None,
     workers: int | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
-    least: int = LANES,
 ) -> dict[str, Any]:
-    """Return the arrays of all rows of a job, in chunks of `least` or some more."""
-    threads = (threads or available_cores()) if job.engine == "compiled" else 1
-    share = -(-count // (4 * (workers or threads) * least))
-    store = MemoryStore(count, least * min(max(share, 1), 32), job.shapes)
+    """Run a job on all its rows, and return its arrays."""
+    compiled = job.engine == "compiled"
+    threads = (threads or available_cores()) if compiled else 1
+    size = chunk_size(count, workers or threads, LANES if compiled else 1)
+    store = MemoryStore(count, size, job.shapes)
     failed = run_chunks(job, rows, store, executor=executor, threads=threads, progress=progress)
     if failed:
         died = "a worker process died: " if executor else ""

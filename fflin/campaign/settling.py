@@ -6,7 +6,7 @@ The norm belongs to the Lyapunov function of the linear loop that decays as the 
 from __future__ import annotations
 
 import math
-from copy import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import count
@@ -15,15 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fflin.analysis.names import rate_of
-from fflin.analysis.wheels import picked, regulated_part, wheel_inputs
+from fflin.analysis.reduction import picked, regulated_part, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double
-from fflin.campaign.runs import CampaignJob, done_by
+from fflin.campaign.runs import CampaignJob, completed
 from fflin.control.policies import StateFeedback
 from fflin.control.saturation import Saturation
-from fflin.dynamics.state import Frame, StateMap
-from fflin.dynamics.state_rows import states_of
+from fflin.dynamics.state import Frame, StateMap, states_of, unwound
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
@@ -31,18 +30,19 @@ from fflin.robot.robot import Robot
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
 
-# A run has settled where its error is this share of the first, and has diverged where it is this
-# many times as large.
+# Ratio of a run's error to its initial error at which it has settled, and has diverged.
 SETTLED, DIVERGED = 1e-3, 1e3
-EDGE = 1e-3  # of 1 - |q_b|^2, within 4 degrees of a turn of 180, where a run leaves the chart
-# The prediction is measured over so many time constants of the slowest pole; a random run may take
-# as many times what the slowest pole needs to settle.
-_FORESIGHT, _PATIENCE = 3.0, 3.0
-_STEP = 0.25  # over the fastest pole
-_WIDEST = 10.0  # displacement of a joint [rad] up to which steps are as much shorter
-_FINER, _FINEST = 8, 2  # times as many steps where a run diverges, and how often so
+EDGE = (
+    1e-3  # value of 1 - |q_b|^2, 4 degrees from a rotation of 180, at which a run leaves the chart
+)
+# Duration of a comparison with the prediction in time constants of the slowest pole, and of a
+# random run in times that this pole needs to settle.
+_CONSTANTS, _PATIENCE = 3.0, 3.0
+_STEP = 0.25  # time step times the fastest pole
+_WIDEST = 10.0  # displacement of a joint [rad] up to which steps shorten in proportion
+_FINER, _FINEST = 8, 2  # factor by which steps are shortened if a run diverges, and how often
 _MOST_STEPS = 1_000_000
-_LOOKS = 60  # at the prediction
+_CHECKS = 60  # comparisons with the prediction in a run
 
 OUTCOMES = ("slow", "settled", "chart", "diverged")
 
@@ -120,10 +120,10 @@ class Loop:
         return x
 
     def errors(self, q: Array, nu: Array) -> tuple[Array, Array]:
-        """Return q0^2 (N,) of the chart, and deviations (N, nz) of the model's states, of rows."""
-        x = states_of(self.state, q, nu)
-        e, turns = x[:, self.watched] - self.lin.x0, np.isin(self.watched, 6 + self.state.unbounded)
-        e[:, turns] -= 2.0 * np.pi * np.round(e[:, turns] / (2.0 * np.pi))
+        """Return q0^2 (N,) of the base attitude and the deviations (N, nz) from the model's x0."""
+        x, center = states_of(self.state, q, nu), np.zeros(self.state.nx)
+        center[self.watched] = self.lin.x0
+        e = unwound(self.state, x - center)[:, self.watched]
         return 1.0 - (x[:, :3] ** 2).sum(axis=1), e
 
     def fed_back_in(self, frame: Frame) -> Loop:
@@ -138,21 +138,24 @@ class Loop:
 
 
 class SettlingJob(CampaignJob):
-    """Runs of a loop from displaced states, looked at by `Settling` every so many steps."""
+    """Runs of a loop from displaced states, until they settle or up to a horizon.
+
+    With `predicts`, they last three time constants and are compared with the linear loop. `fine`
+    is how often the steps have been shortened.
+    """
 
     def __init__(
-        self, loop: Loop, foresees: bool, limits: Any, joint: float, fine: int = 0, engine: str = ""
+        self, loop: Loop, predicts: bool, limits: Any, joint: float, fine: int = 0, engine: str = ""
     ) -> None:
         lin, decay = loop.lin, loop.decay
-        self.loop, self.foresees, self.fine = loop, foresees, fine
-        # Between samples, and where it is cut, the robot is without its loop.
+        # Between samples, and where an input saturates, the robot moves without its loop.
         free = linearize(loop.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
         rates = [2.0 * free.A] if lin.dt else [free.A, loop.rate]
         fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
-        horizon = (_FORESIGHT if foresees else _PATIENCE * math.log(1.0 / SETTLED)) / decay
+        horizon = (_CONSTANTS if predicts else _PATIENCE * math.log(1.0 / SETTLED)) / decay
         pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
-        self.every = math.ceil(lin.dt * pace / _STEP) if lin.dt else 1
-        dt = lin.dt / self.every if lin.dt else _STEP / pace
+        every = math.ceil(lin.dt * pace / _STEP) if lin.dt else 1
+        dt = lin.dt / every if lin.dt else _STEP / pace
         if not horizon / dt <= _MOST_STEPS:
             raise InputError(
                 f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
@@ -160,38 +163,33 @@ class SettlingJob(CampaignJob):
                 f"{_MOST_STEPS:,}; give a gain whose poles are closer together, or add damping"
             )
         if not lin.dt:
-            self.every = max(1, int(horizon / dt / _LOOKS)) if foresees else 4
-        looks, finer = math.ceil(horizon / (dt * self.every) - 1e-9), _FINER**fine
-        dt, self.every = dt / finer, self.every * finer
-        options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * self.every * looks}
-        options |= {"limits": limits, "project": not foresees, "every": self.every}
-        none = dict.fromkeys(loop.state.names, 0.0)
-        super().__init__(loop.robot, StateFeedback(lin, loop.K), none, 0, engine, options)
-        if limits is None:  # nothing cuts, not even thrusts that pull
+            every = max(1, int(horizon / dt / _CHECKS)) if predicts else 4
+        checks, finer = math.ceil(horizon / (dt * every) - 1e-9), _FINER**fine
+        dt, every = dt / finer, every * finer
+        options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
+        options |= {"limits": limits, "project": not predicts, "every": every}
+        deviations = dict.fromkeys(loop.state.names, 0.0)
+        policy = StateFeedback(lin, loop.K)
+        super().__init__(loop.robot, policy, deviations, 0, engine, options)
+        if limits is None:  # no input saturates, and thrusters may pull
             most = np.full(len(self.plan.initial), np.inf)
-            self.plan = replace(self.plan, limits=Saturation(-most, most, None, None))
-        self._again = partial(SettlingJob, loop, foresees, limits, joint, fine)
-        self.finer = partial(SettlingJob, loop, foresees, limits, joint, fine + 1)
-        self.step = self._foreseen(dt)
+            self.plan = replace(self.plan, limits=Saturation(-most, most))
+        self.loop, self.every, self.fine = loop, every, fine
+        self._arguments = (loop, predicts, limits, joint, fine, engine)
+        self.step = _sampled(loop, dt, every) if predicts else None
 
-    def _foreseen(self, dt: float) -> Array | None:
-        """Return what takes the linear loop from look to look, by the method of the nonlinear one.
-
-        Of a linear system CF4 is the classical method of order four, whose steps are those of its
-        stability polynomial: so the difference of the two loops is that of what is not linear.
-        """
-        if not self.foresees or self.loop.lin.dt:
-            return self.loop.rate if self.foresees else None
-        one, Z = np.eye(len(self.loop.rate)), self.loop.rate * dt
-        step = one + Z @ (one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0)))
-        return np.linalg.matrix_power(step, self.every)
+    def finer(self) -> SettlingJob:
+        """Return the same runs in shorter steps."""
+        loop, predicts, limits, joint, fine, _ = self._arguments
+        return SettlingJob(loop, predicts, limits, joint, fine + 1, self.engine)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each array of a run's outcome."""
         return dict.fromkeys(Judged._fields, ())
 
-    def _tally(self, count: int) -> Any:
+    def statistics(self, count: int) -> Settling:
+        """Return the statistics of one run in Python, or of eight parallel runs."""
         return Settling(self, count)
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
@@ -205,7 +203,20 @@ class SettlingJob(CampaignJob):
             e = loop.errors(q[None], loop.state.velocities(v)[None])[1]
             return float(loop.size(e[0]) - SETTLED * first)
 
-        return replace(plan, events=() if self.foresees else (settled,)), plant
+        return replace(plan, events=(settled,) if self.step is None else ()), plant
+
+
+def _sampled(loop: Loop, dt: float, every: int) -> Array:
+    """Return the transition matrix of the linear loop from check to check.
+
+    For a linear system CF4 is the classical method of order four, which multiplies by its stability
+    polynomial in each step. The two loops then differ by their nonlinear terms alone.
+    """
+    if loop.lin.dt:
+        return loop.rate
+    one, Z = np.eye(len(loop.rate)), loop.rate * dt
+    step = one + Z @ (one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0)))
+    return np.linalg.matrix_power(step, every)
 
 
 class Judged(NamedTuple):
@@ -216,34 +227,36 @@ class Judged(NamedTuple):
 
 
 class Settling:
-    """Runs of a loop: whether they have settled, and how far they are from the linear loop's."""
+    """Whether runs have settled, and their differences from the linear loop; see `Statistics`."""
 
-    span = 128  # steps between looks at what is over
+    span = 128  # steps between checks of `over`
 
     def __init__(self, job: SettlingJob, count: int) -> None:
-        self._job, self._loop = job, job.loop
-        self._code, self._worst = np.zeros(count, dtype=int), np.zeros(count)
+        self._job, self._loop, self._count = job, job.loop, count
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin with other runs."""
+        self._code, self._worst = np.zeros(self._count, dtype=int), np.zeros(self._count)
+        self._next = 0  # first step that has not been added
 
     @property
     def over(self) -> Any:
-        """Which runs (count,) need not go on."""
+        """Which runs (count,) may end before their time."""
         return (self._code > 0) & (self._job.step is None)
 
-    def copy(self) -> Settling:
-        """Return one that goes its own way from here on."""
-        return copy(self)
-
-    def add(self, first: int, rows: list[Array], _: Any = None) -> Settling:
-        """Take rows (steps, count, ..) from a step on into account."""
-        looks = slice(-first % self._job.every, None, self._job.every)
-        loop, (q, nu) = self._loop, (each[looks] for each in rows[:2])
+    def add(self, first: int, rows: Sequence[Array], _: Any) -> None:
+        """Add the rows (steps, count, ..) from step `first` on."""
+        begin, self._next = max(first, self._next), first + len(rows[0])
+        checked = slice(begin - first + -begin % self._job.every, None, self._job.every)
+        loop, (q, nu) = self._loop, (each[checked] for each in rows[:2])
         if not (shape := q.shape[:2])[0]:
-            return self
+            return
         square, e = loop.errors(*(each.reshape(-1, each.shape[-1]) for each in (q, nu)))
         e = e.reshape(*shape, -1)
         size = loop.size(e)
-        if first == 0:
-            self._first, self._ahead = size[0], e[0]
+        if begin == 0:
+            self._first, self._predicted = size[0], e[0]
         edge = square.reshape(shape) < EDGE
         ends = [size <= SETTLED * self._first, edge, ~(size < DIVERGED * self._first)]
         code = np.select(ends, [1, 2, 3], 0)
@@ -251,23 +264,22 @@ class Settling:
         self._code = np.where(self._code > 0, self._code, code)
         if self._job.step is not None:
             for each in e:
-                self._worst = np.maximum(self._worst, loop.size(each - self._ahead))
-                self._ahead = self._ahead @ self._job.step.T
-        return self
+                self._worst = np.maximum(self._worst, loop.size(each - self._predicted))
+                self._predicted = self._predicted @ self._job.step.T
 
     def outcome(self, _: int, stop: Array) -> Judged:
-        """Return how they ended, by which of STOPS."""
+        """Return the outcomes of the runs; `stop` are indices into STOPS."""
         code = np.where(self._code > 0, self._code, np.array([0, 3, 2, 1])[stop.astype(int)])
         error = self._worst / np.maximum(self._first, 1e-300)
         return Judged(code.astype(float), np.where((stop > 0.0) | (code > 1), np.nan, error))
 
 
-def flown(job: SettlingJob, rows: Any, runs: Any, how: dict[str, Any]) -> dict[str, Array]:
-    """Return how runs ended; what diverges is flown again in shorter steps, which follow it."""
-    arrays = done_by(job, lru_cache(64)(partial(rows, runs)), len(runs), **how)
+def settle(job: SettlingJob, rows: Any, runs: Any, **how: Any) -> dict[str, Array]:
+    """Return the outcomes of runs; those that diverge are repeated in shorter steps."""
+    arrays = completed(job, lru_cache(64)(partial(rows, runs)), len(runs), **how)
     lost = np.flatnonzero(arrays["outcome"] == OUTCOMES.index("diverged"))
     if len(lost) and job.fine < _FINEST:
-        again = flown(job.finer(engine=job.engine), rows, runs[lost], how | {"progress": None})
+        again = settle(job.finer(), rows, runs[lost], **how | {"progress": None})
         for key, values in again.items():
             arrays[key][lost] = values
     return arrays

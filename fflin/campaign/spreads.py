@@ -1,17 +1,157 @@
-"""Spreads: inverse distribution functions of the dispersed values."""
+"""Spreads of dispersed values: from Python or a TOML file, as inverse distribution functions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import reprlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
+from fflin.base.toml_file import TomlFile, is_number
 from fflin.base.validation import Array, number
+from fflin.base.writing import as_path
 
-SEED = "noise"  # what is drawn of a run's noise, which says nothing of how it ends
+SEED = "noise"  # name of the drawn seed of a run's noise, which explains no result
+
+_TABLE = "dispersions"
+_FORMS = ("normal", "uniform", "values", "distribution")
+_EXPECTED = (
+    "a number (a standard deviation), {uniform = [least, largest]}, {values = [a, b, ...]} or "
+    '{distribution = "NAME", ...}'
+)
+
+
+class DispersionFile(dict[str, Any]):
+    """{name, group or pattern: spread} of a file, and the lines on which they stand."""
+
+    def __init__(self, document: TomlFile) -> None:
+        super().__init__()
+        self.document = document
+
+
+def placed(dispersions: Any) -> AbstractContextManager[None]:
+    """Put file and line of the spread that an error names in front of its message."""
+    if isinstance(dispersions, DispersionFile):
+        return dispersions.document.located(_TABLE)
+    return nullcontext()
+
+
+def load_dispersions(path: str | Path) -> dict[str, Any]:
+    """Read the dispersions of `monte_carlo` from a TOML file.
+
+    The file has one table ``[dispersions]`` of names, groups or patterns, each with its spread:
+
+    ==========================================  ==================================================
+    ``0.05`` or ``{normal = 0.05}``             normal about 0 with this standard deviation
+    ``{uniform = [-0.1, 0.2]}``                 uniform between least and largest value
+    ``{values = [0, 10, 20]}``                  one of these values, all equally likely
+    ``{distribution = "triang", c = 0.5}``      distribution of scipy.stats by its name, with its
+                                                shape parameters, ``loc`` and ``scale``
+    ``{normal = 0.05, tied = true}``            one draw for all names of a pattern or group
+    ==========================================  ==================================================
+
+    Values are in the SI units of the state, input or joint, see `monte_carlo`.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    dict
+        {name: spread}, as `monte_carlo` takes it. If `monte_carlo` refuses a name or spread, its
+        message names file and line.
+
+    Raises
+    ------
+    FileError
+        If the path is not a regular file, or the file cannot be read or is too large.
+    UnknownNameError
+        If a table, kind of spread, distribution or parameter is unknown; with file and line.
+    InputError
+        If the file is not TOML or a value is wrong; with file and line.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> _ = Path("uncertain.toml").write_text("dispersions.q_b = {uniform = [-0.1, 0.1]}")
+    >>> fflin.load_dispersions("uncertain.toml").keys()
+    dict_keys(['q_b'])
+    """
+    try:
+        document = TomlFile(as_path(path))
+    except InputError as error:  # q_b = 1 and q_b.sensor = 1 are a number and a table
+        hint = '; names with dots stand in quotes, "q_b.sensor"' * ("overwrite" in str(error))
+        raise InputError(f"{error}{hint}") from None
+    table = document.record.get(_TABLE)
+    for key in (*document.record, _TABLE):
+        if key != _TABLE or not isinstance(table, dict) or not table:
+            problem = "contains no spreads"
+            if key != _TABLE:
+                kind = "table" if isinstance(document.record[key], dict | list) else "name"
+                problem = f"{kind} '{key}' is outside [{_TABLE}], the only table of this file"
+            problem = f"{problem}; write [{_TABLE}] and below it q_b = 0.05"
+            raise document.error(UnknownNameError(problem), key)
+    found = DispersionFile(document)
+    for name, value in _names(table or {}):
+        try:
+            found[name] = _spread(value)
+        except FflinError as error:
+            raise document.error(type(error)(f"'{name}': {error}"), _TABLE, name) from None
+    return found
+
+
+def _names(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield (name, spread); ``base.mass = 0.1`` is the name "base.mass"."""
+    for key, value in table.items():
+        if isinstance(value, dict) and value and not {*value} & {*_FORMS}:
+            yield from _names(value, f"{before}{key}.")
+        else:
+            yield f"{before}{key}", value
+
+
+def _spread(value: Any) -> Any:
+    table: dict[str, Any] = dict(value) if isinstance(value, dict) else {"normal": value}
+    if "tied" in table:
+        tied = table.pop("tied")
+        return {"range": _spread(table), "tied": tied}
+    if isinstance(table.get("distribution"), str):
+        return _distribution(**table)
+    (form, given), *others = table.items() or [("", None)]
+    entries = given if isinstance(given, list) and form in ("uniform", "values") else [given]
+    right = {"normal": given is not entries, "uniform": len(entries) == 2, "values": given}
+    if not others and all(map(is_number, entries)) and right.get(form):
+        return tuple(entries) if form == "uniform" else given
+    raise InputError(f"{reprlib.repr(value)} is not a spread, expected {_EXPECTED}")
+
+
+def _distribution(distribution: str, **given: Any) -> Any:
+    from scipy import stats
+
+    kinds = stats.rv_continuous, stats.rv_discrete
+    known = [each for each in dir(stats) if isinstance(getattr(stats, each), kinds)]
+    if distribution not in known:
+        raise unknown("distribution of scipy.stats", distribution, known)
+    kind = getattr(stats, distribution)
+    try:
+        for key, value in given.items():
+            if not is_number(value):
+                raise ValueError(f"has {key} = {reprlib.repr(value)}, expected a finite number")
+        frozen = kind(**given)
+        if abs(float(frozen.ppf(0.5))) < 1e100:
+            return frozen
+        problem = f"is not defined for {', '.join(f'{key} = {x:g}' for key, x in given.items())}"
+    except (TypeError, ValueError) as error:
+        problem = str(error).partition("() ")[2] or str(error)
+    shapes = f"{kind.shapes}, " if kind.shapes else ""
+    raise InputError(
+        f"distribution {distribution} {problem}; its parameters are {shapes}loc, scale"
+    )
 
 
 def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
@@ -19,7 +159,7 @@ def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
     if hasattr(spread, "ppf"):
         try:
             middle = float(spread.ppf(0.5))
-        except Exception:  # of what may call itself a distribution
+        except Exception:  # any object may have a ppf
             middle = np.nan
         if not np.isfinite(middle):
             raise InputError(
@@ -45,7 +185,7 @@ def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
 
 
 def is_closed_form(inverse: Callable[[Array], Array]) -> bool:
-    """Whether an inverse is one of this module, and no distribution's that may take long."""
+    """Whether an inverse is one of this module; those of SciPy may take long."""
     return isinstance(inverse, partial) or inverse is whole_number
 
 
@@ -65,12 +205,12 @@ def _normal(deviation: float, u: Array) -> Array:
 
 
 def whole_number(u: Array) -> Array:
-    """Return seeds: the uniform numbers that a double tells from one another."""
+    """Return seeds of noise: whole numbers that are all different doubles."""
     return np.floor(u * 2.0**53)
 
 
 def deviation_of(name: str, spread: Any) -> Callable[[Array], Array]:
-    """Return the same of a noise's deviation, which a number itself is."""
+    """Return the inverse for the standard deviation of noise; a number is this deviation itself."""
     inverse = inverse_of(name, spread)
     fixed = getattr(inverse, "func", None) is _normal
     return partial(_choice, np.array([float(spread)])) if fixed else inverse

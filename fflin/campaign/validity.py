@@ -12,16 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from fflin.analysis.displacement import checked_displacement, joint_unit, scaled, shown
 from fflin.base.errors import InputError
-from fflin.base.frozen import FrozenArrays
-from fflin.base.intervals import clopper_pearson
+from fflin.base.intervals import until_failure
 from fflin.base.tables import folded
-from fflin.base.validation import Array, share, whole
+from fflin.base.validation import Array, FrozenArrays, number, share, whole
 from fflin.batch.run import Progress, check_workers
 from fflin.batch.workers import OwnWorkers
 from fflin.campaign.dispersions import Draws
-from fflin.campaign.settling import OUTCOMES, Loop, SettlingJob, checked_loop, flown
+from fflin.campaign.settling import OUTCOMES, Loop, SettlingJob, checked_loop, settle
 from fflin.dynamics.names import Frame, refuse_orbit
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -33,6 +31,9 @@ _DIRECTIONS = 4
 _MOST = 1_000_000  # random runs
 _ROUNDING = 1e-7  # prediction errors below it are those of the integration
 TRUSTED = 0.1  # relative prediction error up to which the linear model is called so
+
+# The largest displacement [m], [rad].
+_FARTHEST = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ class Validity(FrozenArrays):
         if np.isfinite(self.slope):
             order = f"the error grows with the displacement to the power {self.slope:.3f}"
         beyond = " and beyond" if self.trusted == self.largest else ""
-        first = shown(scaled(self.largest, float(self.sampled[0])), self.joint_unit)
+        first = shown(_scaled(self.largest, float(self.sampled[0])), self.joint_unit)
         lines = [
             f"{self.robot}: the linear loop predicts the nonlinear loop within "
             f"{100.0 * TRUSTED:g} % up to {trusted}{beyond}; {order}",
@@ -235,7 +236,7 @@ def validity(
     (True, 4)
     """
     loop = checked_loop(robot, lin, gain)
-    largest = checked_displacement(loop.lin, attitude, position, joint)
+    largest = _checked_displacement(loop.lin, attitude, position, joint)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)
     if isinstance(frames, str) or not isinstance(frames, Iterable):
@@ -244,28 +245,29 @@ def validity(
     loops = {loop.lin.frame: loop} | {each: loop.fed_back_in(each) for each in frames}
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
-    foreseen = len(_LEVELS) * _DIRECTIONS
-    total, done, found = len(loops) * (foreseen + samples), 0, list[Validity]()
-    kinds = ((True, foreseen), (False, samples))
-    # All of them before anything is compiled: what cannot be flown is refused at once.
+    counts = {True: len(_LEVELS) * _DIRECTIONS, False: samples}  # runs that predict, random runs
+    total, done, found = len(loops) * sum(counts.values()), 0, list[Validity]()
+    # Every job is made first, so that a wrong argument is refused before anything is compiled.
     jobs = {
-        (frame, foresees): SettlingJob(each, foresees, limits, largest["joint"])
+        (frame, predicts): SettlingJob(each, predicts, limits, largest["joint"])
         for frame, each in loops.items()
-        for foresees, _ in kinds
+        for predicts in counts
     }
     for job in jobs.values():
         job.choose(engine)
     with OwnWorkers(workers) if workers else nullcontext(executor) as others:
+        how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         for frame, each in loops.items():
-            arrays = []
-            for foresees, count in kinds:
-                job = jobs[frame, foresees]
-                rows = partial(_displaced, each, largest, seed, None if foresees else levels)
-                told = progress and partial(_tell, progress, done, total)
-                how = {"executor": others, "workers": workers, "threads": threads, "progress": told}
-                arrays.append(flown(job, rows, np.arange(count), how))
+            arrays = {}
+            for predicts, count in counts.items():
+                rows = partial(_displaced, each, largest, seed, None if predicts else levels)
+                counted = progress and partial(_report, progress, done, total)
+                job = jobs[frame, predicts]
+                arrays[predicts] = settle(job, rows, np.arange(count), progress=counted, **how)
                 done += count
-            found.append(_judged(each, largest, levels, arrays, confidence))
+            error = arrays[True]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
+            outcomes = tuple(OUTCOMES[int(code)] for code in arrays[False]["outcome"])
+            found.append(_judged(each, largest, levels, error, outcomes, confidence))
     own, *more = found
     return replace(own, frames={each.frame: each for each in more})
 
@@ -273,39 +275,42 @@ def validity(
 def _displaced(
     loop: Loop, largest: dict[str, float], seed: int, levels: Array | None, runs: Any, *at: int
 ) -> Draws:
-    """Return the displaced starts of some runs, each from its own random stream."""
+    """Return the displaced initial states of some runs, each from its own random stream."""
     drawn, runs = [], runs[slice(*at)]
     for run in runs.tolist():
         stream, level = run // len(_LEVELS), _LEVELS[run % len(_LEVELS)]
         if levels is not None:
             stream, level = _DIRECTIONS + run, levels[run]
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-        drawn.append(loop.displaced(rng, **scaled(largest, float(level))))
+        drawn.append(loop.displaced(rng, **_scaled(largest, float(level))))
     return Draws(np.array(drawn) - loop.state.to_state(loop.lin.q, loop.lin.v), runs)
 
 
-def _tell(progress: Progress, before: int, total: int, done: int, _: int) -> None:
+def _report(progress: Progress, before: int, total: int, done: int, _: int) -> None:
     progress(before + done, total)
 
 
 def _judged(
-    loop: Loop, largest: dict[str, float], levels: Array, runs: list[Any], confidence: float
+    loop: Loop,
+    largest: dict[str, float],
+    levels: Array,
+    error: Array,
+    outcomes: tuple[str, ...],
+    confidence: float,
 ) -> Validity:
-    worst = runs[0]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
-    samples, outcomes = len(levels), tuple(OUTCOMES[int(code)] for code in runs[1]["outcome"])
-    inside = next((i for i, outcome in enumerate(outcomes) if outcome != "settled"), samples)
-    reach = float(levels[inside - 1]) if inside else 0.0
+    failed = np.array([outcome != "settled" for outcome in outcomes])
+    inside, bound, rate = until_failure(failed, confidence)
     return Validity(
         levels=_LEVELS,
-        prediction_error=worst,
-        slope=_slope(worst),
-        trusted=scaled(largest, _crossing(worst)),
+        prediction_error=error,
+        slope=_slope(error),
+        trusted=_scaled(largest, _crossing(error)),
         sampled=levels,
         outcomes=outcomes,
-        holds=scaled(largest, reach),
+        holds=_scaled(largest, float(levels[inside - 1]) if inside else 0.0),
         inside=inside,
-        inside_rate=(1.0 - confidence) ** (1.0 / inside) if inside else 0.0,
-        rate=clopper_pearson(outcomes.count("settled"), samples, confidence)[1:],
+        inside_rate=bound,
+        rate=rate,
         confidence=confidence,
         largest=largest,
         joint_unit=joint_unit(loop.lin),
@@ -334,3 +339,48 @@ def _crossing(errors: Array) -> float:
         return near if np.isfinite(errors[0]) else 0.0
     pair = slice(first - 1, first + 1)
     return float(np.exp(np.interp(np.log(TRUSTED), np.log(errors[pair]), np.log(_LEVELS[pair]))))
+
+
+def _checked_displacement(
+    lin: LinearModel, attitude: float, position: float, joint: float
+) -> dict[str, float]:
+    """Return the largest displacement; zero of what is not among the states."""
+    given = {"attitude": attitude, "position": position, "joint": joint}
+    given = {key: number(key, value) for key, value in given.items()}
+    if not 0.0 <= given["attitude"] < 175.0 or min(given.values()) < 0.0:
+        raise InputError(
+            f"the displacements are {shown(given)}; expected values of 0 or more, and an "
+            "attitude below 175 deg, because the chart ends at 180 deg"
+        )
+    if max(given.values()) > _FARTHEST:
+        raise InputError(
+            f"the displacements are {shown(given)}; expected at most {_FARTHEST:g}; give smaller "
+            "ones"
+        )
+    groups = {name.partition(".")[0] for name in lin.state_names}
+    names = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}
+    largest = {key: given[key] if name in groups else 0.0 for key, name in names.items()}
+    if not any(largest.values()):
+        raise InputError(
+            "no state of the model is displaced; give a nonzero displacement of one of its states"
+        )
+    return largest
+
+
+def _scaled(largest: dict[str, float], level: float) -> dict[str, float]:
+    """Return a share of a displacement."""
+    return {key: level * value for key, value in largest.items()}
+
+
+def joint_unit(lin: LinearModel) -> str:
+    """Return the unit of the joints, "rad|m" where some turn and others slide."""
+    pairs = zip(lin.state_names, lin.state_units, strict=True)
+    of = {unit for name, unit in pairs if name.startswith("q_m.")}
+    return of.pop() if len(of) == 1 else "rad|m"
+
+
+def shown(displacement: dict[str, float], of_joints: str = "rad|m") -> str:
+    """Say in words what of a displacement is not zero."""
+    units = {"attitude": "deg", "position": "m", "joint": of_joints}
+    words = [f"{displacement[key]:.3g} {unit}" for key, unit in units.items() if displacement[key]]
+    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:]))) or "0"

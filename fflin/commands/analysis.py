@@ -1,26 +1,31 @@
-"""The commands `analyze`, `modes`, `validity`, `sensitivity` and `uncertain`."""
+"""The commands `analyze`, `modes`, `sensitivity` and `uncertain`."""
 
 from __future__ import annotations
 
 import argparse
-from contextlib import nullcontext
+import warnings
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinWarning, InputError
 from fflin.base.tables import counted, headed
 from fflin.commands import DONE
 from fflin.commands.arguments import (
+    OUTPUT,
+    POINT,
     Commands,
-    add_options,
+    add,
     add_output_file,
     add_point,
     add_robot,
     add_system,
+    assignment,
     command,
+    count_of,
+    group_of,
     number,
+    output_file,
 )
 from fflin.commands.points import linear_model, load_robot, once, placed
-from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.tracking import say
 from fflin.commands.visual import add_figure, check_figure, draw
 
@@ -29,81 +34,86 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: Commands) -> None:
-    """Add analyze, modes, validity, sensitivity and uncertain."""
+    """Add analyze, modes, sensitivity and uncertain."""
     analyze = command(
-        *(commands, "analyze", _analyze),
+        commands,
+        "analyze",
+        _analyze,
         "show controllability, conserved momenta, modes and observability of a linear model",
-        "fflin analyze servicer_7dof --stiffness panel_left=100 --output joints",
+        example="fflin analyze servicer_7dof --stiffness panel_left=100 --output joints",
+        common="joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
+        "frame plot",
     )
     add_point(analyze)
     add_figure(analyze, "plot the modes")
     modes = command(
-        *(commands, "modes", _modes),
+        commands,
+        "modes",
+        _modes,
         "show natural frequencies, damping ratios, kinetic energies and effective masses",
-        "fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100",
+        example="fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100",
+        common="joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
+        "frame plot html",
     )
     add_point(modes)
     add_figure(modes, "plot frequencies, damping and shapes")
-    add_options(modes, "--html >FILE: write a page that plays the mode shapes")
-    validity = command(
-        *(commands, "validity", _validity),
-        "measure how far the robot can be displaced until the linear model or its regulator fails",
-        "fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
-    )
-    add_point(validity)
-    add_weights(validity)
-    add_options(
-        validity,
-        """
-        --attitude X = 90: largest rotation of the base [deg]; 90 by default
-        --offset X = 0.5: largest displacement of the base [m]; 0.5 by default
-        --spread X = 1: largest displacement of a joint [rad|m]; 1 by default
-        --samples N = 100: number of random runs; 100 by default
-        --seed S = 0: random seed of the runs; 0 by default
-        --jobs N = 1: number of processes, at most one for each core; 1 by default
-        --limits urdf|none = none: saturate the inputs at the limits of the robot (urdf), or never
-            (none, default)""",
-    )
-    frames = """--frames hybrid|local|world: also test the loop with base velocities and inputs in
-        these axes"""
-    add_options(validity, frames, nargs="+", default=())
-    add_figure(validity, "plot the results")
+    pages = group_of(modes, OUTPUT)
+    add(pages, "--html", "write a page that plays the mode shapes", output_file)
+    _add_sensitivity(commands)
+    _add_uncertain(commands)
+
+
+def _add_sensitivity(commands: Commands) -> None:
     sensitivity = command(
-        *(commands, "sensitivity", _sensitivity),
+        commands,
+        "sensitivity",
+        _sensitivity,
         "show or save the derivatives of A and B with respect to masses, springs, thrusters ...",
-        "fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
+        example="fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
+        common="joint rpy velocity equilibrium inputs frame dt top only output-file",
     )
     add_point(sensitivity)
-    add_options(sensitivity, "--dt H: differentiate the sampled model, with inputs held for H [s]")
-    add_options(
-        sensitivity, "--top N = 15: show the N parameters with the largest effect; 15 by default"
+    model = group_of(sensitivity, "derivatives")
+    add(model, "--dt", "differentiate the sampled model, with inputs held for H [s]", number, "H")
+    top = "show the N parameters with the largest effect"
+    add(model, "--top", top, count_of, default=15)
+    add(
+        model,
+        "--only",
+        "show only the parameters of this kind, link or pattern, such as mass, link_3, *.density",
+        metavar="NAME",
     )
-    add_options(
-        sensitivity,
-        "--only NAME: show only the parameters of this kind, link or pattern, such as mass, "
-        "link_3, *.density",
-    )
-    add_output_file(
-        sensitivity,
-        "save dA, dB, df0 for each parameter to FILE: .npz, .mat or .json",
-        "Sensitivity",
-    )
+    what = "save dA, dB, df0 for each parameter to FILE: .npz, .mat or .json"
+    add_output_file(group_of(sensitivity, OUTPUT), what, "Sensitivity")
+
+
+def _add_uncertain(commands: Commands) -> None:
     uncertain = command(
-        *(commands, "uncertain", _uncertain),
+        commands,
+        "uncertain",
+        _uncertain,
         "show or save the exact linear-fractional model (LFT) at rest for uncertain parameters",
-        "fflin uncertain servicer_7dof --vary base.mass=0.2 --vary panel_left.stiffness=80:120 "
-        "-o uncertain.mat",
+        example="fflin uncertain servicer_7dof --vary base.mass=0.2 "
+        "--vary panel_left.stiffness=80:120 -o uncertain.mat",
     )
+    point = group_of(uncertain, POINT)
+    neutral = "position of a joint [rad|m]; by default as in robot.toml, else neutral"
+    add(point, "--joint", neutral, assignment, repeatable=True)
     add_robot(uncertain)
-    add_options(uncertain, "--joint NAME=VALUE*: position of a joint [rad|m]; default: neutral")
-    add_system(uncertain, axes=False)
-    vary = """--vary NAME=RANGE*: range of a parameter named by `fflin sensitivity`, or of all
-        parameters that match a pattern: a fraction of the nominal value, such as 0.2, or
-        LEAST:LARGEST. With RANGE,tied all parameters of the pattern share one delta"""
-    add_options(uncertain, vary, type=_range, required=True)
-    add_output_file(
-        uncertain, "save A, B1 .. D22 and the blocks to FILE: .npz, .mat or .json", "LFT"
+    add_system(uncertain)
+    add(
+        group_of(uncertain, "parameters"),
+        "--vary",
+        "range of a parameter named by `fflin sensitivity`, or of all parameters that match a "
+        "pattern: a fraction of the nominal value, such as 0.2, or LEAST:LARGEST. With RANGE,tied "
+        "all parameters of the pattern share one delta",
+        _range,
+        "NAME=RANGE",
+        repeatable=True,
+        required=True,
     )
+    what = "save A, B1 .. D22 and the blocks to FILE: .npz, .mat or .json"
+    add_output_file(group_of(uncertain, OUTPUT), what, "LFT")
 
 
 def _range(text: str) -> tuple[str, Any]:
@@ -119,9 +129,8 @@ def _range(text: str) -> tuple[str, Any]:
 
 
 def _analyze(arguments: argparse.Namespace) -> int:
-    from fflin.analysis.controllability import controllability
+    from fflin.analysis.controllability import controllability, observability
     from fflin.analysis.modes import modes
-    from fflin.analysis.observability import observability
 
     check_figure(arguments.plot)
     _, lin = linear_model(arguments)
@@ -171,7 +180,7 @@ def _modes(arguments: argparse.Namespace) -> int:
 
 
 def _momentum(lin: LinearModel) -> str:
-    from fflin.analysis.momentum import momentum_reduction
+    from fflin.analysis.reduction import momentum_reduction
     from fflin.base.tables import folded
 
     try:
@@ -196,45 +205,6 @@ def _momentum(lin: LinearModel) -> str:
     return folded(text.splitlines())
 
 
-_FREE = "as large as it takes; --limits urdf cuts them"
-
-
-def _validity(arguments: argparse.Namespace) -> int:
-    from fflin.base.progress import Progress
-    from fflin.batch.workers import OwnWorkers
-    from fflin.campaign.validity import validity
-
-    robot, lin = linear_model(arguments)
-    check_figure(arguments.plot)
-    lin = regulated_part(lin, arguments)
-    gain = gain_of(lin, arguments)
-    judged = lin.discretize(arguments.dt) if arguments.dt else lin
-    bar, cut = Progress(), arguments.limits == "urdf"
-    try:
-        with OwnWorkers(arguments.jobs) if arguments.jobs > 1 else nullcontext() as executor:
-            found = validity(
-                robot,
-                judged,
-                gain,
-                attitude=arguments.attitude,
-                position=arguments.offset,
-                joint=arguments.spread,
-                samples=arguments.samples,
-                seed=arguments.seed,
-                frames=arguments.frames,
-                limits="urdf" if cut else None,
-                executor=executor,
-                progress=bar.update,
-            )
-    finally:
-        bar.close()
-    print(headed("validity", str(found)))
-    if cut or any(name in lin.limits for name in lin.input_names):
-        print("inputs were " + ("cut to the limits of the robot" if cut else _FREE))
-    draw(arguments.plot, "plot_validity", found)
-    return DONE
-
-
 def _sensitivity(arguments: argparse.Namespace) -> int:
     from fflin.uncertainty.sensitivity import sensitivity
 
@@ -245,9 +215,14 @@ def _sensitivity(arguments: argparse.Namespace) -> int:
 
 
 def _uncertain(arguments: argparse.Namespace) -> int:
+    from fflin.dynamics.points import base_of
     from fflin.uncertainty.uncertain import uncertain
 
     robot, ranges = load_robot(arguments), once("--vary", arguments.vary)
-    lft = uncertain(robot, ranges).lft(placed(robot, "--joint", arguments.joint))
+    if robot.point.get("velocity"):
+        text = "uncertain is about rest; the velocity of [point] is ignored"
+        warnings.warn(text, FflinWarning, stacklevel=2)
+    base, joints = base_of(robot.point), robot.point.get("joints")
+    lft = uncertain(robot, ranges).lft(placed(robot, "--joint", arguments.joint, base, joints))
     say("uncertain", lft, arguments)
     return DONE

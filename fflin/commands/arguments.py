@@ -1,18 +1,22 @@
-"""Options that commands share: robot, operating point, system; parsers of their values."""
+"""Options of commands: parsers of their values, and the options that several commands share."""
 
 from __future__ import annotations
 
 import argparse
+import copy
 import math
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
-_OPTION = re.compile(r"--(\[no-\])?([\w-]+)(?: (\S+?)([*!])?(?: = (\S+))?)?: (.+)")
-
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 Container: TypeAlias = "argparse._ActionsContainer"
+
+# Titles of groups of options in the help. Those of ROBOT repeat settings of a robot.toml.
+POINT, ROBOT, OUTPUT = "operating point", "robot, in place of robot.toml", "output"
+TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 
 
 def number(text: str) -> float:
@@ -65,7 +69,7 @@ def assignment(text: str) -> tuple[str, float]:
     return name, number(value)
 
 
-def passive(text: str) -> tuple[str | None, float | str]:
+def joint_or_all(text: str) -> tuple[str | None, float | str]:
     """Read NAME=VALUE, or VALUE or urdf for all joints (name None)."""
     if "=" in text:
         return assignment(text)
@@ -83,13 +87,16 @@ def lock(text: str) -> tuple[str, float | None]:
     return assignment(text) if "=" in text else (text, None)
 
 
-_READ: dict[str, Callable[[str], Any]] = {
-    **dict.fromkeys(("FILE", "FILE.npz"), input_file),
-    **{"FILE.toml": input_name, ">FILE": output_file},
-    **dict.fromkeys(("T", "H", "P", "X", "FPS", "SPEED"), number),
-    **{"N": count_of, "S": whole, "K": whole, "[NAME=]VALUE": passive, "NAME[=VALUE]": lock},
-    "ALTITUDE[:BODY]": orbit,
-    **dict.fromkeys(("NAME=VALUE", "NAME=W"), assignment),
+_REPEATABLE = " (repeatable)"
+_METAVARS: dict[Any, str] = {
+    input_file: "FILE",
+    output_file: "FILE",
+    input_name: "FILE.toml",
+    assignment: "NAME=VALUE",
+    joint_or_all: "[NAME=]VALUE",
+    lock: "NAME[=VALUE]",
+    orbit: "ALTITUDE[:BODY]",
+    count_of: "N",
 }
 
 
@@ -98,17 +105,106 @@ def command(
     name: str,
     run: Callable[[argparse.Namespace], int],
     summary: str,
+    *,
     example: str,
+    common: str = "",
 ) -> argparse.ArgumentParser:
-    """Add a command; its help ends with `example`."""
+    """Add a command.
+
+    Its help ends with `example`. ``--help`` lists the `common` options, by default all options.
+    """
     command: argparse.ArgumentParser = commands.add_parser(
         name,
+        add_help=False,
         help=summary,
         description=f"{summary[0].upper()}{summary[1:]}.",
         epilog=f"example: {example}",
     )
-    command.set_defaults(run=run, command=command)
+    about = "show the common options; --help all describes every option"
+    command.add_argument("-h", "--help", nargs="?", metavar="all", action=_Help, help=about)
+    command.set_defaults(run=run, command=command, common=common.split())
     return command
+
+
+class _Help(argparse.Action):
+    """Option that prints the short help, or the full help if its value is `all`."""
+
+    def __call__(self, parser: argparse.ArgumentParser, _: Any, value: Any, *__: Any) -> None:
+        text = parser.format_help() if value == "all" else short_help(parser)
+        parser._print_message(text, sys.stdout)
+        parser.exit()
+
+
+def short_help(command: argparse.ArgumentParser) -> str:
+    """Return the help of a command with the first sentence about each common option."""
+    arguments = [each for each in command._actions if not each.option_strings]
+    options = {each.dest: each for each in command._actions if each.option_strings}
+    del options["help"]
+    common = [name.replace("-", "_") for name in command.get_default("common")] or list(options)
+    formatter = argparse.HelpFormatter(command.prog, max_help_position=30)
+    operands = " ".join(str(each.metavar) for each in arguments)
+    formatter.add_text(" ".join(f"usage: {command.prog} {operands} [options]".split()))
+    formatter.add_text(command.description)
+    for title, actions in (
+        ("arguments", arguments),
+        ("options", [options[name] for name in common]),
+    ):
+        formatter.start_section(title)
+        for action in actions:
+            shown, text = copy.copy(action), action.help or ""
+            first = re.split(r"; |(?<!\.)\. ", text.removesuffix(_REPEATABLE))[0]
+            shown.help = first + _REPEATABLE * text.endswith(_REPEATABLE)
+            formatter.add_argument(shown)
+        formatter.end_section()
+    formatter.add_text(command.epilog)
+    if options:
+        formatter.add_text(f"all {len(options)} options in full: {command.prog} --help all")
+    return formatter.format_help()
+
+
+def group_of(command: argparse.ArgumentParser, title: str) -> Container:
+    """Return the group of options with this title; the first call creates it."""
+    groups = (group for group in command._action_groups if group.title == title)
+    return next(groups, None) or command.add_argument_group(title)
+
+
+def add(
+    group: Container,
+    name: str,
+    help: str,
+    type: Callable[[str], Any] = str,
+    metavar: str | tuple[str, ...] | None = None,
+    *,
+    default: Any = None,
+    repeatable: bool = False,
+    **more: Any,
+) -> None:
+    """Add an option with a value.
+
+    A tuple `metavar` takes as many values. The help states the default of a number.
+    """
+    if repeatable:
+        more |= {"action": "append", "default": []}
+        help += _REPEATABLE
+    else:
+        more["default"] = default
+    if default is not None and type in (number, whole, count_of):
+        help = f"{help}; {default:g} by default"
+    if isinstance(metavar, tuple):
+        more["nargs"] = len(metavar)
+    if "choices" not in more or metavar:
+        more["metavar"] = metavar or _METAVARS.get(type)
+    group.add_argument(name, help=help, type=type, **more)
+
+
+def switch(group: Container, name: str, help: str) -> None:
+    """Add an option without a value."""
+    group.add_argument(name, help=help, action="store_true")
+
+
+def yes_or_no(group: Container, name: str, help: str) -> None:
+    """Add the options --NAME and --no-NAME; the value is None without them."""
+    group.add_argument(name, help=help, action=argparse.BooleanOptionalAction)
 
 
 def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[Path]]:
@@ -121,149 +217,178 @@ def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[Path]]:
     return given[input_file] + given[input_name], given[output_file]
 
 
-def add_options(group: Container, text: str, **more: Any) -> None:
-    """Add options; each is a line ``--name METAVAR: help`` with its continuation lines.
-
-    A metavar in _READ selects the parser of the value, a|b lists the choices, and X,Y are numbers.
-    FILE is an input file and >FILE an output file. A suffix ``*`` marks a repeatable option, ``!``
-    a required one, and ``= default`` gives the default. An option without a metavar is a switch;
-    ``--[no-]x`` can be switched on and off. `more` applies to all options of the text.
-    """
-    for line in re.split(r"\n\s*(?=--)", text.strip()):
-        found = _OPTION.fullmatch(" ".join(line.split()))
-        assert found, line
-        both, name, metavar, many, default, said = found.groups()
-        options: dict[str, Any] = {"help": said + " (repeatable)" * (many == "*"), **more}
-        if not metavar:
-            options["action"] = argparse.BooleanOptionalAction if both else "store_true"
-        elif "|" in metavar:
-            options["choices"] = metavar.split("|")
-        elif "," in metavar:
-            options |= {"metavar": (each := tuple(metavar.split(","))), "nargs": len(each)}
-            options["type"] = number
-        else:
-            kind = _READ.get(metavar, str)
-            options = {"metavar": metavar.lstrip(">"), "type": kind} | options
-        if many == "*":
-            options |= {"action": "append", "default": []}
-        if many == "!":
-            options["required"] = True
-        if default:
-            options["default"] = options.get("type", str)(default)
-        group.add_argument(f"--{name}", **options)
-
-
 def add_robot(command: argparse.ArgumentParser) -> None:
     """Add ROBOT and --lock."""
     what = "name of a robot in `fflin robots`, or path of a URDF or of a robot.toml"
     command.add_argument("robot", metavar="ROBOT", type=input_name, help=what)
-    add_options(
-        command,
-        """
-        --lock NAME[=VALUE]*: lock a joint at VALUE [rad|m], or at its neutral position; NAME may
-            be a pattern such as 'hinge_*', here and in the options below""",
+    add(
+        group_of(command, ROBOT),
+        "--lock",
+        "lock a joint at VALUE [rad|m], or at its neutral position; NAME may be a pattern such as "
+        "'hinge_*', here and in all other options",
+        lock,
+        repeatable=True,
     )
 
 
 def add_point(command: argparse.ArgumentParser) -> None:
     """Add the robot and the options of its operating point."""
+    point = group_of(command, POINT)
     add_robot(command)
-    add_pose(command)
+    add_pose(point)
+    add_inputs_there(point)
     add_system(command)
-    add_inputs_there(command)
-    add_reference(command)
+    add_frame(point)
+    add_reference(point)
 
 
-def add_reference(command: argparse.ArgumentParser) -> None:
-    """Add the option for the reference of attitude and position."""
-    add_options(
-        command,
-        """
-        --reference base|world = base: reference of attitude and position in the state: the base
-            pose of the operating point (default), or the world""",
-    )
-
-
-def add_pose(command: Container) -> None:
+def add_pose(group: Container) -> None:
     """Add the options for the configuration and velocity of the robot."""
-    add_options(
-        command,
-        """
-        --joint NAME=VALUE*: position of a joint [rad|m]; other joints are at their neutral
-            position
-        --rpy R,P,Y: base attitude: roll, pitch, yaw [deg] about fixed axes
-        --position X,Y,Z: base position [m]
-        --velocity NAME=VALUE*: velocity of a joint or wheel [rad/s|m/s], or omega_b.x ... v_b.z of
-            the base in base axes""",
+    add(
+        group,
+        "--joint",
+        "position of a joint [rad|m]; other joints are as in robot.toml, or at their neutral "
+        "position",
+        assignment,
+        repeatable=True,
+    )
+    rpy = "base attitude: roll, pitch, yaw [deg] about fixed axes"
+    add(group, "--rpy", rpy, number, ("R", "P", "Y"))
+    add(group, "--position", "base position [m]", number, ("X", "Y", "Z"))
+    add(
+        group,
+        "--velocity",
+        "velocity of a joint or wheel [rad/s|m/s], or omega_b.x ... v_b.z of the base in base axes",
+        assignment,
+        repeatable=True,
     )
 
 
-def add_inputs_there(command: Container) -> None:
+def add_inputs_there(group: Container) -> None:
     """Add the options for the inputs at the operating point."""
-    add_options(
-        command,
-        """
-        --effort NAME=VALUE*: input at the operating point, by its name in u, such as
-            tau_m.joint_1
-        --equilibrium: apply the minimum-norm inputs that balance springs, gravity and the inertial
-            forces of a steady motion at the operating point. Passive joints sag on their springs.
-            If no inputs hold the point, the command reports an error""",
+    add(
+        group,
+        "--effort",
+        "input at the operating point, by its name in u, such as tau_m.joint_1",
+        assignment,
+        repeatable=True,
     )
-    text = """--relative-equilibrium N: in orbit, use the N-th (default: first) of the 24 attitudes
-        without gravity-gradient torque, and the inputs that --equilibrium computes. Attitude
-        and position in the state are relative to this pose"""
-    add_options(command, text, nargs="?", const=1, choices=range(1, 25))
+    switch(
+        group,
+        "--equilibrium",
+        "apply the minimum-norm inputs that balance springs, gravity and the inertial forces of a "
+        "steady motion at the operating point. Passive joints sag on their springs. If no inputs "
+        "hold the point, the command reports an error",
+    )
+    add(
+        group,
+        "--relative-equilibrium",
+        "in orbit, use the N-th (default: first) of the 24 attitudes without gravity-gradient "
+        "torque, and the inputs that --equilibrium computes. Attitude and position in the state "
+        "are relative to this pose",
+        count_of,
+        "N",
+        nargs="?",
+        const=1,
+        choices=range(1, 25),
+    )
 
 
-def add_orbit(command: Container) -> None:
+def add_reference(group: Container) -> None:
+    """Add the option for the reference of attitude and position."""
+    add(
+        group,
+        "--reference",
+        "reference of attitude and position in the state: the base pose of the operating point "
+        "(default), or the world",
+        choices=("base", "world"),
+        default="base",
+    )
+
+
+def add_frame(group: Container) -> None:
+    """Add the option for the axes of velocities and wrenches."""
+    add(
+        group,
+        "--frame",
+        "axes of velocities and wrenches. hybrid (default): angular parts in base axes, linear "
+        "parts in reference axes; local: all in base axes; world: all in reference axes. For a "
+        "robot in orbit, the axes are as in hybrid, and the orbital frame is the world. lvlh "
+        "(default): x along the orbit, y opposite to the orbit normal, z towards the central body; "
+        "hill: x away from the central body, y along the orbit, z along the orbit normal",
+        choices=("hybrid", "local", "world", "lvlh", "hill"),
+    )
+
+
+def add_orbit(group: Container) -> None:
     """Add --orbit."""
-    add_options(
-        command,
-        """
-        --orbit ALTITUDE[:BODY]: circular orbit at an altitude [m] above the earth (default), moon,
-            mars ...; the world is then the frame of the orbit""",
+    add(
+        group,
+        "--orbit",
+        "circular orbit at an altitude [m] above the earth (default), moon, mars ...; the world is "
+        "then the frame of the orbit",
+        orbit,
     )
 
 
-def add_system(command: Container, *, axes: bool = True) -> None:
-    """Add the options for forces, inputs, outputs and the axes of velocities."""
-    add_orbit(command)
-    add_options(
-        command,
-        """
-        --stiffness [NAME=]VALUE*: stiffness of a joint [N m/rad|N/m], or one value for all joints
-        --damping [NAME=]VALUE*: damping of a joint [N m s/rad|N s/m], or one value for all joints;
-            `urdf` uses the damping in the URDF
-        --gravity X,Y,Z: uniform gravity in world axes [m/s^2]; zero by default
-        --passive NAME*: treat this joint as having no motor: the default inputs omit its torque
-        --inputs FILE.toml: inputs of the robot: a file for fflin.load_inputs, a bundled name,
-            `joints` (joint torques only) or `base` (base torque and force only). The default is
-            the inputs of robot.toml, or base torque, base force and all joint torques
-        --output SPEC*: outputs of the model: state (default), base, joints, rates, joints:NAME,
-            rates:NAME (a joint or a pattern), com, momentum, frame:NAME (pose and velocity),
-            pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (NAME
-            relative to frame TO)""",
+def add_system(command: argparse.ArgumentParser) -> None:
+    """Add the options for forces, inputs and outputs, which robot.toml may set too."""
+    group = group_of(command, ROBOT)
+    add_orbit(group)
+    add(
+        group,
+        "--stiffness",
+        "stiffness of a joint [N m/rad|N/m], or one value for all joints",
+        joint_or_all,
+        repeatable=True,
     )
-    frame = """
-        --frame hybrid|local|world|lvlh|hill: axes of velocities and wrenches. hybrid (default):
-            angular parts in base axes, linear parts in reference axes; local: all in base axes;
-            world: all in reference axes. For a robot in orbit, the axes are as in hybrid, and the
-            orbital frame is the world. lvlh (default): x along the orbit, y opposite to the orbit
-            normal, z towards the central body; hill: x away from the central body, y along the
-            orbit, z along the orbit normal"""
-    if axes:
-        add_options(command, frame)
+    add(
+        group,
+        "--damping",
+        "damping of a joint [N m s/rad|N s/m], or one value for all joints; `urdf` uses the "
+        "damping in the URDF",
+        joint_or_all,
+        repeatable=True,
+    )
+    gravity = "uniform gravity in world axes [m/s^2]; zero by default"
+    add(group, "--gravity", gravity, number, ("X", "Y", "Z"))
+    add(
+        group,
+        "--passive",
+        "treat this joint as having no motor: the default inputs omit its torque",
+        metavar="NAME",
+        repeatable=True,
+    )
+    add(
+        group,
+        "--inputs",
+        "inputs of the robot: a file for fflin.load_inputs, a bundled name, `joints` (joint "
+        "torques only) or `base` (base torque and force only). The default is the inputs of "
+        "robot.toml, or base torque, base force and all joint torques",
+        input_name,
+    )
+    add(
+        group,
+        "--output",
+        "outputs of the model: state (default), base, joints, rates, joints:NAME, rates:NAME (a "
+        "joint or a pattern), com, momentum, frame:NAME (pose and velocity), pose:NAME, "
+        "velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (NAME relative to "
+        "frame TO)",
+        metavar="SPEC",
+        repeatable=True,
+    )
 
 
-def add_output_file(command: Container, what: str, *kinds: str) -> None:
+def add_output_file(group: Container, what: str, *kinds: str) -> None:
     """Add -o FILE with the help `what`, which lists the endings.
 
     With the `kinds` of results that are written there, add --force too; see `require_own_kind`.
     """
-    command.add_argument("-o", "--output-file", metavar="FILE", type=output_file, help=what)
+    group.add_argument("-o", "--output-file", metavar="FILE", type=output_file, help=what)
     if kinds:
-        add_options(
-            command,
-            "--force: allow -o to replace a file that does not contain the same kind of result",
+        switch(
+            group,
+            "--force",
+            "allow -o to replace a file that does not contain the same kind of result",
         )
-        command.set_defaults(kinds=kinds)
+        group.set_defaults(kinds=kinds)

@@ -10,27 +10,39 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NoReturn
 
-from fflin.base.errors import FflinError, FflinWarning, one_line
-from fflin.base.version import __version__
-from fflin.base.writing import files_of_command
+from fflin.base import __version__
+from fflin.base.errors import FflinError, FflinWarning, FileError, one_line
+from fflin.base.writing import files_of_command, place
 from fflin.commands import BAD_INPUT, DONE
 from fflin.commands.arguments import files_of
-from fflin.commands.kinds import require_own_kind
 
 # The commands by task, in the order of the help, each with its module.
 TASKS = {
-    "inspect robots": {"robots": "models", "info": "models", "init": "init", "view": "visual"},
+    "inspect robots": {"robots": "models", "info": "models", "init": "models", "view": "visual"},
     "make and check a linear model": {"linearize": "models", "check": "models"},
     "analyse a model": {
-        **dict.fromkeys(("analyze", "modes", "validity", "sensitivity", "uncertain"), "analysis"),
-        "funnel": "funnels",
+        **{"analyze": "analysis", "modes": "analysis", "validity": "regions"},
+        **{"sensitivity": "analysis", "uncertain": "analysis", "funnel": "regions"},
     },
-    "design and simulate": {"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
+    "design and simulate": {
+        **{"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
+        "export": "export",
+    },
     "many models or simulations": {"sweep": "sweeps", "montecarlo": "montecarlo"},
 }
 _MODULES = {name: module for names in TASKS.values() for name, module in names.items()}
+
+
+# The entries by which a result is known whose file does not name its kind.
+_ENTRIES = {
+    "Sensitivity": {"urdf_sha256", "dA", "dB"},
+    "LinearModel": {"urdf_sha256", "certificate"},
+    "LinearBatch": {"header", "B_lower"},
+    "Campaign": {"header", "drawn"},
+}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -122,3 +134,56 @@ def _parser(asked: str) -> argparse.ArgumentParser:
         group = parser.add_argument_group(task)._group_actions
         group += [left[name] for name in names if name in left]
     return parser
+
+
+def require_own_kind(arguments: argparse.Namespace) -> None:
+    """Raise `FileError` if -o names a file of a kind that the command does not write."""
+    path, kinds = getattr(arguments, "output_file", None), getattr(arguments, "kinds", ())
+    if path is None or not kinds or arguments.force:
+        return
+    if path.suffix == ".csv" and "LinearModel" in kinds:
+        from fflin.linear.files import foreign_table
+
+        path = foreign_table(path) or path
+        place(path)  # refuses a table that is an input file
+    if not path.is_file():
+        return
+    found = kind_of(path)
+    if found not in kinds and path.stat().st_size:
+        there = f"holds a {found}" if found else "exists and is not a result of fflin"
+        raise FileError(
+            f"{path} {there}; without --force this command replaces only files of kind "
+            f"{' or '.join(kinds)}. Name another file or add --force"
+        )
+
+
+def kind_of(path: Path) -> str:
+    """Return the name of the class whose result a file holds; "" if it is not known."""
+    try:
+        names, kind = _entries(path)
+    except Exception:  # each decoder has its own
+        return ""
+    return kind or next((name for name, of in _ENTRIES.items() if of <= names), "")
+
+
+def _entries(path: Path) -> tuple[set[str], str]:
+    """Return the names of a file's entries, and its kind where it has one."""
+    from fflin.base.record import decoded, text
+
+    entries: Any
+    if path.suffix == ".csv":
+        with path.open(encoding="utf-8") as file:
+            names = {*file.readline().strip().split(",")}
+        return names, "Motion" if {"t", "q_b.x"} <= names else ""
+    if path.suffix == ".h5":
+        from fflin.batch.files import hdf5
+
+        with hdf5().File(path, "r") as file:
+            return {*file, *file.attrs}, ""
+    if path.suffix == ".npz":
+        import numpy as np
+
+        with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
+            return {*entries.files}, text(entries["kind"]) if "kind" in entries.files else ""
+    entries, _ = decoded(path.suffix, path.read_bytes())  # `read_file` would make it an input
+    return {*entries}, text(entries["kind"]) if "kind" in entries else ""

@@ -8,14 +8,30 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.commands.arguments import (
+    CONTROLLER,
+    SIMULATION,
     Container,
+    add,
+    add_frame,
     add_inputs_there,
-    add_options,
     add_pose,
     add_robot,
     add_system,
+    assignment,
+    group_of,
+    input_file,
+    number,
+    switch,
+    yes_or_no,
 )
-from fflin.commands.points import attitude, configuration_of, held_at, once, placed, velocity_of
+from fflin.commands.points import (
+    attitude,
+    configuration_of,
+    held_at,
+    once,
+    refuse_pose,
+    velocity_of,
+)
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.tracking import add_trajectory, models_along, schedule_of
 
@@ -26,7 +42,7 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 _WEIGHTS = ("weights", "q", "r", "bryson", "dt")
-_GROUPS = "start", "target", "controller", "simulation", "robot"
+_POSE = ("target_rpy", "target_position")
 _TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
 
 
@@ -48,7 +64,7 @@ def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> 
 def refuse_law(arguments: argparse.Namespace) -> None:
     """Refuse the options of a regulator together with --free."""
     _refuse(arguments, ("limit", "delay"), "--free has no input to limit or delay")
-    names = (*_WEIGHTS, *_TARGETS[:2], "reduce", "allocate", "gain", "controller")
+    names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "reduce", "allocate", "gain", "controller")
     _refuse(
         arguments,
         names,
@@ -56,60 +72,111 @@ def refuse_law(arguments: argparse.Namespace) -> None:
     )
 
 
-def add_loop(command: argparse.ArgumentParser) -> Container:
-    """Add the options of the loop; return the group of simulation options."""
+def add_loop(command: argparse.ArgumentParser) -> None:
+    """Add the options of the loop."""
     add_robot(command)
-    start, goal, law, run, system = map(command.add_argument_group, _GROUPS)
-    add_system(system)
+    start, goal = group_of(command, "start"), group_of(command, "target")
     add_pose(start)
-    add_options(
+    add(
         start,
-        """
-        --offset NAME=VALUE*: initial error relative to the start of the trajectory, in base axes.
-            NAME is a state, group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw
-            [deg]""",
+        "--offset",
+        "initial error relative to the start of the trajectory, in base axes. NAME is a state, "
+        "group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]",
+        assignment,
+        repeatable=True,
     )
-    add_options(
+    add(
         goal,
-        """
-        --target-joint NAME=VALUE*: target position of a joint [rad|m]; the target of other
-            joints is their neutral position, and the target of the base is the world's origin
-        --target-velocity NAME=VALUE*: target velocity, such as the speed of a wheel. It is also the
-            initial velocity unless --velocity is given""",
+        "--target-joint",
+        "target position of a joint [rad|m]; by default [target] of robot.toml, then its [point], "
+        "then the neutral position",
+        assignment,
+        repeatable=True,
+    )
+    rpy = "target attitude of the base: roll, pitch, yaw [deg] about fixed axes"
+    add(goal, "--target-rpy", rpy, number, ("R", "P", "Y"))
+    add(goal, "--target-position", "target position of the base [m]", number, ("X", "Y", "Z"))
+    add(
+        goal,
+        "--target-velocity",
+        "target velocity, such as the speed of a wheel. It is also the initial velocity unless "
+        "--velocity is given",
+        assignment,
+        repeatable=True,
     )
     add_inputs_there(goal)
-    add_trajectory(goal)
-    add_weights(law)
-    add_options(
-        law,
-        """
-        --schedule FILE: follow the trajectory with the gains that tvlqr saved; without this option,
-            gains are designed along --trajectory
-        --gain FILE: use a gain that lqr saved, and regulate to the operating point for which this
-            gain was designed
-        --controller FILE: use a linear controller K with positive feedback, u - u0 = K (y - y0)
-            about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled.
-            y is set by --output
-        --negative-feedback: the controller assumes negative feedback, u - u0 = -K (y - y0)
-        --[no-]allocate: design with torque and force on the base, and allocate the nearest wrench
-            to the thrusters, which cannot pull. This is the default if the thrusters can push in
-            every direction. With --no-allocate, negative thrust is set to zero
-        --free: simulate without a regulator and without inputs
-        --limits urdf|none = urdf: saturate the inputs at the efforts of the URDF, at max and min of
-            the inputs and at wheel speeds (urdf, default), or at no limits except --limit (none)
-        --limit NAME=VALUE*: largest magnitude of an input, or of all inputs of a group such as
-            tau_m or a pattern. This value takes precedence over --limits
-        --delay T = 0: time [s] from a sample until its command acts; 0 by default""",
-    )
-    add_options(
+    add_trajectory(command)
+    add_weights(command)
+    _add_controllers(group_of(command, CONTROLLER))
+    run = group_of(command, SIMULATION)
+    add(
         run,
-        """
-        --duration T: duration [s]; by default the duration of the trajectory, or the settling time
-            of the linear loop, between 60 and 600 s
-        --step H: integration step [s]; chosen automatically by default
-        --method METHOD = cf4: integrator: cf4 (default), rkmk4 or semi_implicit_euler""",
+        "--duration",
+        "duration [s]; by default the duration of the trajectory, or the settling time of the "
+        "linear loop, between 60 and 600 s",
+        number,
+        "T",
     )
-    return run
+    add(run, "--step", "integration step [s]; chosen automatically by default", number, "H")
+    methods = "integrator: cf4 (default), rkmk4 or semi_implicit_euler"
+    add(run, "--method", methods, metavar="METHOD", default="cf4")
+    add_system(command)
+    add_frame(run)
+
+
+def _add_controllers(group: Container) -> None:
+    add(
+        group,
+        "--schedule",
+        "follow the trajectory with the gains that tvlqr saved; without this option, gains are "
+        "designed along --trajectory",
+        input_file,
+    )
+    add(
+        group,
+        "--gain",
+        "use a gain that lqr saved, and regulate to the operating point for which this gain was "
+        "designed",
+        input_file,
+    )
+    add(
+        group,
+        "--controller",
+        "use a linear controller K with positive feedback, u - u0 = K (y - y0) about the target: "
+        ".mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled. y is set by --output",
+        input_file,
+    )
+    switch(
+        group,
+        "--negative-feedback",
+        "the controller assumes negative feedback, u - u0 = -K (y - y0)",
+    )
+    yes_or_no(
+        group,
+        "--allocate",
+        "design with torque and force on the base, and allocate the nearest wrench to the "
+        "thrusters, which cannot pull. This is the default if the thrusters can push in every "
+        "direction. With --no-allocate, negative thrust is set to zero",
+    )
+    switch(group, "--free", "simulate without a regulator and without inputs")
+    add(
+        group,
+        "--limits",
+        "saturate the inputs at the efforts of the URDF, at max and min of the inputs and at wheel "
+        "speeds (urdf, default), or at no limits except --limit (none)",
+        choices=("urdf", "none"),
+        default="urdf",
+    )
+    add(
+        group,
+        "--limit",
+        "largest magnitude of an input, or of all inputs of a group such as tau_m or a pattern. "
+        "This value takes precedence over --limits",
+        assignment,
+        repeatable=True,
+    )
+    delay = "time [s] from a sample until its command acts"
+    add(group, "--delay", delay, number, "T", default=0.0)
 
 
 def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
@@ -149,23 +216,32 @@ def start_of(
     robot: Robot, arguments: argparse.Namespace, reference: Any = None
 ) -> tuple[Array, Array | None]:
     """Return the initial q (nq,) and v (nv,) of the arguments or of the robot."""
-    q = configuration_of(robot, arguments, robot.start)
-    if number := arguments.relative_equilibrium:
+    from fflin.base.names import rates_by_name
+    from fflin.robot.fields import combined
+
+    point, number = robot.point, arguments.relative_equilibrium
+    if number:  # the start is relative to this pose, which replaces the pose of the point
+        point = {part: point[part] for part in ("joints", "velocity") if part in point}
+    rates = rates_by_name(robot.joint_names, once("--target-velocity", arguments.target_velocity))
+    state = combined(combined(point, {"velocity": rates}), robot.start)
+    q = configuration_of(robot, arguments, state)
+    if number:
         import pinocchio as pin
 
         about = reference or attitude(robot, q, number, arguments.frame)[1]
         q[:7] = pin.SE3ToXYZQUAT(about * pin.XYZQUATToSE3(q[:7]))
-    names = ("target_velocity", "velocity")
-    return q, velocity_of(robot, arguments, *names, start=robot.start)
+    return q, velocity_of(robot, arguments, state, "velocity")
 
 
 def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, LinearModel | None]:
     """Return the policy, its feedback, and the model that predicts every row."""
     from fflin.control.linear_controller import LinearController
-    from fflin.control.policies import Allocation, StateFeedback, thrusters_push_every_way
+    from fflin.control.policies import Allocation, StateFeedback, thrusters_give_every_wrench
 
     gain: Any = None
-    allocate = thrusters_push_every_way(robot) if arguments.allocate is None else arguments.allocate
+    allocate = (
+        thrusters_give_every_wrench(robot) if arguments.allocate is None else arguments.allocate
+    )
     if arguments.gain:
         from fflin.control.gain import Gain
 
@@ -202,7 +278,7 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
 
     _refuse(
         arguments,
-        ("free", "gain", "controller", "relative_equilibrium", *_TARGETS),
+        ("free", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS),
         "the trajectory defines the target",
     )
     poses = ("joint", "rpy", "position", "velocity")
@@ -245,18 +321,25 @@ def _require_own(schedule: Any, motion: Any, arguments: argparse.Namespace) -> N
 
 
 def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> LinearModel:
-    """Return the model about the operating point of a gain, with the base at its reference."""
+    """Return the model about the operating point of a gain.
+
+    If the gain is about its reference, the reference is the target pose of the base.
+    """
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
     from fflin.linear.fit import require_same
     from fflin.linear.linearization import linearize
 
-    made = f"{arguments.gain} is a gain of '{gain.robot}'"
+    made = f"{arguments.gain} was made for '{gain.robot}'"
     state, reference = StateMap(robot, frame=gain.frame), None
     for kind, there in (("state", state), ("input", Actuation(state))):
         own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")
         require_same(made, robot, kind, own, (there.names, there.units))
     q, v = state.to_pinocchio(gain.x0)
+    if gain.x0[:6].any():
+        _refuse(arguments, _POSE, "--gain contains the pose of the base")
+    else:
+        q[:7] = _target_of(robot, arguments)[0][:7]
     if number := arguments.relative_equilibrium:
         q, reference = attitude(robot, q, number, gain.frame)
     return linearize(robot, q, v, gain.u0, frame=gain.frame, reference=reference)
@@ -302,8 +385,17 @@ def _without_thrusters(robot: Robot) -> Robot:
 def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
     from fflin.linear.linearization import linearize
 
-    q = placed(robot, "--target-joint", arguments.target_joint)
-    v = velocity_of(robot, arguments, "target_velocity")
+    q, v = _target_of(robot, arguments)
     q, u, reference = held_at(robot, q, v, arguments)
     lin = linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
     return regulated_part(lin, arguments)
+
+
+def _target_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:
+    """Return q (nq,) and v (nv,) of the target, which is the point of the robot by default."""
+    from fflin.robot.fields import combined
+
+    refuse_pose(arguments, "target_")
+    state = combined(robot.point, robot.target)
+    q = configuration_of(robot, arguments, state, "target_")
+    return q, velocity_of(robot, arguments, state, "target_velocity")

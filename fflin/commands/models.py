@@ -1,25 +1,33 @@
-"""The commands `robots`, `info`, `linearize` and `check`."""
+"""The commands `robots`, `info`, `init`, `linearize` and `check`."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fflin.base.errors import FflinError, FflinWarning, InputError
+from fflin.base.errors import FflinError, FflinWarning, FileError, InputError
 from fflin.base.tables import headed
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
+    OUTPUT,
+    POINT,
     Commands,
-    add_options,
+    add,
     add_output_file,
     add_point,
+    add_pose,
     add_robot,
     add_system,
     command,
+    group_of,
+    input_name,
+    number,
+    switch,
 )
-from fflin.commands.points import linear_model, load_robot
+from fflin.commands.points import configuration_of, linear_model, load_robot, velocity_of
 from fflin.commands.tracking import add_trajectory, check_along, linearize_along
 from fflin.commands.visual import add_figure, check_figure, draw
 
@@ -28,49 +36,82 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: Commands) -> None:
-    """Add robots, info, linearize and check."""
-    command(
-        commands, "robots", _robots, "list the robots that can be loaded by name", "fflin robots"
-    )
+    """Add robots, info, init, linearize and check."""
+    summary = "list the robots that can be loaded by name"
+    command(commands, "robots", _robots, summary, example="fflin robots")
     info = command(
         commands,
         "info",
         _info,
-        "show tree, masses, limits and settings of a robot",
-        "fflin info servicer_7dof",
+        "show mass, inertia, wheels and thrusters at a point, and tree, limits and settings",
+        example="fflin info servicer_7dof",
     )
     add_robot(info)
-    add_system(info, axes=False)
+    add_pose(group_of(info, POINT))
+    add_system(info)
+    init = command(
+        commands,
+        "init",
+        _init,
+        "write a first robot.toml from a URDF: inputs, limits, joints without a motor",
+        example="fflin init my.urdf && fflin simulate my.toml",
+    )
+    urdf = "path of a URDF, or name of a robot in `fflin robots`"
+    init.add_argument("robot", metavar="URDF", type=input_name, help=urdf)
+    written = group_of(init, OUTPUT)
+    what = "output file; by default the URDF's name with the ending .toml, in the current folder"
+    add_output_file(written, what)
+    switch(written, "--force", "replace an existing file")
+    _add_linearize(commands)
+    _add_check(commands)
+
+
+def _add_linearize(commands: Commands) -> None:
     linearize = command(
-        *(commands, "linearize", _linearize),
+        commands,
+        "linearize",
+        _linearize,
         "show or save the linear model A, B, C, D about an operating point",
-        "fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat",
+        example="fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat",
+        common="joint rpy position velocity effort equilibrium frame reference inputs dt tool "
+        "trajectory output-file plot",
     )
     add_point(linearize)
-    add_options(linearize, "--dt H: sample the model, with inputs held for H [s]")
-    tools = "drake|mujoco|pinocchio|spart|euler|euler_rates"
-    add_options(
-        linearize,
-        f"--for {tools}: convert the model to the coordinates of this tool; needs -o FILE",
+    made = group_of(linearize, OUTPUT)
+    add(made, "--dt", "sample the model, with inputs held for H [s]", number, "H")
+    add(
+        made,
+        "--for",
+        "convert the model to the coordinates of this tool; needs -o FILE",
+        choices=("drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"),
         dest="tool",
     )
     add_trajectory(linearize)
     add_output_file(
-        *(linearize, "save to FILE: .npz, .mat, .json, or .csv (one per matrix: NAME.A.csv, ...)"),
-        *("LinearModel", "LinearTrajectory", "ToolModel"),
+        made,
+        "save to FILE: .npz, .mat, .json, or .csv (one per matrix: NAME.A.csv, ...)",
+        "LinearModel",
+        "LinearTrajectory",
+        "ToolModel",
     )
     add_figure(linearize, "plot the magnitudes of the entries of A and B")
+
+
+def _add_check(commands: Commands) -> None:
     check = command(
-        *(commands, "check", _check),
+        commands,
+        "check",
+        _check,
         "compare A and B with two independent computations; exit code 1 if they differ",
-        "fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
+        example="fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
+        common="joint rpy position velocity effort equilibrium frame reference inputs trajectory "
+        "tolerance plot",
     )
     add_point(check)
     add_trajectory(check)
-    add_options(
-        check,
-        "--tolerance X: relative tolerance of all errors; by default each error has its own",
-    )
+    shown = group_of(check, OUTPUT)
+    tolerance = "relative tolerance of all errors; by default each error has its own"
+    add(shown, "--tolerance", tolerance, number, "X")
     add_figure(check, "plot the errors and their tolerances")
 
 
@@ -97,15 +138,45 @@ def _robots(_: argparse.Namespace) -> int:
 def _info(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
+    import numpy as np
+
+    from fflin.commands.model_text import inputs_report
+    from fflin.control.authority import point_report
     from fflin.robot.summary import robot_info
 
     robot = load_robot(arguments)
-    print(headed("info", robot_info(robot)))
+    q = configuration_of(robot, arguments, robot.point)
+    v = velocity_of(robot, arguments, robot.point, "velocity")
+    at_point = point_report(robot, q, np.zeros(robot.nv) if v is None else v)
+    print(headed("info", robot_info(robot, at_point)))
     default = replace(robot, inputs=()).inputs
     if arguments.inputs is not None or robot.limits or robot.inputs != default:
-        from fflin.commands.model_text import inputs_report
-
         print(f"\n{inputs_report(robot)}")
+    return DONE
+
+
+def _init(arguments: argparse.Namespace) -> int:
+    from fflin.base.writing import check_place, write_whole
+    from fflin.robot.catalog import find_robot
+    from fflin.robot.loading import load
+    from fflin.robot.summary import draft
+
+    found = find_robot(arguments.robot)
+    if found.path.suffix.lower() == ".toml":
+        raise InputError(f"{found.path} is already a robot file; give a URDF")
+    target = arguments.output_file or Path(f"{found.name}.toml")
+    check_place(target, (".toml",))
+    if target.exists() and not arguments.force:
+        raise FileError(f"{target} already exists; give another name with -o, or add --force")
+    urdf = found.name
+    if found.origin == "file":
+        urdf = os.path.relpath(os.path.realpath(found.path), os.path.realpath(target.parent))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        robot = load(arguments.robot)
+    write_whole({target: draft(robot, urdf).encode()})
+    load(target)  # warns of settings that the file leaves open
+    print(f"init: wrote {target}; try: fflin simulate {target}")
     return DONE
 
 

@@ -8,11 +8,29 @@ from typing import Any
 
 from fflin.base.tables import headed
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_options, add_output_file, command, input_file
+from fflin.commands.arguments import (
+    OUTPUT,
+    Commands,
+    add,
+    add_output_file,
+    command,
+    count_of,
+    group_of,
+    input_file,
+    number,
+    switch,
+    whole,
+)
 from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
 from fflin.commands.sweeps import executor_of, going_on
-from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
+from fflin.commands.visual import (
+    add_figure,
+    add_pictures,
+    check_figure,
+    check_pictures,
+    show_motion,
+)
 
 _ROWS = 240  # of errors and inputs for a figure
 _PICTURES = ("html", "png", "gif")
@@ -22,10 +40,14 @@ _PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
 def add_commands(commands: Commands) -> None:
     """Add montecarlo."""
     montecarlo = command(
-        *(commands, "montecarlo", _montecarlo),
+        commands,
+        "montecarlo",
+        _montecarlo,
         "simulate a loop many times with random parameters; show quantiles, success rates, the "
         "worst runs and their causes",
-        "fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png",
+        example="fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png",
+        common="runs seed until width confidence workers goal worst json joint rpy trajectory "
+        "gain schedule duration inputs output-file plot",
     )
     add_loop(montecarlo)
     montecarlo.add_argument(
@@ -35,45 +57,51 @@ def add_commands(commands: Commands) -> None:
         help="TOML file with a table [dispersions] of the random parameters, for "
         "fflin.load_dispersions",
     )
-    add_options(
-        montecarlo.add_argument_group("runs"),
-        """
-        --runs N!: number of runs
-        --seed S = 0: random seed; 0 by default
-        --until CONDITION: stop when the confidence interval of the success rate of a condition,
-            such as 'attitude < 1 deg', is at most --width wide
-        --width P = 0.02: width of the confidence interval at which --until stops; 0.02 by default
-        --confidence P = 0.95: confidence level of all intervals; 0.95 by default
-        --workers N: distribute the runs over N processes
-        --threads N: distribute the runs over N threads; by default one for each core
-        --dask ADDRESS: distribute the runs over the workers of a dask scheduler""",
+    runs = group_of(montecarlo, "runs")
+    add(runs, "--runs", "number of runs", count_of, required=True)
+    add(runs, "--seed", "random seed", whole, "S", default=0)
+    add(
+        runs,
+        "--until",
+        "stop when the confidence interval of the success rate of a condition, such as 'attitude < "
+        "1 deg', is at most --width wide",
+        metavar="CONDITION",
     )
-    shown = montecarlo.add_argument_group("output of the campaign")
-    add_options(
+    width = "width of the confidence interval at which --until stops"
+    add(runs, "--width", width, number, "P", default=0.02)
+    add(runs, "--confidence", "confidence level of all intervals", number, "P", default=0.95)
+    add(runs, "--workers", "distribute the runs over N processes", count_of)
+    threads = "distribute the runs over N threads; by default one for each core"
+    add(runs, "--threads", threads, count_of)
+    dask = "distribute the runs over the workers of a dask scheduler"
+    add(runs, "--dask", dask, metavar="ADDRESS")
+    shown = group_of(montecarlo, OUTPUT)
+    add(
         shown,
-        """
-        --goal CONDITION*: report the fraction of runs that meet a condition, such as 'attitude < 1
-            deg and settle < 60 s', and draw the bounds of the condition
-        --worst K = 3: list the K worst runs; 3 by default
-        --json: print the results as JSON
-        --plot >FILE: plot quantile bands over time, histograms and the worst runs to FILE: .png,
-            .pdf or .svg""",
+        "--goal",
+        "report the fraction of runs that meet a condition, such as 'attitude < 1 deg and settle < "
+        "60 s', and draw the bounds of the condition",
+        metavar="CONDITION",
+        repeatable=True,
     )
+    add(shown, "--worst", "list the K worst runs", whole, "K", default=3)
+    switch(shown, "--json", "print the results as JSON")
+    add_figure(montecarlo, "plot quantile bands over time, histograms and the worst runs")
     add_output_file(
         shown,
         "save the runs to FILE: .h5 (HDF5) or .npz; the runs are collected in FILE.part, from "
         "which the same command resumes",
     )
-    add_options(shown, "--force: replace the file of -o even if another call wrote it")
-    add_pictures(shown, "that plays the worst run, with the paths of other runs as thin lines")
+    switch(shown, "--force", "replace the file of -o even if another call wrote it")
+    add_pictures(montecarlo, "that plays the worst run, with the paths of other runs as thin lines")
 
 
 def _montecarlo(arguments: argparse.Namespace) -> int:
     from fflin.batch.store import output_path
-    from fflin.campaign.dispersion_files import load_dispersions
     from fflin.campaign.monte_carlo import monte_carlo
     from fflin.campaign.plots import plot_campaign
     from fflin.campaign.report import campaign_record, worst_runs
+    from fflin.campaign.spreads import load_dispersions
 
     path = arguments.output_file
     check_figure(arguments.plot)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -61,7 +60,7 @@ def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
         return (JointTorque("*"),)
     if name == "base":
         return BaseTorque(), BaseForce()
-    from fflin.robot.input_files import load_inputs
+    from fflin.robot.robot_files import load_inputs
 
     return load_inputs(name)
 
@@ -77,19 +76,19 @@ def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def configuration_of(
-    robot: Robot, arguments: argparse.Namespace, start: Mapping[str, Any] | None = None
+    robot: Robot, arguments: argparse.Namespace, state: Mapping[str, Any], prefix: str = ""
 ) -> Array:
-    """Return q (nq,) of --joint, --rpy and --position, which override a start."""
-    import pinocchio as pin
+    """Return q (nq,) of --joint, --rpy and --position, which override a state of the robot.
 
-    start = start or {}
-    rpy, position = (
-        start.get(name, (0.0, 0.0, 0.0)) if given is None else given
-        for name, given in (("rpy", arguments.rpy), ("position", arguments.position))
-    )
-    rotation = pin.rpy.rpyToMatrix(*map(math.radians, rpy))
-    base = pin.SE3(rotation, pin.SE3.Identity().translation + position)
-    return placed(robot, "--joint", arguments.joint, base, start.get("joints"))
+    The names of the options may have a prefix, such as ``target_``.
+    """
+    from fflin.dynamics.points import base_of
+
+    given = {name: getattr(arguments, f"{prefix}{name}") for name in ("rpy", "position")}
+    base = base_of({**state, **{name: x for name, x in given.items() if x is not None}})
+    pairs = getattr(arguments, f"{prefix}joint")
+    option = f"--{prefix}joint".replace("_", "-")
+    return placed(robot, option, pairs, base, state.get("joints"))
 
 
 def placed(
@@ -97,13 +96,13 @@ def placed(
     option: str,
     pairs: list[tuple[str, Any]],
     base: pin.SE3 | None = None,
-    start: Mapping[str, float] | None = None,
+    of_state: Mapping[str, float] | None = None,
 ) -> Array:
-    """Return q (nq,) with the joints of an option; warn outside limits."""
+    """Return q (nq,) with the joints of a state and of an option; warn outside limits."""
     from fflin.base.names import joints_by_name
     from fflin.dynamics.points import configuration
 
-    joints = dict(start or {}) | joints_by_name(
+    joints = dict(of_state or {}) | joints_by_name(
         "joint", once(option, pairs), robot.joint_names, lambda name: robot.joint(name).name
     )
     q = configuration(robot, joints, base)
@@ -132,30 +131,33 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     from fflin.linear.linearization import linearize
 
     robot = load_robot(arguments)
-    q, v = configuration_of(robot, arguments), velocity_of(robot, arguments)
-    if arguments.relative_equilibrium and (arguments.rpy or arguments.position):
-        raise InputError(
-            "--relative-equilibrium sets the base pose, as --rpy and --position do; give either"
-        )
+    q = configuration_of(robot, arguments, robot.point)
+    v = velocity_of(robot, arguments, robot.point, "velocity")
+    refuse_pose(arguments)
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
     q, u, reference = held_at(robot, q, v, arguments, reference)
     return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
 
 
+def refuse_pose(arguments: argparse.Namespace, prefix: str = "") -> None:
+    """Refuse --rpy and --position, with a prefix, together with --relative-equilibrium."""
+    names = [f"{prefix}{name}" for name in ("rpy", "position")]
+    if arguments.relative_equilibrium and any(getattr(arguments, name) for name in names):
+        rpy, position = (f"--{name.replace('_', '-')}" for name in names)
+        raise InputError(
+            f"--relative-equilibrium sets the base pose, as {rpy} and {position} do; give either"
+        )
+
+
 def velocity_of(
-    robot: Robot,
-    arguments: argparse.Namespace,
-    *options: str,
-    start: Mapping[str, Any] | None = None,
+    robot: Robot, arguments: argparse.Namespace, state: Mapping[str, Any], *options: str
 ) -> Array | None:
-    """Return the velocity (nv,) of --velocity, of these options, or of a start."""
+    """Return the velocity (nv,) of a state of the robot, overridden by these options in turn."""
     from fflin.base.names import rates_by_name
     from fflin.dynamics.points import velocity
 
-    values: dict[str, float] = {}
-    for option in options or ("velocity",):
-        if option == "velocity":
-            values |= (start or {}).get("velocity", {})
+    values: dict[str, float] = dict(state.get("velocity", {}))
+    for option in options:
         given = once(f"--{option.replace('_', '-')}", getattr(arguments, option))
         velocity(robot, given)  # raises an error if it is invalid
         values |= rates_by_name(robot.joint_names, given)

@@ -11,12 +11,18 @@ from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityErr
 from fflin.base.tables import headed
 from fflin.commands import DONE
 from fflin.commands.arguments import (
+    CONTROLLER,
+    OUTPUT,
     Commands,
-    Container,
-    add_options,
+    add,
     add_output_file,
     add_point,
+    assignment,
     command,
+    group_of,
+    number,
+    switch,
+    yes_or_no,
 )
 from fflin.commands.points import linear_model, once
 from fflin.commands.visual import add_figure, check_figure, draw
@@ -29,35 +35,77 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Add lqr."""
     lqr = command(
-        *(commands, "lqr", _lqr),
+        commands,
+        "lqr",
+        _lqr,
         "design a linear quadratic regulator; show gain, poles, residual and margins",
-        "fflin lqr canadarm2 -o gain.npz",
+        example="fflin lqr canadarm2 -o gain.npz",
+        common="joint velocity equilibrium inputs frame weights q r bryson dt reduce "
+        "wheel-speeds output-file json plot",
     )
     add_point(lqr)
     add_weights(lqr)
-    add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json", "Gain")
+    what = "save the gain to FILE: .npz, .mat or .json"
+    shown = group_of(lqr, OUTPUT)
+    add_output_file(shown, what, "Gain")
+    switch(shown, "--json", "print the gain as JSON, with the keys of a .json file of -o")
     add_figure(lqr, "plot the poles, and the loop of each input with its margins,")
 
 
-def add_weights(command: Container) -> None:
+def add_weights(command: argparse.ArgumentParser) -> None:
     """Add the options of the cost and the regulated states: --q, --r, --bryson, --dt and others."""
-    add_options(
-        command,
-        """
-        --weights urdf|identity: rule that sets all weights not given by --q, --r or --bryson.
-            `urdf` (default) keeps the inputs within the limits of the URDF for displacements of 30
-            deg of the base and 0.3 rad of the joints; `identity` sets every weight to 1
-        --q NAME=W*: weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b,
-            q_m.hinge_*
-        --r NAME=W*: weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*
-        --bryson NAME=VALUE*: largest acceptable value of a state, an input or a group, which gets
-            the weight 1/VALUE^2. The other weights, from the rule, are scaled to match
-        --dt H: design for inputs held for H [s]; the continuous-time cost is still minimised
-        --reduce: if momentum is conserved, regulate only the states that the inputs can control
-        --[no-]wheel-speeds: whether to return the speeds of reaction wheels to their values at the
-            operating point. By default, they are returned if thrusters or a base torque can absorb
-            the wheel torque. --wheel-speeds also returns the combinations of wheel speeds that
-            exert no net torque on the robot (redundant wheels)""",
+    group = group_of(command, CONTROLLER)
+    add(
+        group,
+        "--weights",
+        "rule that sets all weights not given by --q, --r or --bryson. `urdf` (default) keeps the "
+        "inputs within the limits of the URDF for displacements of 30 deg of the base and 0.3 rad "
+        "of the joints; `identity` sets every weight to 1",
+        choices=("urdf", "identity"),
+    )
+    add(
+        group,
+        "--q",
+        "weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b, q_m.hinge_*",
+        assignment,
+        "NAME=W",
+        repeatable=True,
+    )
+    add(
+        group,
+        "--r",
+        "weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*",
+        assignment,
+        "NAME=W",
+        repeatable=True,
+    )
+    add(
+        group,
+        "--bryson",
+        "largest acceptable value of a state, an input or a group, which gets the weight "
+        "1/VALUE^2. The other weights, from the rule, are scaled to match",
+        assignment,
+        repeatable=True,
+    )
+    add(
+        group,
+        "--dt",
+        "design for inputs held for H [s]; the continuous-time cost is still minimised",
+        number,
+        "H",
+    )
+    switch(
+        group,
+        "--reduce",
+        "if momentum is conserved, regulate only the states that the inputs can control",
+    )
+    yes_or_no(
+        group,
+        "--wheel-speeds",
+        "whether to return the speeds of reaction wheels to their values at the operating point. "
+        "By default, they are returned if thrusters or a base torque can absorb the wheel torque. "
+        "--wheel-speeds also returns the combinations of wheel speeds that exert no net torque on "
+        "the robot (redundant wheels)",
     )
 
 
@@ -65,16 +113,16 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
     """Return the model of the design; with --reduce, its controllable part."""
     if not arguments.reduce:
         return lin
-    from fflin.analysis.momentum import momentum_reduction
+    from fflin.analysis.reduction import momentum_reduction
 
     return momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
 
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     """Return the regulator of the weights; warn if its margins are small."""
+    from fflin.control.default_weights import rule_weights
     from fflin.control.gain import fragility
     from fflin.control.lqr import lqr, require_fixed_point
-    from fflin.control.weight_rules import rule_weights
 
     try:
         require_fixed_point(lin)
@@ -116,8 +164,13 @@ def _lqr(arguments: argparse.Namespace) -> int:
         warnings.warn(pulling, FflinWarning, stacklevel=2)
     if arguments.output_file:
         gain.save(arguments.output_file)
-    print(headed("lqr", str(gain)))
-    if arguments.output_file:
-        print(f"\nwrote {arguments.output_file}")
-    draw(arguments.plot, "plot_loops", gain)
+    if arguments.json:
+        from fflin.base.record import json_text
+
+        print(json_text(gain), end="")
+    else:
+        print(headed("lqr", str(gain)))
+        if arguments.output_file:
+            print(f"\nwrote {arguments.output_file}")
+    draw(arguments.plot, "plot_loops", gain, report=not arguments.json)
     return DONE

@@ -10,10 +10,25 @@ from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import chosen, input_keys
 from fflin.base.tables import headed
 from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.arguments import Commands, add_options, add_output_file, command
+from fflin.commands.arguments import (
+    OUTPUT,
+    SIMULATION,
+    Commands,
+    add,
+    add_output_file,
+    command,
+    count_of,
+    group_of,
+)
 from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
-from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
+from fflin.commands.visual import (
+    add_figure,
+    add_pictures,
+    check_figure,
+    check_pictures,
+    show_motion,
+)
 
 if TYPE_CHECKING:
     from fflin.control.policies import StateFeedback
@@ -27,24 +42,33 @@ _OUTPUTS = ("output_file", "plot", "html", "png", "gif")
 def add_commands(commands: Commands) -> None:
     """Add simulate."""
     simulate = command(
-        *(commands, "simulate", _simulate),
+        commands,
+        "simulate",
+        _simulate,
         "simulate the nonlinear robot with a regulator to a target or along a trajectory",
-        "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png",
+        example="fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html "
+        "--plot loop.png",
+        common="joint rpy velocity target-joint target-rpy trajectory weights q r gain schedule "
+        "free limits duration inputs output-file plot html",
     )
-    run, shown = add_loop(simulate), simulate.add_argument_group("output of the simulation")
-    add_options(
-        run,
-        "--every N: number of steps between saved rows; chosen automatically for long runs",
+    add_loop(simulate)
+    add(
+        group_of(simulate, SIMULATION),
+        "--every",
+        "number of steps between saved rows; chosen automatically for long runs",
+        count_of,
     )
-    add_options(
+    add_figure(simulate, "plot the nonlinear and the linear motion")
+    shown = group_of(simulate, OUTPUT)
+    add(
         shown,
-        """
-        --plot >FILE: plot the nonlinear and the linear motion to FILE: .png, .pdf or .svg
-        --show NAME*: show only these curves in --plot: a state, input, group or pattern, as q_m or
-            '*.hinge_*'""",
+        "--show",
+        "show only these curves in --plot: a state, input, group or pattern, as q_m or '*.hinge_*'",
+        metavar="NAME",
+        repeatable=True,
     )
     add_output_file(shown, "save the motion to FILE: .npz, .mat, .json or .csv", "Motion")
-    add_pictures(shown)
+    add_pictures(simulate)
 
 
 def _simulate(arguments: argparse.Namespace) -> int:

@@ -13,16 +13,24 @@ from typing import TYPE_CHECKING, Any
 from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.commands import DONE
 from fflin.commands.arguments import (
+    OUTPUT,
+    POINT,
     Commands,
-    add_options,
+    add,
+    add_frame,
     add_output_file,
     add_pose,
     add_reference,
     add_robot,
     add_system,
+    assignment,
     command,
     count_of,
+    group_of,
+    input_file,
     number,
+    switch,
+    whole,
 )
 from fflin.commands.points import configuration_of, load_robot, once, velocity_of
 
@@ -42,49 +50,76 @@ _DASK_TIMEOUT = 10  # seconds
 def add_commands(commands: Commands) -> None:
     """Add sweep."""
     sweep = command(
-        *(commands, "sweep", _sweep),
+        commands,
+        "sweep",
+        _sweep,
         "linearise about many points and save all models",
-        "fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5",
+        example="fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 "
+        "-o grid.h5",
+        common="grid random configurations seed range joint velocity inputs output frame engine "
+        "workers yes output-file",
     )
-    add_robot(sweep)
     points = sweep.add_argument_group(
         "points",
-        "give --grid, --random or --configurations; without --velocity, points are at rest",
+        "give --grid, --random or --configurations; without --velocity, points are at rest, or "
+        "move as [point] of robot.toml does",
     )
-    add_options(
+    add(
         points,
-        """--grid JOINT=LO:HI:N*: N values of a joint [rad|m] from LO to HI; for several joints, all
-            combinations are used, and the last joint varies fastest""",
-        type=_axis,
+        "--grid",
+        "N values of a joint [rad|m] from LO to HI; for several joints, all combinations are used, "
+        "and the last joint varies fastest",
+        _axis,
+        "JOINT=LO:HI:N",
+        repeatable=True,
     )
-    add_options(
+    drawn = "N points, uniformly distributed within the joint limits"
+    add(points, "--random", drawn, count_of)
+    add(
         points,
-        """
-        --random N: N points, uniformly distributed within the joint limits
-        --configurations FILE.npz: q (N, nq) in Pinocchio's order, saved by numpy.savez, and
-            optionally v (N, nv) and u (N, nu)
-        --seed S = 0: random seed of --random; 0 by default""",
+        "--configurations",
+        "q (N, nq) in Pinocchio's order, saved by numpy.savez, and optionally v (N, nv) and u (N, "
+        "nu)",
+        input_file,
+        "FILE.npz",
     )
-    ranges = (
-        "--range JOINT=LO:HI*: with --random: range of a joint, which replaces the joint limits"
+    add(points, "--seed", "random seed of --random", whole, "S", default=0)
+    add(
+        points,
+        "--range",
+        "with --random: range of a joint, which replaces the joint limits",
+        _range,
+        "JOINT=LO:HI",
+        repeatable=True,
     )
-    add_options(points, ranges, type=_range)
-    add_pose(sweep)
-    add_options(
-        sweep,
-        "--effort NAME=VALUE*: input at all points, by its name in u, such as tau_m.joint_1",
+    point = group_of(sweep, POINT)
+    add_pose(point)
+    add(
+        point,
+        "--effort",
+        "input at all points, by its name in u, such as tau_m.joint_1",
+        assignment,
+        repeatable=True,
     )
+    add_frame(point)
+    add_reference(point)
+    add_robot(sweep)
     add_system(sweep)
-    add_reference(sweep)
-    add_options(
-        sweep,
-        """
-        --workers N: distribute the work over N processes, at most one for each core
-        --dask ADDRESS: distribute the work over the workers of a dask scheduler
-        --yes: permit results of more than 10 GB""",
+    work = group_of(sweep, "computation")
+    add(
+        work,
+        "--engine",
+        "compute the points in compiled code or in Python; by default compiled if numba is "
+        "installed and the outputs are the state",
+        choices=("compiled", "python"),
     )
+    workers = "distribute the work over N processes, at most one for each core"
+    add(work, "--workers", workers, count_of)
+    dask = "distribute the work over the workers of a dask scheduler"
+    add(work, "--dask", dask, metavar="ADDRESS")
+    switch(work, "--yes", "permit results of more than 10 GB")
     add_output_file(
-        sweep,
+        group_of(sweep, OUTPUT),
         "save to FILE: .h5 (HDF5) or .npz; the models are collected in FILE.part, from which the "
         "same command resumes",
         "LinearBatch",
@@ -125,7 +160,11 @@ def _sweep(arguments: argparse.Namespace) -> int:
         raise InputError("-o is missing; give a file .h5 or .npz for the models")
     output_path(path)
     robot = load_robot(arguments)
-    v = velocity_of(robot, arguments)
+    # A file of configurations has its own velocities.
+    at_rest: dict[str, Any] = {}
+    v = velocity_of(
+        robot, arguments, at_rest if arguments.configurations else robot.point, "velocity"
+    )
     u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
     options: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
@@ -148,7 +187,8 @@ def _sweep(arguments: argparse.Namespace) -> int:
     with executor_of(arguments) as executor:
         print(f"fflin: {said}", file=sys.stderr)  # all options are valid
         with going_on(path, "points") as progress:
-            work = {"executor": executor, "workers": arguments.workers, "progress": progress}
+            work = {name: getattr(arguments, name) for name in ("engine", "workers")}
+            work |= {"executor": executor, "progress": progress}
             batch = sweep(robot, q, v, u, **options, **work, out=path)
     states, inputs = len(batch.state_names), len(batch.input_names)
     print(f"sweep: wrote {path}: {len(batch):,} points, {states} states, {inputs} inputs")
@@ -166,6 +206,7 @@ def _points(
     import numpy as np
 
     from fflin.batch.configurations import as_configurations, grid, random_configurations
+    from fflin.robot.joints import by_joint
 
     kinds = [bool(arguments.grid), arguments.random is not None, bool(arguments.configurations)]
     if sum(kinds) != 1:
@@ -193,9 +234,8 @@ def _points(
         v, u = given.get("v", v), given.get("u", u)
         announce(len(given["q"]), at_rest=v is None and u is None)
         return as_configurations(robot, given["q"]), v, u
-    start = configuration_of(robot, arguments)
     fixed = once("--joint", arguments.joint)
-    base = _base(robot, start)
+    base = _base(robot, configuration_of(robot, arguments, robot.point))
     at_rest = v is None and u is None
     if arguments.random is not None:
         ranges = once("--range", arguments.range)
@@ -216,7 +256,9 @@ def _points(
     # The points are counted before the grid is created.
     announce(math.prod(count for _, _, count in axes.values()), at_rest=at_rest)
     values = {name: np.linspace(*axis) for name, axis in axes.items()}
-    return grid(robot, values, joints=fixed, base=base), v, u
+    joints = {**robot.point.get("joints", {}), **by_joint(fixed, robot.joint_names, robot.joint)}
+    others = {name: x for name, x in joints.items() if name not in axes or name in fixed}
+    return grid(robot, values, joints=others, base=base), v, u
 
 
 def _base(robot: Robot, q: Array) -> Any:
@@ -253,7 +295,7 @@ def _given(path: Path) -> dict[str, Array]:
 @contextmanager
 def going_on(path: Path | None, what: str) -> Iterator[Callable[[int, int], None]]:
     """Yield the progress callback; after Ctrl-C report the progress and the saved part."""
-    from fflin.base.progress import Progress
+    from fflin.base.process import Progress
     from fflin.batch.store import part_of
 
     bar, reached = Progress(), [0, 0]

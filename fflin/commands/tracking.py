@@ -9,13 +9,20 @@ from fflin.base.errors import InputError
 from fflin.base.tables import headed
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
+    CONTROLLER,
+    OUTPUT,
+    TRAJECTORY,
     Commands,
-    Container,
-    add_options,
+    add,
+    add_frame,
     add_output_file,
     add_robot,
     add_system,
+    assignment,
     command,
+    group_of,
+    input_file,
+    switch,
 )
 from fflin.commands.points import load_robot, once
 from fflin.commands.regulator import add_weights
@@ -29,37 +36,51 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Add tvlqr."""
     tvlqr = command(
-        *(commands, "tvlqr", _tvlqr),
+        commands,
+        "tvlqr",
+        _tvlqr,
         "design the time-varying regulator along a trajectory",
-        "fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --dt 0.1 -o gains.npz",
+        example="fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --dt 0.1 "
+        "-o gains.npz",
+        common="trajectory hold strict weights q r bryson dt qf inputs frame output-file",
     )
     add_robot(tvlqr)
     add_system(tvlqr)
+    add_frame(group_of(tvlqr, TRAJECTORY))
     add_trajectory(tvlqr, required=True)
     add_weights(tvlqr)
-    add_options(
-        tvlqr,
-        "--qf NAME=VALUE*: weight on the final error; by default the solution of the algebraic "
-        "Riccati equation about the last configuration",
+    add(
+        group_of(tvlqr, CONTROLLER),
+        "--qf",
+        "weight on the final error; by default the solution of the algebraic Riccati equation "
+        "about the last configuration",
+        assignment,
+        repeatable=True,
     )
-    add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json", "GainSchedule")
+    what = "save the gains to FILE: .npz, .mat or .json"
+    add_output_file(group_of(tvlqr, OUTPUT), what, "GainSchedule")
 
 
-def add_trajectory(parser: Container, *, required: bool = False) -> None:
+def add_trajectory(command: argparse.ArgumentParser, *, required: bool = False) -> None:
     """Add --trajectory, --hold and --strict; the file then sets the default of --frame."""
-    trajectory = """--trajectory FILE: use the trajectory in FILE: .npz, .mat, .json, or .csv with
-        named columns, as fflin.Trajectory.load reads it. --frame gives the axes of the data; by
-        default the frame named in the file, or local if the file names none"""
-    add_options(parser, trajectory, required=required)
-    add_options(
-        parser,
-        """
-        --hold linear|previous: inputs between the knots of FILE: interpolated linearly, or held at
-            the value of the previous knot. By default the setting in the file, or
-            linear if the file has none
-        --strict: refuse a FILE that does not satisfy the dynamics of the robot""",
+    group = group_of(command, TRAJECTORY)
+    add(
+        group,
+        "--trajectory",
+        "use the trajectory in FILE: .npz, .mat, .json, or .csv with named columns, as "
+        "fflin.Trajectory.load reads it. --frame gives the axes of the data; by default the frame "
+        "named in the file, or local if the file names none",
+        input_file,
+        required=required,
     )
-    parser.set_defaults(frame=None)
+    add(
+        group,
+        "--hold",
+        "inputs between the knots of FILE: interpolated linearly, or held at the value of the "
+        "previous knot. By default the setting in the file, or linear if the file has none",
+        choices=("linear", "previous"),
+    )
+    switch(group, "--strict", "refuse a FILE that does not satisfy the dynamics of the robot")
 
 
 def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> LinearTrajectory:
@@ -116,8 +137,8 @@ def schedule_of(
     along: LinearTrajectory, arguments: argparse.Namespace, Qf: Any = "steady"
 ) -> GainSchedule:
     """Return the regulator of the weights along a trajectory."""
+    from fflin.control.default_weights import pace_along, rule_weights
     from fflin.control.tvlqr import steady_end, tvlqr
-    from fflin.control.weight_rules import pace_along, rule_weights
 
     options: dict[str, Any] = {"sample": arguments.dt, "weights": arguments.weights}
     given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}

@@ -9,13 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 from fflin.commands import DONE
 from fflin.commands.arguments import (
+    OUTPUT,
+    POINT,
+    ROBOT,
     Commands,
     Container,
-    add_options,
+    add,
     add_orbit,
     add_pose,
     add_robot,
     command,
+    group_of,
+    number,
+    output_file,
+    switch,
+    yes_or_no,
 )
 from fflin.commands.points import configuration_of, load_robot
 
@@ -30,53 +38,64 @@ _FILES, _SHOWN = ("html", "png", "gif"), ("scene", "follow", "tool")
 def add_commands(commands: Commands) -> None:
     """Add view."""
     view = command(
-        *(commands, "view", _view),
+        commands,
+        "view",
+        _view,
         "show a robot live in the browser with a slider for each joint",
-        "fflin view servicer_7dof --joint joint_2=0.4",
+        example="fflin view servicer_7dof --joint joint_2=0.4",
     )
     add_robot(view)
-    add_pose(view)
-    add_orbit(view)
-    add_options(view, "--frame lvlh|hill: orbital frame used as the world; lvlh by default")
-    _add_scene(view)
-    add_options(view, "--no-open: do not open a browser; the address appears on stderr")
-    add_options(view, "--port N = 0: port on 127.0.0.1; a free port by default", type=int)
+    add_pose(group_of(view, POINT))
+    add_orbit(group_of(view, ROBOT))
+    page = group_of(view, OUTPUT)
+    frames = "orbital frame used as the world; lvlh by default"
+    add(page, "--frame", frames, choices=("lvlh", "hill"))
+    _add_scene(page)
+    switch(page, "--no-open", "do not open a browser; the address appears on stderr")
+    port = "port on 127.0.0.1; a free port by default"
+    add(page, "--port", port, int, "N", default=0)
 
 
-def add_pictures(command: Container, page: str = "that plays the motion without a network") -> None:
+def add_pictures(
+    command: argparse.ArgumentParser, page: str = "that plays the motion without a network"
+) -> None:
     """Add the options of pages, pictures and animations of a motion."""
-    add_options(
-        command,
-        f"""
-        --html >FILE: write a page {page}
-        --png >FILE: write a picture (needs Chromium): a strip of four images, or of images
-            at the times of --times
-        --gif >FILE: write an animation (needs Chromium)""",
+    group = group_of(command, OUTPUT)
+    add(group, "--html", f"write a page {page}", output_file)
+    add(
+        group,
+        "--png",
+        "write a picture (needs Chromium): a strip of four images, or of images at the times of "
+        "--times",
+        output_file,
     )
-    add_options(command, "--times T: times of the pictures [s]", nargs="+")
-    _add_scene(command)
-    add_options(
-        command,
-        """
-        --fps FPS = 30: frames per second of playback; 30 by default
-        --speed SPEED: playback speed, in seconds of motion per second; 1 by default""",
+    add(group, "--gif", "write an animation (needs Chromium)", output_file)
+    add(group, "--times", "times of the pictures [s]", number, "T", nargs="+")
+    _add_scene(group)
+    add(group, "--fps", "frames per second of playback", number, "FPS", default=30.0)
+    speed = "playback speed, in seconds of motion per second; 1 by default"
+    add(group, "--speed", speed, number, "SPEED")
+
+
+def _add_scene(group: Container) -> None:
+    add(
+        group,
+        "--scene",
+        "show sky and planet (space), or a floor with a grid (lab, the default under gravity)",
+        choices=("space", "lab"),
+    )
+    add(group, "--tool", "draw the axes and the trail of this frame", metavar="FRAME")
+    yes_or_no(
+        group,
+        "--follow",
+        "whether the camera follows the base; by default it does in long motions",
     )
 
 
-def _add_scene(command: Container) -> None:
-    add_options(
-        command,
-        """
-        --scene space|lab: show sky and planet (space), or a floor with a grid (lab, the default
-            under gravity)
-        --tool FRAME: draw the axes and the trail of this frame
-        --[no-]follow: whether the camera follows the base; by default it does in long motions""",
-    )
-
-
-def add_figure(command: Container, what: str) -> None:
+def add_figure(command: argparse.ArgumentParser, what: str) -> None:
     """Add --plot FILE."""
-    add_options(command, f"--plot >FILE: {what} to FILE: .png, .pdf or .svg")
+    text = f"{what} to FILE: .png, .pdf or .svg"
+    add(group_of(command, OUTPUT), "--plot", text, output_file)
 
 
 def check_figure(path: Path | None) -> None:
@@ -90,13 +109,14 @@ def check_figure(path: Path | None) -> None:
     require_matplotlib()
 
 
-def draw(path: Path | None, figure: str, drawn: object) -> None:
+def draw(path: Path | None, figure: str, drawn: object, *, report: bool = True) -> None:
     """Draw with the public function of this name and report the file, if a path is given."""
     if path is not None:
         import fflin
 
         getattr(fflin, figure)(drawn, path)
-        print(f"wrote {path}")
+        if report:
+            print(f"wrote {path}")
 
 
 def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
@@ -129,12 +149,14 @@ def show_motion(
 
 
 def _view(arguments: argparse.Namespace) -> int:
+    from fflin.robot.fields import combined
     from fflin.view.live import Live
     from fflin.view.visualize import visualize
 
     robot = load_robot(arguments)
+    q = configuration_of(robot, arguments, combined(robot.point, robot.start))
     how: Any = {name: getattr(arguments, name) for name in (*_SHOWN, "port", "frame")}
-    live = visualize(robot, open=False, q=configuration_of(robot, arguments, robot.start), **how)
+    live = visualize(robot, open=False, q=q, **how)
     assert isinstance(live, Live)  # since there is no motion
     print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
     if not arguments.no_open:

@@ -1,7 +1,6 @@
 """Channel from command to actuator: sample and hold, delay and limits."""
 
 import math
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import DOUBLE, Array, as_double
 from fflin.control.saturation import Saturation
+from fflin.kernel import channel as rules
 
 
 class Law:
@@ -52,8 +52,34 @@ class Law:
         return u
 
 
+def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> rules.Channel:
+    """Return what the kernel reads of the limits, the sample time and the delay in steps.
+
+    `initial` (nu,) acts until the first command arrives.
+    """
+    slots = delay // sample + 1 if sample else 1
+    channel = rules.Channel(
+        low=limits.low,
+        high=limits.high,
+        held=initial.copy(),
+        pending=np.zeros(slots * len(initial)),
+        slots=slots,
+        sample=sample,
+        delay=np.array([float(delay)]),
+        fresh=np.zeros(1),
+        wheels=limits.wheels,
+        pulses=limits.pulses,
+    )
+    rules.limit(channel, channel.held)
+    return channel
+
+
 class Channel:
-    """A command on its way: `law` is asked at each sample, and acts `delay` steps later."""
+    """The way of the commands of `law` to the inputs, by the rules of the kernel.
+
+    `law` is called with the arguments of `begin` or `ask`. `speeds` (k,) of these arguments are
+    the speeds of the wheels whose speed is limited.
+    """
 
     def __init__(
         self,
@@ -62,19 +88,30 @@ class Channel:
         limits: Saturation,
         sample: int,
         delay: int,
+        speeds: Callable[..., Array],
     ) -> None:
-        # In steps; `sample` is 0 of a law that is asked at every stage of every step.
-        self._law, self._low, self._high = law, limits.low, limits.high
-        self._sample, self._delay = sample, delay
+        self._law, self._speeds, self._u = law, speeds, initial.tolist()
+        self._wheels, self._pulses = len(limits.wheels.at), len(limits.pulses.at)
         self._limited = bool(np.isfinite((limits.low, limits.high)).any())
-        self._wheels, self._pulses = limits.wheels, limits.pulses and limits.pulses()
-        self._pending: deque[tuple[int, Array]] = deque()
-        self._held = self._within(initial)
+        own = channel_of(limits, initial, sample, delay)
+        # The entries of a list are read faster than the entries of an array.
+        self._rules = own._replace(
+            low=own.low.tolist(),
+            high=own.high.tolist(),
+            held=own.held.tolist(),
+            pending=own.pending.tolist(),
+            wheels=own.wheels._replace(row=range(self._wheels)),
+            pulses=own.pulses._replace(
+                left=np.zeros(self._pulses),
+                level=np.zeros(self._pulses),
+                end=np.zeros(self._pulses),
+            ),
+        )
 
     @property
     def continuous(self) -> bool:
         """Whether the law is asked at every stage."""
-        return not self._sample
+        return not self._rules.sample
 
     @property
     def cuts(self) -> bool:
@@ -83,23 +120,14 @@ class Channel:
 
     def begin(self, step: int, *point: Any) -> Array:
         """Return the applied inputs at the start of a step."""
-        if not self._sample:
-            return self.ask(*point)
-        if step % self._sample == 0:
-            self._pending.append((step + self._delay, self._within(self._law(*point))))
-            if self._pulses and step < self._delay:
-                self._pulses.begin(step, self._held)
-        while self._pending and self._pending[0][0] <= step:
-            self._held = self._pending.popleft()[1]
-            if self._pulses:
-                self._pulses.begin(step, self._held)
-        u = self._pulses.at(step) if self._pulses else self._held
-        return self._wheels.cut(u, *point) if self._wheels else u
+        if not (self._rules.sample or self._limited or self._wheels):
+            return self._law(*point)
+        if rules.is_asked(self._rules, step):
+            self._u[:] = self._law(*point).tolist()
+        speeds = self._speeds(*point).tolist() if self._wheels else []
+        rules.transmit(self._rules, step, speeds, self._u)
+        return np.array(self._u)
 
     def ask(self, *point: Any) -> Array:
-        """Return the applied inputs of the law's present command."""
-        u = self._within(self._law(*point))
-        return self._wheels.cut(u, *point) if self._wheels else u
-
-    def _within(self, u: Array) -> Array:
-        return np.minimum(np.maximum(u, self._low), self._high) if self._limited else u
+        """Return the applied inputs of the law's present command, if there is no sample time."""
+        return self.begin(0, *point)

@@ -1,6 +1,7 @@
-"""Default weights of a regulator, from the limits of the URDF."""
+"""Weights of a regulator by a rule: from the limits of the URDF, or by name."""
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
@@ -8,39 +9,43 @@ import numpy as np
 from scipy.linalg import eigh
 
 from fflin.analysis.mechanics import second_order, slopes
-from fflin.base.errors import InputError, listed
+from fflin.analysis.ranks import Noisy, null_space
+from fflin.analysis.reduction import ignorable_wheels, picked, regulated_part, rigid_forces, without
+from fflin.base.errors import FflinWarning, InputError, listed, unknown
+from fflin.base.names import input_keys
 from fflin.base.validation import Array
-from fflin.control.riccati import half_size, rates_of, solve
+from fflin.control.riccati import rates_of, solve
 from fflin.control.saturation import warn_beyond
+from fflin.control.weights import GivenWeight, sampled_cost, weights_of
 from fflin.linear.model import LinearModel
 
-# The bandwidth [rad/s] of a loop that no limit slows: it settles in about thirty seconds. Under a
-# hold of h it is this much over h at the most.
+# The bandwidth [rad/s] of a loop that no limit slows: it settles in about thirty seconds. With
+# inputs held for h, the bandwidth is at most _HELD / h.
 BANDWIDTH, _HELD = 0.2, 0.3
 
-# The displacements that the limits must bear: a turn of the base [deg], a way of it in radii of
-# gyration, and a joint's [rad], [m], or this share of its travel.
-TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
+# Displacements from which the robot must return within its limits: a rotation of the base [deg], an
+# offset of the base in radii of gyration, and a joint's [rad], [m], or this fraction of its range.
+ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
-# So many times the loops of springs and gravity are slowed. One that needs this much more than the
-# least is slowed in vain.
+# A loop with springs or gravity is slowed at most this many times. The fastest loop is taken that
+# leaves the efforts at least this fraction of the best.
 _TRIALS, _IN_VAIN = 8, 0.9
 
 # What grows is held by a loop of at least this fraction of its rate of growth, and of the second
 # fraction where the efforts have less. A slower one lets light joints swing by radians.
 _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
-# The inputs count as reaching each mode by at least this fraction of what holds it at rest. A mode
-# that they reach less keeps its decay.
+# The inputs reach each mode by at least this fraction of the effort that holds it at rest. A mode
+# that they reach less keeps its own decay.
 _LEAST_REACH = 1e-3
 
-# A coordinate that inputs act on by no more, relative to what holds it, is one that none acts on.
+# No input acts on a coordinate if the inputs' effect, relative to its inertia, is below this.
 _IDLE = 1e-12
 
-# A mode of a smaller fraction of the decay at rest is named.
+# The report names a mode whose decay is below this fraction of the decay at rest.
 _AS_SLOW = 0.9
 
-# So many times the bandwidth is sought at which damping counts.
+# Iterations for the bandwidth of a robot with dampers, whose effect depends on the bandwidth.
 _PASSES = 4
 
 _NOT_ENOUGH = "is too small for all displacements"
@@ -105,7 +110,7 @@ def _damping(lin: LinearModel) -> Array:
         return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
-    # What motion brings to one, it takes from another; what an orbit turns is not damped.
+    # Coupling by motion moves energy between coordinates, and an orbit rotates them: no damping.
     size = np.sqrt(lin.M.diagonal())
     whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
     damped: Any = rates.sum() > 1e-9 * whole
@@ -176,7 +181,7 @@ def _of_inertia(
         driven = (S**2 / cost).sum(axis=1) > _IDLE * D / unit
         least = min(grows._replace(bandwidth=_LEAST_OF_GROWTH * grows.bandwidth), limit)
         limit, achieved = _slowed(lin, costs, size, size * driven, limit, least)
-    rule = _rule(lin, size, limit, achieved, pace.share * TURN) + (
+    rule = _rule(lin, size, limit, achieved, pace.share * ROTATION) + (
         "; joint damping is included" if damped else ""
     )
     terms = h * on_positions.diagonal() * size**2, h * cost * use**2
@@ -214,9 +219,9 @@ def displacements(lin: LinearModel, share: float) -> Array:
     size = np.empty(m)
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         if name.startswith("q_b."):
-            size[i] = math.sin(math.radians(share * TURN / 2.0))
+            size[i] = math.sin(math.radians(share * ROTATION / 2.0))
         elif name.startswith("r_b."):
-            size[i] = share * WAY * radius
+            size[i] = share * OFFSET * radius
         else:
             most = LENGTH if unit == "m" else ANGLE
             size[i] = share * min(most, TRAVEL * lin.limits.get(name, math.inf))
@@ -229,8 +234,8 @@ _BASE = tuple(f"{group}.{axis}" for group in ("q_b", "r_b") for axis in "xyz")
 def _radius_of_gyration(M: Array) -> float:
     """Return the radius [m] at which a sphere would have the mass to have such moments."""
     mass = M[3, 3]
-    way = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
-    moment = np.trace(M[:3, :3]) - 2.0 * mass * way @ way
+    center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
+    moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
     return math.sqrt(max(float(moment) / (2.0 * mass), 1e-300))
 
 
@@ -238,7 +243,7 @@ def _largest(K: Array, size: Array, names: tuple[str, ...]) -> Array:
     """Return the largest K d of all displacements d: the base's in any direction, joints' signs."""
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
     scaled = K[..., : len(size)] * size
-    total: Array = np.abs(scaled[..., (groups != "q_b") & (groups != "r_b")]).sum(axis=-1)
+    total: Array = np.abs(scaled[..., ~np.isin(groups, ("q_b", "r_b"))]).sum(axis=-1)
     for group in ("q_b", "r_b"):
         total += np.linalg.norm(scaled[..., groups == group], axis=-1)
     return total
@@ -297,27 +302,16 @@ def _growth(lin: LinearModel) -> _Limit:
     return _Limit(fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})")
 
 
-class _Loop(NamedTuple):
-    """A gain (nu, nx), and the rates (nx,) [1/s] and modes of the loop it closes."""
-
-    K: Array
-    rates: Any
-    modes: Any
-
-
-def _loop(lin: LinearModel, K: Array) -> _Loop:
-    poles, modes = np.linalg.eig(lin.A - lin.B @ K)
-    return _Loop(K, rates_of(poles, lin.dt), modes)
-
-
 class _Trial(NamedTuple):
-    """A loop, by what its limits leave of its bandwidth, and what its inputs are asked for."""
+    """A loop that was tried: its limit, its gain and modes, and what its inputs require."""
 
     limit: _Limit
-    left: float
-    effort: str  # the one that leaves the least
-    loop: _Loop
-    asked: Array
+    left: float  # factor on the bandwidth that the efforts allow, as far as it is below 1
+    effort: str  # the input that allows the least
+    K: Array
+    rates: Any  # of the modes (nx,) [1/s]
+    modes: Any
+    required: Array  # largest inputs (nu,)
 
 
 def _slowed(
@@ -331,56 +325,72 @@ def _slowed(
     """
     trials = list[_Trial]()
     for _ in range(_TRIALS):
-        arguments = (lin.A, lin.B, *costs(limit.bandwidth), None, lin.dt)
+        Q, R = costs(limit.bandwidth)
         try:
-            solution = half_size(*arguments) or solve(*arguments)
+            K = solve(lin.A, lin.B, Q, R, None, lin.dt).K
         except np.linalg.LinAlgError:
             break
-        loop = _loop(lin, solution.K)
+        poles, modes = np.linalg.eig(lin.A - lin.B @ K)
+        rates = rates_of(poles, lin.dt)
+        time = np.geomspace(0.1 / np.abs(rates).max(), 3.0 / np.abs(rates).min(), 60)
+        decaying = (K @ modes) * np.exp(rates * time[:, None])[:, None]
+        later = (decaying @ np.linalg.inv(modes)[:, : len(size)]).real
         use = np.maximum(
-            _largest(solution.K, size, lin.state_names), _on_the_way(lin, loop, driven)
+            _largest(K, size, lin.state_names),
+            _largest(later, driven, lin.state_names).max(axis=0),
         )
         left, what = min(_limits("effort", _efforts(lin), use, 2.0), default=_Limit(1.0, ""))
-        trials.append(_Trial(limit, left, what, loop, np.abs(lin.u0) + use))
+        trials.append(_Trial(limit, left, what, K, rates, modes, np.abs(lin.u0) + use))
         if left >= 1.0 - 1e-6:
-            return limit, _achieved(lin, loop, limit.bandwidth)
+            return limit, _achieved(lin, trials[-1])
         if limit.bandwidth <= least.bandwidth:
             break
-        # What springs and gravity ask for stays however slow the loop.
+        # What springs and gravity require remains, however slow the loop is.
         slower = _Limit(min(max(left, 0.3), 0.8) * limit.bandwidth, what)
         limit = max(slower, least)
     if not trials:
         return limit, ""  # the regulator raises with the reason
     most = max(trial.left for trial in trials)
-    limit, _, effort, loop, asked = next(x for x in trials if x.left >= _IN_VAIN * most)
+    trial = next(x for x in trials if x.left >= _IN_VAIN * most)
+    limit, effort = trial.limit, trial.effort
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "to return from the displacements of the default weights"
-    warn_beyond(lin.robot, where, lin.input_names, lin.input_units, asked[None], -high, high)
+    required = trial.required[None]
+    warn_beyond(lin.robot, where, lin.input_names, lin.input_units, required, -high, high)
     held = limit.what == least.what  # a slower loop loses an unstable mode
     what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
-    limit = limit._replace(what=what)
-    return limit, _achieved(lin, loop, limit.bandwidth)
+    return limit._replace(what=what), _achieved(lin, trial)
 
 
-def _on_the_way(lin: LinearModel, loop: _Loop, size: Array) -> Array:
-    """Return the largest inputs (nu,) on the way back from displacements (m,)."""
-    K, rates, modes = loop
-    time = np.geomspace(0.1 / np.abs(rates).max(), 3.0 / np.abs(rates).min(), 60)
-    passing = (K @ modes) * np.exp(rates * time[:, None])[:, None]
-    way = (passing @ np.linalg.inv(modes)[:, : len(size)]).real
-    return _largest(way, size, lin.state_names).max(axis=0)
-
-
-def _achieved(lin: LinearModel, loop: _Loop, bandwidth: float) -> str:
+def _achieved(lin: LinearModel, trial: _Trial) -> str:
     """Return a report of a loop's bandwidth and decay, and of modes slower than at rest."""
-    _, rates, modes = loop
-    decay, fast = -rates.real, np.abs(rates)
+    decay, fast = -trial.rates.real, np.abs(trial.rates)
     said = f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} 1/s, "
     said += f"damping ratio at least {(decay / fast).min():.2g}"
-    slow = np.flatnonzero(decay < _AS_SLOW * math.sqrt(0.5) * bandwidth)
-    if names := _moving_most(lin, modes[:, slow]):
+    slow = np.flatnonzero(decay < _AS_SLOW * math.sqrt(0.5) * trial.limit.bandwidth)
+    if vibrating := _vibrations(lin, trial, slow.tolist()):
+        said += f"; left to their damping: {listed(list(dict.fromkeys(vibrating.values())))}"
+    slow = np.setdiff1d(slow, list(vibrating)).astype(int)
+    if names := _moving_most(lin, trial.modes[:, slow]):
         said += f"; slower than without springs, gravity or motion: {listed(names)}"
     return said
+
+
+def _vibrations(lin: LinearModel, trial: _Trial, slow: list[int]) -> dict[int, str]:
+    """Return {index: mode of an appendage} of the slow modes of a loop that vibrate with it."""
+    robot, m = lin._robot, len(lin.M)
+    if robot is None or not robot.modes:
+        return {}
+    names = [name.removeprefix("q_m.") for name in lin.state_names[:m]]
+    stiffness = np.array([robot.stiffness.get(name, 0.0) for name in names])
+    of_modes = np.isin(names, [joint.name for joint in robot.modes])
+    found = {}
+    for k in slow:
+        energy = stiffness * np.abs(trial.modes[:m, k]) ** 2
+        rate = trial.rates[k]
+        if energy[of_modes].sum() > 0.5 * energy.sum() and abs(rate.imag) > 2.0 * abs(rate.real):
+            found[k] = names[int((energy * of_modes).argmax())]
+    return found
 
 
 def _moving_most(lin: LinearModel, modes: Any) -> list[str]:
@@ -398,7 +408,7 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: flo
         base.append(f"{size[groups.index('r_b')]:.2g} m")
     joints: dict[str, float] = {}
     for group, unit, d in zip(groups, lin.state_units, size, strict=False):
-        if group == "q_m":
+        if group == "q_m" and unit != "kg^0.5 m":
             joints[unit] = max(d, joints.get(unit, 0.0))
     from_where = [f"{' and '.join(base)} of the base"] if base else []
     if joints:
@@ -410,3 +420,127 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: flo
         slow += f"; at or beyond the URDF limit at the point itself: {listed(beyond)}"
     pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"
     return f"from {source}, for displacements of {' and '.join(from_where)}: {pace}{slow}"
+
+
+# Along a trajectory the displacements are a tenth as large. They must decay within its duration:
+# this many time constants fit in, of a loop no slower than at a point and no faster than _FASTEST.
+# With held inputs the loop may be faster than at a point, since the sampled regulator is exact.
+_BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
+
+# The speeds of wheels come back at this share of the bandwidth.
+_SPEEDS = 0.1
+
+# A weight that is given and this many times apart from that of the rule is on another scale.
+_APART = 1e4
+
+
+def pace_along(duration: float, hold: float) -> Pace:
+    """Return the pace of a loop along a trajectory of that duration [s]."""
+    return Pace(min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold, _HELD_ALONG)
+
+
+def rule_weights(
+    lin: LinearModel,
+    name: str | None,
+    given: Mapping[str, Any] | None = None,
+    *,
+    wheel_speeds: bool | None = None,
+    pace: Pace = AT_A_POINT,
+) -> tuple[Array, Array, Array | None, str]:
+    """Return Q, R and N of a model by a rule, changed by `given` weights, and the rule in words."""
+    # The cost of a sampled model is the continuous one under the hold, where it is known what it
+    # was sampled from. The rule is by default what the robot has in its `weights`, else "urdf".
+    source = lin.generator or lin
+    layers = [(given, False)] if given else []
+    if name is None and lin.weights:
+        layers.insert(0, (lin.weights, True))
+        name = lin.weights.get("rule")
+    terms: Array = np.zeros(sum(lin.B.shape))
+    if name is None or name == "urdf":
+        pace = pace._replace(hold=lin.dt or pace.hold)
+        Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
+    elif name == "identity":
+        nx, nu = lin.B.shape
+        Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
+    else:
+        raise unknown("rule of weights", name, ("urdf", "identity"))
+    given_weights: dict[int, GivenWeight] = {}
+    named: dict[str, None] = {}
+    for layer, of_robot in layers:
+        weights, names = weights_of(lin, layer, of_robot)
+        given_weights |= weights
+        named |= dict.fromkeys(names)
+    if named:
+        Q, R = _reweighed(lin, Q, R, terms, given_weights)
+        rule = f"{', '.join(named)} as given, the others {rule}"
+        rule += " (figures of this rule alone)" if terms.any() else ""
+    if source.dt == lin.dt:
+        return Q, R, None, rule
+    return (*sampled_cost(source, lin.dt, Q, R), rule)
+
+
+def _of_regulated(
+    lin: LinearModel, pace: Pace, wheel_speeds: bool | None
+) -> tuple[Array, Array, str, Array]:
+    """Return Q (nx, nx), R, the rule and costs, for a model that may have wheels.
+
+    The costs (nx + nu,) are those of the largest value of each state and input, 0 if the rule has
+    none.
+    """
+    part = regulated_part(lin, wheel_speeds)
+    if part is lin:
+        Q, R, rule, _, (of_positions, of_inputs) = default_weights(lin, pace)
+        return Q, R, rule, np.concatenate((np.tile(of_positions, 2), of_inputs))
+    wheels, _ = ignorable_wheels(lin)
+    body = regulated_part(without(lin, wheels))
+    at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
+    names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
+    most = np.array([lin.limits[name] for name in names])
+    # A wheel that is at its limit already is counted as one at rest, and told.
+    room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
+    found = default_weights(body, pace, dict(zip(names, room, strict=True)))
+    Q, R, rule, bandwidth, (of_positions, of_inputs) = found
+    if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
+        rule += f"; at or beyond the URDF limit at the point itself: {listed(beyond)}"
+    S = picked(body.state_names, lin.state_names)
+    Q = S.T @ Q @ S
+    terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
+    if speeds := [name for name in part.state_names if name not in body.state_names]:
+        S, slow = picked(speeds, lin.state_names), _SPEEDS * bandwidth
+        # Inputs R^-1/2 Z n that turn no body change the speeds at X n.
+        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
+        X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
+        Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
+        rule = f"{rule}; wheel speeds at {slow:.3g} rad/s"
+    return Q, R, rule, terms
+
+
+def _reweighed(
+    lin: LinearModel, Q: Array, R: Array, terms: Array, given: Mapping[int, GivenWeight]
+) -> tuple[Array, Array]:
+    """Return Q and R, scaled to the largest values that are given, with what is given in them.
+
+    A common factor of Q and R does not change the gain. The rule's weights are scaled so that the
+    largest values of the named states and inputs cost 1, as in Bryson's rule.
+    """
+    costs = [terms[index] for index, each in given.items() if each.largest and terms[index]]
+    scale = math.exp(-np.log(costs).mean()) if costs else 1.0
+    Q, R, nx, apart = scale * Q, scale * R, len(Q), dict[str, str]()
+    names = (*lin.state_names, *input_keys(lin))
+    for index, (value, largest) in given.items():
+        matrix, at = (Q, index) if index < nx else (R, index - nx)
+        own = float(matrix[at, at])
+        if terms.any() and not largest and value > 0.0 and own > 0.0:
+            ratio = value / own
+            if not 1.0 / _APART < ratio < _APART:
+                apart[names[index]] = f"{names[index]} is {value:.3g}, by the rule {own:.3g}"
+        matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
+    if apart:
+        warnings.warn(
+            f"the weights given differ in scale from the rule's weights: {listed(apart.values())}; "
+            "one of the two groups will dominate the cost; give largest values (bryson) instead, "
+            "to which the rule's weights are scaled",
+            FflinWarning,
+            stacklevel=4,
+        )
+    return Q, R

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from itertools import pairwise
+from contextlib import contextmanager, suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -103,15 +101,18 @@ def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> t
         while pending:
             start, end, single = pending.pop()
             P = values[-1]
-            single = back(start, end, P) if single is None else single
-            middle = 0.5 * (start + end)
-            half = back(middle, end, P)
-            double = back(start, middle, half)
-            h = end - start
-            # The cubic with these values and derivatives, midway.
-            bend = at(start).rate(double) - at(end).rate(P)
-            between = 0.5 * (double + P) + 0.125 * h * bend
-            if max(_apart(single, double), _apart(between, half)) <= _ACCURACY:
+            middle, h = 0.5 * (start + end), end - start
+            half, accurate = None, False
+            # Over a long step, the mixed coefficients can be indefinite; shorter steps follow.
+            with suppress(np.linalg.LinAlgError):
+                single = back(start, end, P) if single is None else single
+                half = back(middle, end, P)
+                double = back(start, middle, half)
+                # The cubic with these values and derivatives, midway.
+                bend = at(start).rate(double) - at(end).rate(P)
+                between = 0.5 * (double + P) + 0.125 * h * bend
+                accurate = max(_apart(single, double), _apart(between, half)) <= _ACCURACY
+            if accurate and half is not None:
                 times += [middle, start]
                 values += [half, double]
             elif len(times) > _KNOTS_LIMIT or h < 1e-12 * abs(knots[-1] - knots[0]):
@@ -134,7 +135,7 @@ def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array
         P = _symmetric(law.T @ total @ law)
         if not np.isfinite(P).all():
             raise np.linalg.LinAlgError("P changes too fast")
-        worst = max(worst, _imbalance(np.array((P, -total[:nx, :nx], total[:nx, nx:] @ K))))
+        worst = max(worst, imbalance(np.array((P, -total[:nx, :nx], total[:nx, nx:] @ K))))
         gains.append(K)
         costs.append(P)
     return np.array(gains), np.array(costs), worst
@@ -153,67 +154,12 @@ def bounded_by(remedy: str) -> Iterator[None]:
         ) from None
 
 
-class Passed:
-    """P (M, nx, nx), K = R^-1 B' P over time; `sign` is -1 of a P that goes backwards."""
-
-    # Between knots P is a cubic and B a spline; of samples it is what the last one has.
-
-    def __init__(
-        self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float, sign: float
-    ) -> None:
-        from scipy.interpolate import CubicHermiteSpline, CubicSpline
-
-        A, B, Q, R = model
-        self.first, self.last = float(t[0]), float(t[-1])
-        self._P, self.K, self._dt, self._sign = P, K, dt, sign
-        if dt:
-            # A little early, since clocks are rounded.
-            self.starts = [self.first, *(t[1:] - 1e-9 * dt).tolist()]
-            return
-        self.starts = t[:-1].tolist()
-        across = (0, 2, 1)
-        drift, spent = P @ A, K.transpose(across) @ R @ K
-        rate = sign * (drift + drift.transpose(across) + Q - spent)
-        self._cubics = CubicHermiteSpline(t, P, rate, extrapolate=False)
-        powers, of_B = self._cubics.c[::-1], CubicSpline(t, B).c[::-1]
-        pieces = np.zeros((7, *of_B[0].transpose(across).shape))
-        for power, reach in enumerate(np.linalg.solve(R, of_B.transpose(0, 1, 3, 2))):
-            pieces[power : power + 4] += reach @ powers
-        self.pieces = pieces.transpose(1, 0, 2, 3).reshape(len(t) - 1, 7, -1)
-
-    def gain(self, t: float) -> Array:
-        """Return R^-1 B' P (nu, nx), of B and P at a time within the knots."""
-        k = bisect_right(self.starts, t) - 1
-        if self._dt:
-            return self.K[k]
-        x = t - self.starts[k]
-        square = x * x
-        fourth = square * square
-        powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
-        return powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
-
-    def cost(self, t: float) -> Array:
-        """Return P (nx, nx) at a time within the knots."""
-        k = bisect_right(self.starts, t) - 1
-        return self._P[k] if self._dt else self._cubics(t)
-
-    def residual(self, at: Callable[[float], Coefficients]) -> float:
-        """Return the largest relative residual of the differential equation midway."""
-        worst, ends = 0.0, [*self.starts, self.last]
-        for t in (0.5 * (a + b) for a, b in pairwise(ends)):
-            P, (A, S, Q) = self._cubics(t), at(t)
-            drift = P @ A
-            terms = np.array((drift, drift.T, -P @ S @ P, Q, -self._sign * self._cubics(t, 1)))
-            worst = max(worst, _imbalance(terms))
-        return worst
-
-
 def spread(B: Array, R: Array) -> Array:
     """Return B R^-1 B'."""
     return _symmetric(B @ np.linalg.solve(R, B.T))
 
 
-def _imbalance(terms: Array) -> float:
+def imbalance(terms: Array) -> float:
     """Return the norm of a sum relative to the sum of the norms of its terms."""
     size = float(np.linalg.norm(terms, axis=(1, 2)).sum())
     return float(np.linalg.norm(terms.sum(axis=0))) / max(size, 1e-300)

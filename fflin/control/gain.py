@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.analysis.wheels import picked
-from fflin.base.errors import listed
+from fflin.analysis.reduction import picked
+from fflin.base.errors import InputError, listed
 from fflin.base.names import group_of, input_keys
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import cut, grid, matrix, width
@@ -22,6 +22,7 @@ from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
     from fflin.control.riccati import Solution
+    from fflin.linear.exchange import ToolGain
 
 # A larger gain, of more than three joints, is shown by the norms of its blocks.
 _LARGE = 9 * 18
@@ -66,6 +67,11 @@ class Gain(Design):
     regulated : tuple of str (nz,)
         States that are fed back; if empty, all states are fed back. K, P, Q and N are zero for the
         other states.
+    placement : ndarray (7,)
+        Reference of the model: position [m] and quaternion x, y, z, w. Empty if an older file does
+        not contain it.
+    urdf_sha256 : str
+        Hash of the robot of the design, see `Robot`.
 
     Examples
     --------
@@ -78,7 +84,7 @@ class Gain(Design):
     True
     """
 
-    VECTORS: ClassVar = ("poles", "x0", "u0")
+    VECTORS: ClassVar = ("poles", "x0", "u0", "placement")
 
     K: Array
     P: Array
@@ -102,6 +108,10 @@ class Gain(Design):
     robot: str
     weights: str = field(default_factory=str)
     regulated: tuple[str, ...] = field(default_factory=tuple)
+    placement: Array = field(default_factory=lambda: np.zeros(0))
+    urdf_sha256: str = field(default_factory=str)
+    # The model of the design; files do not contain it.
+    _lin: LinearModel | None = field(default=None, repr=False, compare=False)
 
     def __repr__(self) -> str:
         return titled(self, nx=self.K.shape[1], nu=len(self.K))
@@ -121,11 +131,21 @@ class Gain(Design):
             "weights": self.weights,
             "warning": "; ".join(filter(None, (fragility(self), one_sided(self)))),
         }
+        rates, margins = rates_of(self.poles, self.dt), self.margins
+        result = (
+            f"{len(self.poles)} poles, slowest decay {-rates.real.max():.3g} 1/s, "
+            f"smallest damping ratio {float((-rates.real / np.abs(rates)).min()):.2g}"
+        )
+        figures = (
+            f"Riccati residual {self.residual:.1e} ({self.method}); margins for simultaneous "
+            f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
+            f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
+        )
         parts = [
-            f"{_result(self)}\n{fold(f'{head}, frame {self.frame}, {time}')}",
+            f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}",
             f"K ({nu} x {nx}){shown}",
             _poles(self),
-            fold(_figures(self)),
+            fold(figures),
             *(fold(f"{what}: {said}") for what, said in more.items() if said),
         ]
         return "\n\n".join(parts if self.verified else [*parts, NOT_VERIFIED])
@@ -144,6 +164,25 @@ class Gain(Design):
             If python-control is not installed.
         """
         return state_space(([], [], [], -self.K), self.dt, (), self.state_names, self.input_names)
+
+    def to(self, tool: str) -> ToolGain:
+        """Return the gain, u0 and reference in another tool's coordinates, see `LinearModel.to`.
+
+        Raises
+        ------
+        InputError
+            If the gain is from a file, or its model lacks states of the robot.
+        UnknownNameError
+            If there is no such tool.
+        """
+        from fflin.linear.exchange import tool_gain
+
+        if self._lin is None:
+            raise InputError(
+                "the gain was read from a file, which does not contain the model; design the gain "
+                "again, or use lin.to(tool) and T_u K T_left"
+            )
+        return tool_gain(self._lin, self.K, tool)
 
     @cached_property
     def margins(self) -> Margins:
@@ -186,11 +225,13 @@ def make_gain(
         method=solution.method,
         weights=weights,
         regulated=part.state_names,
+        _lin=lin,
     )
 
 
 _FROM_MODEL = (
     *("A", "B", "x0", "u0", "dt", "frame", "robot", "verified"),
+    *("placement", "urdf_sha256"),
     *("state_names", "input_names", "state_units", "input_units"),
 )
 
@@ -275,7 +316,8 @@ def _poles(gain: Gain) -> str:
     else:
         order, heads = np.argsort(-poles.real), ["pole [1/s]", "frequency [rad/s]", "damping"]
         columns = [np.abs(poles), -poles.real / np.abs(poles)]
-    every = [(_pole(poles[i]), *(f"{column[i]:.4g}" for column in columns)) for i in order]
+    shown = [f"{p.real:.5g}" + (f" +- {p.imag:.5g}i" if p.imag else "") for p in poles.tolist()]
+    every = [(shown[i], *(f"{column[i]:.4g}" for column in columns)) for i in order]
     times = Counter(every)
     body = [[*row, f"{times[row]}"] for row in dict.fromkeys(every)]
     if max(times.values()) > 1:
@@ -284,26 +326,3 @@ def _poles(gain: Gain) -> str:
         body = [row[:-1] for row in body]
     title = "poles of A - B K, slowest first"
     return f"{title}\n\n{grid(cut([heads, *body]), 'l')}"
-
-
-def _pole(pole: complex) -> str:
-    return f"{pole.real:.5g}" + (f" +- {pole.imag:.5g}i" if pole.imag else "")
-
-
-def _result(gain: Gain) -> str:
-    rates = rates_of(gain.poles, gain.dt)
-    damping = float((-rates.real / np.abs(rates)).min())
-    return (
-        f"{len(gain.poles)} poles, slowest decay {-rates.real.max():.3g} 1/s, "
-        f"smallest damping ratio {damping:.2g}"
-    )
-
-
-def _figures(gain: Gain) -> str:
-    margins = gain.margins
-    low, high = margins.gain
-    return (
-        f"Riccati residual {gain.residual:.1e} ({gain.method}); margins for simultaneous changes "
-        f"of all inputs: gain {low:.3g} to {high:.3g}, phase {margins.phase:.3g} deg (disk margin "
-        f"{margins.disk:.3g})"
-    )

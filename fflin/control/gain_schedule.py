@@ -1,9 +1,12 @@
-"""Time-varying feedback gain along a trajectory."""
+"""Time-varying gains of feedback and filter along a trajectory."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,7 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import folded
 from fflin.base.validation import Array, number
-from fflin.control.differential_riccati import Passed
+from fflin.control.differential_riccati import Coefficients, imbalance
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same
@@ -32,7 +35,7 @@ class Schedule(Design):
 
     def __repr__(self) -> str:
         of: Any = self
-        time, wide = f"dt={of.dt:g} s, " if of.dt else "", self.passed.K.shape[1]
+        time, wide = f"dt={of.dt:g} s, " if of.dt else "", self.interpolant.K.shape[1]
         return (
             f"{type(self).__name__}('{of.robot}', {len(self.t)} knots, {self.t[0]:g} to "
             f"{self.t[-1]:g} s, {time}nx={of.P.shape[1]}, {self.WIDTH}={wide}, "
@@ -49,19 +52,19 @@ class Schedule(Design):
         Between knots, the gain is computed from the interpolated model and P. A sampled schedule
         returns the gain of the most recent sample.
         """
-        passed = self.passed
-        if type(t) is not float or not passed.first <= t <= passed.last:
+        over_time = self.interpolant
+        if type(t) is not float or not over_time.first <= t <= over_time.last:
             t = self._within(t)
-        return passed.gain(t)
+        return over_time.gain(t)
 
     def _within(self, t: float) -> float:
-        t, passed = number("t", t), self.passed
-        if not passed.first <= t <= passed.last:
-            raise InputError(f"t is {t:g} s, expected {passed.first:g} to {passed.last:g} s")
+        t, over_time = number("t", t), self.interpolant
+        if not over_time.first <= t <= over_time.last:
+            raise InputError(f"t is {t:g} s, expected {over_time.first:g} to {over_time.last:g} s")
         return t
 
     @cached_property
-    def passed(self) -> Passed:
+    def interpolant(self) -> Interpolant:
         """Gain and cost over time."""
         raise NotImplementedError
 
@@ -145,11 +148,10 @@ class GainSchedule(Schedule):
                 "the file of gains contains no trajectory; load one with fflin.Trajectory.load "
                 "and use TrajectoryFeedback"
             )
-        state, made = StateMap(robot), f"the gains are for a model of '{self.robot}'"
-        inputs = Actuation(state).names, self.input_names
+        state, made = StateMap(robot), f"the gain schedule was made for '{self.robot}'"
         for kind, there, own in (
             ("state", state.names, self.state_names),
-            ("input", *inputs),
+            ("input", Actuation(state).names, self.input_names),
         ):
             require_same(made, robot, kind, (own, own), (there, there))
         values: dict[str, Any] = {name: getattr(self, name) for name in ("q", "v", "u")}
@@ -157,10 +159,144 @@ class GainSchedule(Schedule):
 
     def cost_to_go(self, t: float) -> Array:
         """Return P (nx, nx) at time t by cubic interpolation; if sampled, at the latest sample."""
-        return self.passed.cost(self._within(t))
+        return self.interpolant.cost(self._within(t))
 
     @cached_property
-    def passed(self) -> Passed:
+    def interpolant(self) -> Interpolant:
         """Gain and cost over time."""
         model = (self.A, self.B, self.Q, self.R)
-        return Passed(self.t, self.P, self.K, model, self.dt, -1.0)
+        return Interpolant(self.t, self.P, self.K, model, self.dt, -1.0)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FilterSchedule(Schedule):
+    r"""Time-varying Kalman filter for the error e relative to a trajectory.
+
+    With the innovation :math:`\nu = y - y^*(t) - C \hat e - D\,\delta u`,
+
+    .. math:: \dot{\hat e} = A(t)\,\hat e + B(t)\,\delta u + L(t)\,\nu.
+
+    For a sampled filter, the left side is the estimate for the next sample.
+
+    Attributes
+    ----------
+    t : ndarray (M,)
+        Times [s] of the knots: the trajectory's knots, and knots added to interpolate P. For a
+        sampled filter, the sample times.
+    L : ndarray (M, nx, ny)
+        Filter gains. In a sampled filter the last row repeats the gain before it.
+    P : ndarray (M, nx, nx)
+        Covariance of the estimation error; for a sampled filter, before the measurement update.
+    A, B, W : ndarray (M, nx, nx), (M, nx, nu), (M, nx, nx)
+        Linear model and intensity of the disturbance at the knots. A sampled filter has M - 1 of
+        each: the transitions from one sample to the next, and the covariance of the disturbance
+        over that time.
+    C, D, y : ndarray (M, ny, nx), (M, ny, nu), (M, ny)
+        Output matrices, and the outputs along the trajectory.
+    V : ndarray (ny, ny)
+        Intensity of the measurement noise; for a sampled filter, its covariance per sample.
+    residual : float
+        Residual of the Riccati equation, as in `GainSchedule`.
+    state_names, input_names, output_names : tuple of str
+    robot : str
+    dt : float
+        Sampling time [s]; 0 for continuous time.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> filtered = fflin.tvkalman(along, 1e-3, 1e-4, sample=0.1)
+    >>> filtered.dt, filtered.P.shape[1:]
+    (0.1, (18, 18))
+    """
+
+    VECTORS: ClassVar = ("t",)
+    WIDTH: ClassVar = "ny"
+
+    L: Array
+    P: Array
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    y: Array
+    W: Array
+    V: Array
+    residual: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    robot: str
+    dt: float = field(default_factory=float)
+
+    def gain(self, t: float) -> Array:
+        """Return the filter gain L (nx, ny) at time t; see `GainSchedule.gain`."""
+        return super().gain(t).T
+
+    def covariance(self, t: float) -> Array:
+        """Return P (nx, nx) at time t by cubic interpolation; if sampled, at the latest sample."""
+        return self.interpolant.cost(self._within(t))
+
+    @cached_property
+    def interpolant(self) -> Interpolant:
+        """Gain and cost over time."""
+        A, C, L = (each.transpose(0, 2, 1) for each in (self.A, self.C, self.L))
+        return Interpolant(self.t, self.P, L, (A, C, self.W, self.V), self.dt, 1.0)
+
+
+class Interpolant:
+    """P (nx, nx) and K = R^-1 B' P over time; `sign` is -1 if P was integrated backwards."""
+
+    # Between knots P is a cubic and B a spline. A sampled schedule keeps the last sample's values.
+
+    def __init__(
+        self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float, sign: float
+    ) -> None:
+        from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+        A, B, Q, R = model
+        self.first, self.last = float(t[0]), float(t[-1])
+        self._P, self.K, self._dt, self._sign = P, K, dt, sign
+        if dt:
+            # A little early, since clocks are rounded.
+            self.starts = [self.first, *(t[1:] - 1e-9 * dt).tolist()]
+            return
+        self.starts = t[:-1].tolist()
+        across = (0, 2, 1)
+        drift, spent = P @ A, K.transpose(across) @ R @ K
+        rate = sign * (drift + drift.transpose(across) + Q - spent)
+        self._cubics = CubicHermiteSpline(t, P, rate, extrapolate=False)
+        powers, of_B = self._cubics.c[::-1], CubicSpline(t, B).c[::-1]
+        pieces = np.zeros((7, *of_B[0].transpose(across).shape))
+        for power, reach in enumerate(np.linalg.solve(R, of_B.transpose(0, 1, 3, 2))):
+            pieces[power : power + 4] += reach @ powers
+        self.pieces = pieces.transpose(1, 0, 2, 3).reshape(len(t) - 1, 7, -1)
+
+    def gain(self, t: float) -> Array:
+        """Return R^-1 B' P (nu, nx), of B and P at a time within the knots."""
+        k = bisect_right(self.starts, t) - 1
+        if self._dt:
+            return self.K[k]
+        x = t - self.starts[k]
+        square = x * x
+        fourth = square * square
+        powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
+        return powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
+
+    def cost(self, t: float) -> Array:
+        """Return P (nx, nx) at a time within the knots."""
+        k = bisect_right(self.starts, t) - 1
+        return self._P[k] if self._dt else self._cubics(t)
+
+    def residual(self, at: Callable[[float], Coefficients]) -> float:
+        """Return the largest relative residual of the differential equation midway."""
+        worst, ends = 0.0, [*self.starts, self.last]
+        for t in (0.5 * (a + b) for a, b in pairwise(ends)):
+            P, (A, S, Q) = self._cubics(t), at(t)
+            drift = P @ A
+            terms = np.array((drift, drift.T, -P @ S @ P, Q, -self._sign * self._cubics(t, 1)))
+            worst = max(worst, imbalance(terms))
+        return worst

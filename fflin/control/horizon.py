@@ -13,15 +13,15 @@ from fflin.base.errors import FflinWarning, MissingPackageError
 from fflin.base.validation import Array, number, vector
 from fflin.control.policies import Clock
 
-# Of limits, as rows of length 1 and in shares of their size: how well they are kept, what passing a
-# soft one costs, and of more than this multiplier how much it yields; what counts as passed.
-_EXACT, _PRICE, _YIELDS, _PASSED = 1e-9, 1e3, 1.0, 1e-6
+# Settings of DAQP for rows of length 1, relative to the typical width of the limits: tolerance,
+# weight and regularisation of soft limits, and the smallest violation that is reported.
+_EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
 
-# Of a limit's width, what the robot passes it by without a word.
+# Violations by the robot below this fraction of a limit's width are not reported.
 _OVER = 1e-3
 
-# DAQP's infinity, its words for a soft limit and for a plan that passes one, and most iterations.
-_OPEN, _SOFT, _PASSES, _MOST = 1e30, 8, 2, 10_000
+# DAQP's infinity, its code of a soft limit, its exit flag of a softened plan, and most iterations.
+_OPEN, _SOFT, _SOFTENED, _MOST = 1e30, 8, 2, 10_000
 
 
 class Stage(NamedTuple):
@@ -29,8 +29,8 @@ class Stage(NamedTuple):
 
     A: Array  # (nx, nx)
     B: Array  # (nx, nu)
-    K: Array  # (nu, nx), of the regulator that no limit hinders
-    L: Array  # (nu, nu): d = L z - K e costs z'z more than that one
+    K: Array  # (nu, nx), gain of the regulator without limits
+    L: Array  # (nu, nu): d = L z - K e costs z'z more than the regulator
     E: Array  # (m, nx)
     D: Array  # (m, nu)
     low: Array  # (m,)
@@ -69,7 +69,10 @@ class Matrices(NamedTuple):
 
 
 def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
-    """Return e, z and what is limited (N + 1, nx | N nu | m, N nu + nx) of z, or of d, and e_0."""
+    """Return the errors, z and the limited values as linear functions of z, or of d, and e_0.
+
+    The matrices have N nu + nx columns: those of d if `planned` is False and of z if it is True.
+    """
     (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
     e = np.eye(nx, size + nx, size)
     states, efforts, limited = [e], [], []
@@ -85,15 +88,15 @@ def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Arr
 
 @dataclass(frozen=True, eq=False)
 class Horizon:
-    """The samples that a horizon passes over, of which the last N stay."""
+    """Samples of a run for the receding horizon; after them, the last N samples repeat."""
 
     stages: tuple[Stage, ...]
     samples: int  # N
     dt: float
     inputs: tuple[str, ...]
-    acting: NDArray[np.intp]  # the inputs that have limits
+    acting: NDArray[np.intp]  # indices of the inputs that have limits
     limited: tuple[str, ...]
-    ranges: Array  # (2, m), of the values themselves, or of errors of q_b and r_b
+    ranges: Array  # (2, m), limits of the values, or of the errors of q_b and r_b
     robot: str
 
     @cached_property
@@ -101,13 +104,13 @@ class Horizon:
         return self.stages[-self.samples :]
 
     def window(self, t: float) -> tuple[Stage, ...]:
-        """Return the samples ahead; the same object where they are the same."""
+        """Return the N samples from time t on; the same object if they have not changed."""
         k = round(min(t / self.dt, len(self.stages)))
         moves = k < len(self.stages) - self.samples
         return self.stages[k : k + self.samples] if moves else self._last
 
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return the limits (m,) of some samples, and which are soft."""
+        """Return the lower and upper limits (m,) of samples, and which limits are soft."""
         soft = np.tile(np.arange(len(self.limited)) >= len(self.acting), len(stages))
         low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
         return low, high, soft
@@ -130,15 +133,15 @@ class Horizon:
 
 
 class Receding:
-    """The commands of a run, the first of each plan; `at` says what u* and e are at t, q, v."""
+    """Policy that applies the first input of each plan; `at(t, q, v)` returns u* and e."""
 
     def __init__(self, horizon: Horizon, at: Any = None) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
         self.solves = self.softened = self.unfinished = self.passed = 0
         self._worst, self._said, self._over, self._met = 0.0, "", _OVER, ""
-        self._due: tuple[Stage, Array] | None = None  # the sample that ends at the next one
-        if horizon.limited:  # before the first sample, which must not wait
+        self._due: tuple[Stage, Array] | None = None  # the sample that is being applied
+        if horizon.limited:  # prepared here, so that the first sample takes no longer than others
             self._change(horizon.window(0.0))
 
     @property
@@ -163,7 +166,7 @@ class Receding:
         return command
 
     def step(self, t: float, e: Array) -> Array:
-        """Return the command (nu,) as the deviation from its target, at the state's e (nx,)."""
+        """Return the command (nu,) as a deviation from u*, for the error e (nx,)."""
         stages, acting = self.of.window(t), self.of.acting
         now, d = stages[0], -stages[0].K @ e
         if not self.of.limited:
@@ -174,12 +177,12 @@ class Receding:
         self.solves += 1
         self._judge(t, e)
         z, flag = self._solved(free)
-        if flag <= 0:  # once more, from nothing
+        if flag <= 0:  # once more, without a warm start
             self._start()
             z, flag = self._solved(free)
         if flag > 0:
             d += now.L @ z[: len(d)]
-        if flag == _PASSES:
+        if flag == _SOFTENED:
             self._count(t, free + self._G @ z)
         if flag <= 0:
             self.unfinished += 1
@@ -195,7 +198,7 @@ class Receding:
         return d
 
     def _judge(self, t: float, e: Array) -> None:
-        """Note where the robot, which is not quite the linear model, is beyond the soft limits."""
+        """Record violations of soft limits by the robot, which differs from the linear model."""
         if self._due is None:
             return
         (by, d), first = self._due, len(self.of.acting)
@@ -209,11 +212,11 @@ class Receding:
             self._met = f"{self.of.limited[first + at]} by {by_much:.2g} at {t:.4g} s"
 
     def _count(self, t: float, reached: Array) -> None:
-        """Note how far a plan goes beyond the soft limits."""
+        """Record how far a plan violates the soft limits."""
         excess = np.maximum(self._low - reached, reached - self._high) * self._soft
         row = int((shares := excess * self._unit).argmax())
-        self.softened += bool(shares[row] > _PASSED * self._size)
-        if shares[row] > max(self._worst, _PASSED * self._size):
+        self.softened += bool(shares[row] > _VIOLATED * self._size)
+        if shares[row] > max(self._worst, _VIOLATED * self._size):
             sample, at = divmod(row, len(self.of.limited))
             self._worst, when = float(shares[row]), t + (sample + 1) * self.of.dt
             self._said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fflin.analysis.reduction import picked, regulated_part, seen_through
 from fflin.analysis.stabilizability import require_detectable, require_disturbed
-from fflin.analysis.wheels import picked, regulated_part, seen_through
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
@@ -198,7 +198,7 @@ def kalman(
         names of outputs.
     G : array_like (nx, nw), optional
         Input matrix of the disturbance; W is then (nw, nw). With ``G=lin.B`` the disturbance acts
-        at the inputs, and W takes names of inputs.
+        at the inputs; if W is a mapping, its keys are then names of inputs.
     wheel_speeds : bool, optional
         As in `lqr`.
 
@@ -254,8 +254,12 @@ def kalman(
         L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
     poles, margin = solution.ordered(lin.dt)
     return Estimator(
-        *(S.T @ L @ seen, S.T @ L_update @ seen, S.T @ solution.P @ S),
-        *(poles, solution.residual, margin),
+        L=S.T @ L @ seen,
+        L_update=S.T @ L_update @ seen,
+        P=S.T @ solution.P @ S,
+        poles=poles,
+        residual=solution.residual,
+        margin=margin,
         W=S.T @ W @ S,
         V=noises,
         estimated=lin.state_names,

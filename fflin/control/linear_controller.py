@@ -1,4 +1,4 @@
-"""Output feedback by any linear system, such as a controller designed in another tool."""
+"""Output feedback by a linear system: a controller from another tool, or a compensator."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, instance, number, vector
-from fflin.control.policies import Clock, Policy, decider, feedback_of
+from fflin.control.kalman import Compensator
+from fflin.control.policies import Clock, Feedback, Policy, decider, feedback_of
 from fflin.control.systems import fitted, system_of
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.output_kinds import KINDS
-from fflin.dynamics.outputs import Measuring, state_indices
+from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel
@@ -25,12 +25,15 @@ from fflin.linear.sampling import held_exponential
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
-# A pole beyond this share of the fastest is one that grows, and no rounding.
+# A pole counts as unstable if it grows faster than this fraction of the fastest pole.
 _ROUNDING = 1e-6
 
 
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
-    """Return which states the outputs are, gyroscopes after them; InputError of other sensors."""
+    """Return the state index of each output, and the gyroscopes, which are numbered after states.
+
+    Other sensors raise `InputError`.
+    """
     found, gyros = list[int](), list[Gyroscope]()
     for output in state.robot.outputs:
         if isinstance(output, Gyroscope):
@@ -45,7 +48,10 @@ def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
 
 
 class Sample(NamedTuple):
-    """u = u0 + C (z + jump) + D dy, then z, or dz/dt, is A (z + jump) + B dy of dy = y - y0."""
+    """Law u = u0 + C (z + jump) + D dy with dy = y - y0.
+
+    The next z, or dz/dt in continuous time, is A (z + jump) + B dy.
+    """
 
     A: Array
     B: Array
@@ -53,7 +59,7 @@ class Sample(NamedTuple):
     D: Array
     u0: Array
     y0: Array
-    seen: Array  # by which, and `through`, a linear model measures y
+    seen: Array  # C and D of the linear model, which predict y
     through: Array
     jump: Array | float = 0.0
 
@@ -63,16 +69,16 @@ class Compensation:
 
     def __init__(self, size: int, at: Callable[[float], Sample], dt: float = 1.0) -> None:
         self.at, self.dt = at, dt
-        self.estimate: Array = np.zeros(size)  # z of the sample or stage to come
+        self.estimate: Array = np.zeros(size)  # z at the next sample or stage
         self.rates: list[Array] = [self.estimate]
         self.stages = 0
 
     def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
-        """Return the command of a sample, at which y is measured then."""
+        """Return the command of a sample; `measure(sample, u)` returns y."""
         by = self.at(t)
         z = self.estimate + by.jump
         u: Array = by.u0 + by.C @ z
-        if by.D.any():  # of what does not feel u
+        if by.D.any():  # acts on outputs that do not depend on u
             u = u + by.D @ (measure(by, u) - by.y0)
         after = by.A @ z + by.B @ (measure(by, u) - by.y0)
         if self.dt:
@@ -82,7 +88,7 @@ class Compensation:
         return u
 
     def advance(self, shares: Array, last: bool) -> None:
-        """Integrate z to the next stage, by shares of it as the step began and of its rates."""
+        """Integrate z to the next stage from weights of z at the step's start and of its rates."""
         if not self.dt:
             self.estimate, self.stages = shares @ np.array(self.rates), self.stages + 1
             if last:
@@ -90,19 +96,19 @@ class Compensation:
 
 
 class Loop(Compensation):
-    """Policy of a control law on the robot's outputs, relative to its reference."""
+    """Policy that measures a robot's outputs relative to a reference, for a compensator."""
 
     def __init__(
         self, state: StateMap, dt: float, noise: Any, size: int, at: Any, there: Any
     ) -> None:
         super().__init__(size, at, dt)
         self._noise, self._there = noise, there
-        self._still: Array = np.zeros(state.robot.nv)
+        self._at_rest: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
         self._aba, self._clock = Aba(state) if felt else None, Clock(dt)
 
     def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
-        """Return what it does at a sample, and the chart and the state that y is relative to."""
+        """Return the law of a sample, and the chart and state relative to which y is measured."""
         measure, near = self._there(t)
         return self.at(t), measure.state, near
 
@@ -117,25 +123,22 @@ class Loop(Compensation):
             )
         measure, near = self._there(t)
         state, x = measure.state, measure.state.read(q, v, near=near)
-        y: Any = None
-        noise: Any = 0.0 if self._noise is None else None  # one, however often y is asked for
+        noise: Any = 0.0
+        if self._noise is not None:
+            size = len(self.at(t).y0)
+            noise = vector("noise(t)", self._noise(t), size, "one value for each output")
 
         def measured(_: Sample, u: Array) -> Array:
-            nonlocal y, noise
-            if y is None or self._aba:
-                a = self._still
-                if aba := self._aba:
-                    a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
-                y = measure(x, q, v, a)
-            if noise is None:
-                noise = vector("noise(t)", self._noise(t), len(y), "one value for each output")
-            return np.asarray(y + noise)
+            a = self._at_rest
+            if aba := self._aba:
+                a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
+            return np.asarray(measure(x, q, v, a) + noise)
 
         return self.step(t, measured)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class LinearController:
+@dataclass(eq=False, repr=False)
+class LinearController(Feedback):
     r"""Output feedback ``u - u0 = system (y - y0)`` by any linear controller `system`.
 
     .. math:: \dot z = A z + B (y - y_0),\qquad u - u_0 = C z + D (y - y_0),\qquad z(0) = 0
@@ -235,8 +238,8 @@ class LinearController:
                 "the controller is {}, the model is {}; give the continuous model, or sample both "
                 "with the same dt".format(*times)
             )
-        by = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
-        vars(self).update(system=by, sign=1.0)
+        self.system = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
+        self.sign = 1.0  # `system` has it from here on
 
     def __repr__(self) -> str:
         (nu, ny), dt = self.system.D.shape, self.dt
@@ -263,7 +266,7 @@ class LinearController:
             If the robot's states, inputs or outputs differ from the model's. The masses may differ.
         """
         lin, stays = self.lin, self.terms
-        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        state = self.state_map(robot)
         require_sensed(lin, robot, state)
         there = Measuring(state, lin.q), state.read(lin.q, lin.v)
         return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
@@ -318,9 +321,66 @@ def growing(policy: Any) -> tuple[str, ...]:
 
 
 def closed_loop(policy: Any) -> tuple[Array, float, tuple[str, ...]] | None:
-    """Return the matrix of a policy's linear loop, where it has one, its dt [s] and its states."""
+    """Return the closed-loop matrix, dt [s] and state names of a policy with a linear loop."""
     (lin, K), by = feedback_of(policy), decider(policy)
     if isinstance(by, LinearController):
         own = (f"z_{k + 1} of the controller" for k in range(len(by.system.A)))
         return by.loop, by.dt, (*by.lin.state_names, *own)
     return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt, lin.state_names)
+
+
+class OutputFeedback(LinearController):
+    """Feedback of the robot's outputs by a sampled compensator, such as the result of `lqg`.
+
+    At each sample, u - u0 = C z is applied. Then y is measured, and z is advanced to the next
+    sample. Accelerometer outputs are computed with the commanded u, before saturation. The initial
+    estimate of the deviation from the point is zero.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Sampled model that the compensator was designed for.
+    compensator : Compensator
+    noise : callable, optional
+        noise(t) -> (ny,), added to y.
+
+    Raises
+    ------
+    InputError
+        If the compensator was designed for another model, or is not sampled.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> sampled = lin.discretize(0.1)
+    >>> compensator = fflin.lqg(fflin.lqr(sampled), fflin.kalman(sampled, 1e-3, 1e-4))
+    >>> policy = fflin.OutputFeedback(sampled, compensator)
+    >>> fflin.simulate(robot, policy, duration=1.0).u.shape[1]
+    9
+    """
+
+    def __init__(
+        self,
+        lin: LinearModel,
+        compensator: Compensator,
+        noise: Callable[[float], ArrayLike] | None = None,
+    ) -> None:
+        if not isinstance(lin, LinearModel) or not isinstance(compensator, Compensator):
+            raise InputError(
+                f"OutputFeedback got a {type(lin).__name__} and a {type(compensator).__name__}, "
+                "expected a LinearModel and a Compensator, as fflin.lqg returns it"
+            )
+        if not lin.dt or lin.moving:
+            raise InputError(
+                "the model must be sampled and about a fixed point; use lin.discretize(dt), and "
+                "design the gain and the estimator for it"
+            )
+        signals = (compensator.input_names, compensator.output_names, compensator.dt)
+        if signals != (lin.output_names, lin.input_names, lin.dt):
+            raise InputError(
+                f"the compensator was designed for another model than '{lin.robot}' with "
+                f"{len(lin.output_names)} outputs at dt = {lin.dt:g} s; use one model for both"
+            )
+        super().__init__(compensator, lin, noise=noise)
+        self.compensator = compensator

@@ -1,22 +1,23 @@
-"""The linear quadratic regulator of a linear model."""
+"""Linear quadratic regulators: by a Riccati equation, and in closed form on accelerations."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fflin.analysis.mechanics import slopes
+from fflin.analysis.reduction import picked, regulated_part
 from fflin.analysis.stabilizability import require_stabilizable, require_weighed
-from fflin.analysis.wheels import picked, regulated_part
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, dimension
+from fflin.control.default_weights import rule_weights
 from fflin.control.gain import Gain, make_gain
-from fflin.control.riccati import half_size, solve
-from fflin.control.weight_rules import rule_weights
-from fflin.control.weights import Weight, cost_weights
+from fflin.control.riccati import Riccati, Solution, half_size, solve
+from fflin.control.weights import Weight, cost_weights, weight
 from fflin.linear.model import LinearModel
 
 _SHOWN_RESIDUALS = 6
@@ -24,9 +25,9 @@ _SHOWN_RESIDUALS = 6
 # A relative residual above _COARSE is worth a warning; above _USELESS the gain is wrong.
 _COARSE, _USELESS = 1e-8, 1e-3
 
-# A pole that is nearer to the boundary of stability, relative to the others, may be one on it that
-# Q does not weigh and rounding moved.
-_STILL = 1e-6
+# A pole that is closer to the boundary of stability, relative to the others, may lie on it:
+# rounding moves a mode that Q does not weight.
+_NEAR_BOUNDARY = 1e-6
 
 
 def lqr(
@@ -142,6 +143,143 @@ def lqr(
     return make_gain(lin, part, solution, Q, R, cross, rule)
 
 
+def acceleration_lqr(
+    lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight, *, wheel_speeds: bool | None = None
+) -> Gain:
+    r"""Return the linear quadratic regulator with weighted accelerations, in closed form.
+
+    Let the accelerations :math:`a = L u` be the inputs, where L is the lower block of B. A model
+    at rest then has one double integrator per coordinate, :math:`\ddot q_i = s_i a_i`, with
+    s = 1/2 for attitude and s = 1 otherwise. Diagonal weights decouple the coordinates. By (10.2)
+    of docs/derivation.md, the regulator is
+
+    .. math:: k_p = \sqrt{q_p/r_a},\quad k_d = \sqrt{q_v/r_a + 2 s k_p},\quad
+              u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
+
+    and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. The speed of a reaction
+    wheel whose angle is not regulated is a single integrator with k_p = 0. The weight on u is
+    :math:`L^T R_a L`. The gain is computed without this product, so an ill-conditioned inertia does
+    not reduce its accuracy.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Continuous model at rest, without gravity, orbit, springs or dampers. Every coordinate that
+        `lqr` regulates must be actuated. `sampled_cost` converts the weights Q and R of the
+        returned gain for a sampled regulator.
+    Qp, Qv, Ra : array_like (6 + n,) or float, or mapping
+        Diagonal weights on the positions (q_b, r_b, q_m), the velocities and the accelerations. In
+        a mapping {name: weight}, `Qp` takes names of positions; `Qv` and `Ra` take names of
+        velocities.
+    wheel_speeds : bool, optional
+        As in `lqr`.
+
+    Returns
+    -------
+    Gain
+        Its residual refers to the Riccati equation with the accelerations as inputs.
+
+    Raises
+    ------
+    EquilibriumError
+        If the point is not a fixed point.
+    StabilizabilityError
+        If a coordinate is not actuated.
+    InputError
+        If the model is sampled, its dynamics are not double integrators, or a weight is negative or
+        not diagonal. Qp, Ra, and Qv on wheel speeds must be positive.
+    ModelError
+        If the robot's model was changed after it was made.
+
+    References
+    ----------
+    Y. Yang, Analytic LQR design for spacecraft control system based on quaternion model, J.
+    Aerospace Engineering 25(3), 2012: its attitude regulator is the weight Ra = J R J.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
+    >>> gain.method, round(float(gain.poles.real.max()), 3)
+    ('closed form', -0.707)
+    """
+    require_fixed_point(lin)
+    if lin.dt:
+        raise InputError(
+            "lin is sampled, expected a continuous model; for a sampled regulator give the Q and R "
+            "of the continuous gain to sampled_cost and lqr"
+        )
+    whole, lin = lin, regulated_part(lin, wheel_speeds)
+    s, L = _integrators(lin)
+    double, half, m = s != 0.0, len(whole.A) // 2, len(s)
+    positions, velocities = lin.state_names[:-m], lin.state_names[-m:]
+    qp = _diagonal("Qp", Qp, whole.state_names[:half], positions, definite=True)
+    qv = _diagonal("Qv", Qv, whole.state_names[half:], velocities, definite=False)
+    ra = _diagonal("Ra", Ra, whole.state_names[half:], velocities, definite=True)
+    if not (double | (qv > 0.0)).all():
+        name = velocities[int((double | (qv > 0.0)).argmin())]
+        raise InputError(f"Qv is 0 for {name}, expected a positive weight on a wheel's speed")
+    to_positions = np.eye(m)[double]
+    Q = np.diag(np.concatenate((qp, qv)))
+    with np.errstate(all="ignore"):
+        kp = to_positions.T @ np.sqrt(qp / ra[double])
+        kd = np.sqrt(qv / ra + 2.0 * s * kp)
+        fast = -0.5 * (kd + np.sqrt((kd * kd - 4.0 * s * kp).astype(complex)))
+        poles = np.concatenate((fast, (s * kp / fast)[double]))
+        P11, P12 = np.diag((kp * ra * kd / s)[double]), to_positions * (ra * kp)
+        P = np.block([[P11, P12], [P12.T, np.diag(ra * kd)]])
+        inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
+        K = inverse @ np.hstack((to_positions.T * kp[double], np.diag(kd)))
+        try:
+            accelerated = np.vstack((np.zeros_like(to_positions), np.eye(m)))
+            residual = Riccati(lin.A, accelerated, Q, np.diag(ra), None, 0.0).trial(P).residual
+            sound = bool((poles.real < 0.0).all() and np.isfinite(K).all())
+        except np.linalg.LinAlgError:
+            sound = False
+    if not sound:
+        raise InputError(
+            "the solution overflows with these weights; scale Qp, Qv and Ra so that they differ "
+            "less"
+        )
+    R = L.T @ (ra[:, None] * L)
+    solution = Solution(P, K, poles, residual, "closed form")
+    return make_gain(whole, lin, solution, Q, 0.5 * R + 0.5 * R.T, None)
+
+
+def _integrators(lin: LinearModel) -> tuple[Array, Array]:
+    """Return s (m,), 0 for a velocity without its coordinate, and L (m, nu) of integrators."""
+    p = sum(name.startswith(("q_", "r_")) for name in lin.state_names)
+    s: Array = lin.A[:p, p:].sum(axis=0)
+    L, double = lin.B[p:], np.diag(s)[s != 0.0]
+    expected = np.zeros_like(lin.A)
+    expected[: len(double), p:] = double
+    if len(double) != p or not np.array_equal(lin.A, expected) or lin.B[:p].any():
+        raise InputError(
+            "the model has other dynamics than double integrators, expected a model at rest "
+            "without gravity, orbit, springs or dampers; use lqr"
+        )
+    sizes = np.abs(L).max(axis=1, keepdims=True)
+    if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < len(s):
+        require_stabilizable(lin)
+        raise StabilizabilityError(
+            "the inputs do not accelerate every coordinate independently; use lqr"
+        )
+    return s, L
+
+
+def _diagonal(
+    what: str, value: Weight, names: Sequence[str], kept: Sequence[str], *, definite: bool
+) -> Array:
+    """Return the diagonal of a weight on `kept`, given by values or names for all `names`."""
+    if not isinstance(value, Mapping) and dimension(what, value) == 2:
+        raise InputError(
+            f"{what} is a matrix, expected its diagonal; for a full weight matrix use lqr"
+        )
+    whole = weight(what, value, names, definite=definite and len(kept) == len(names))
+    diagonal = whole.diagonal()[[names.index(name) for name in kept]]
+    return weight(what, diagonal, kept, definite=definite).diagonal()
+
+
 def require_fixed_point(lin: LinearModel) -> None:
     """Raise `EquilibriumError` if f0 is not zero, `ModelError` if the robot has changed."""
     if not isinstance(lin, LinearModel):
@@ -177,16 +315,15 @@ def _difference(a: Array, b: Array, c: Array) -> Array:
     return np.where(np.abs(difference) > rounding, difference, 0.0)
 
 
-def _still(poles: Any, dt: float) -> bool:
-    """Whether a pole of a stable loop hardly moves."""
+def _near_boundary(poles: Any, dt: float) -> bool:
+    """Whether a pole of a stable loop is close to the boundary of stability."""
     decay = 1.0 - np.abs(poles) if dt else -poles.real
-    return decay.min() < _STILL * np.abs(poles - 1.0 if dt else poles).max()
+    return decay.min() < _NEAR_BOUNDARY * np.abs(poles - 1.0 if dt else poles).max()
 
 
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
-    arguments = (lin.A, lin.B, Q, R, N, lin.dt)
-    structured = half_size(*arguments)
-    if structured is not None and not _still(structured.poles, lin.dt):
+    structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
+    if structured is not None and not _near_boundary(structured.poles, lin.dt):
         return structured
     # A general solver would fail without saying which mode is to blame.
     require_stabilizable(lin)
@@ -198,7 +335,7 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
     if structured is not None:
         return structured
     try:
-        solution = solve(*arguments)
+        solution = solve(lin.A, lin.B, Q, R, N, lin.dt)
         if solution.residual > _USELESS:
             raise np.linalg.LinAlgError("the weights are too badly scaled")
     except np.linalg.LinAlgError as error:

@@ -12,7 +12,7 @@ ACCURACY = 1e-5
 
 _POINTS = 400
 
-# A factor on the gain below this is none: a loop with an integrator is infinite at rest.
+# A smaller gain factor counts as zero: with an integrator, the gain is infinite at rest.
 _NOTHING = 1e-6
 
 
@@ -74,7 +74,7 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
 def gain_crossings(A: Array, B: Array, C: Array, D: Array, bound: float) -> tuple[Any, Any]:
     """Return eigenvalues (.., 2 nx), and which are imaginary: there the gain crosses the bound.
 
-    One too many of these costs only another evaluation.
+    A superfluous crossing costs only one more evaluation of the response.
     """
     inverse = np.linalg.inv(bound**2 * np.eye(D.shape[1]) - D.T @ D)
     F = A + B @ inverse @ D.T @ C

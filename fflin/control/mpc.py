@@ -11,26 +11,25 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError, listed
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
+from fflin.base.process import in_one_thread
 from fflin.base.tables import folded
-from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array, number, whole
 from fflin.control.differential_riccati import bounded_by, samples_back
 from fflin.control.gain import Gain
 from fflin.control.horizon import Horizon, Matrices, Receding, Stage
 from fflin.control.lqr import lqr
-from fflin.control.policies import Policy, StateFeedback
-from fflin.control.saturation import saturation
+from fflin.control.policies import Feedback, Policy, StateFeedback
+from fflin.control.saturation import input_limits
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import asks_steady, held_stages, steady_regulator, tvlqr
 from fflin.control.weights import Weight, sampled_cost, weight
 from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import moving_error
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import range_of
 from fflin.robot.limits import chosen_limits
 
-# Entries of the matrices that take inputs to states and limits, some 160 MB.
+# Most entries of the matrices that map inputs to states and limits: 160 MB.
 _MOST = 20_000_000
 
 
@@ -163,8 +162,8 @@ class _Shown:
         return folded((repr(self), *(f"{key}: {', '.join(at)}" for key, at in same.items())))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Mpc(_Shown):
+@dataclass(eq=False, repr=False)
+class Mpc(_Shown, Feedback):
     """Model predictive controller about a point.
 
     Attributes
@@ -187,9 +186,7 @@ class Mpc(_Shown):
 
     def bind(self, robot: Any) -> Policy:
         """Return policy(t, q, v) -> u for a robot with the model's states and inputs."""
-        lin = self.lin
-        StateFeedback(lin, self.gain.K).bind(robot)  # refuses another robot
-        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        lin, state = self.lin, self.state_map(robot)
         fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
         near[fed] = lin.x0
 
@@ -199,7 +196,7 @@ class Mpc(_Shown):
         return Receding(self.horizon, at)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(eq=False, repr=False)
 class TrajectoryMpc(_Shown, TrajectoryFeedback):
     """Model predictive controller along a trajectory and about its end.
 
@@ -219,18 +216,15 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
 
     def bind(self, robot: Any) -> Policy:
         """Return policy(t, q, v) -> u for a robot with the trajectory's states and inputs."""
-        super().bind(robot)  # refuses another robot
-        state = StateMap(robot, frame=self.frame)
-
-        def at(t: float, q: Array, v: Array) -> tuple[Array, Array]:
-            q_star, v_star, u_star = self.commanded(t)
-            return u_star, moving_error(state, q_star, v_star, q, v)
-
-        return Receding(self.horizon, at)
+        return Receding(self.horizon, self.deviation(robot))
 
 
 def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any], Array]:
-    """Return what has limits, where among inputs, states and outputs, a stage's rows, ranges."""
+    """Return the names of limited signals, their indices, a function for a stage, and ranges.
+
+    The indices are among inputs, states and outputs. The function returns a stage's E, D, low and
+    high for its output matrices and target.
+    """
     if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
         raise InputError("lin was loaded from a file, which contains no robot; linearise again")
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
@@ -246,7 +240,7 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
         parts[k] = {key: part[key] for key in keys if key not in own} if own else part
     acting = chosen_limits(robot, parts if several else parts[0])[0]
     found |= {name: acting[name] for name in states if name in acting}
-    of_inputs = np.array(saturation(robot, acting, robot.neutral(), 1.0, 1)[:2])
+    of_inputs = np.array(input_limits(robot, acting))
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
     others = [found.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
     low, high = np.hstack((of_inputs, np.array(others).T))
@@ -268,7 +262,7 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
 def _about(
     lin: LinearModel, cost: Any, Qf: Any, samples: int, dt: float, names: Any, rows: Any
 ) -> tuple[Callable[[Horizon], Mpc], list[Stage]]:
-    """Return what makes the controller, and its samples."""
+    """Return a function that makes the controller about a point, and its stages."""
     (Q, R, weights), sampled = cost, lin.discretize(dt)
     given = (Q, R) if Q is None or R is None else sampled_cost(lin, dt, Q, R)
     gain = lqr(sampled, *given, weights=weights)
@@ -292,13 +286,13 @@ def _about(
 def _along(
     traj: LinearTrajectory, cost: Any, Qf: Any, samples: int, dt: float, _: Any, rows: Any
 ) -> tuple[Callable[[Horizon], TrajectoryMpc], list[Stage]]:
-    """Return what makes the controller, and its samples, those about the end last."""
+    """Return a function that makes the controller along a trajectory, and its stages."""
     schedule = tvlqr(traj, cost[0], cost[1], Qf, dt, weights=cost[2])
     follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
     Q, R, models, end = schedule.Q, schedule.R, along(traj.resampled(dt)), follows.end
 
     def about(of: Any, u: Array) -> Any:
-        # Of the base's place the error is limited.
+        # For the pose of the base, the error is limited.
         x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
         return rows(of.C, of.D, u, x, of.y0)
 
@@ -314,7 +308,7 @@ def _along(
 
 
 def _stage(total: Array, whole: Array, K: Array, P: Array, limited: tuple[Array, ...]) -> Stage:
-    """Return a sample of that cost, transition and gain, where P is the cost from its end on."""
+    """Return the stage of a sample from its cost, transition and gain, and the later cost P."""
     A, B = np.split(whole, [len(P)], axis=1)
     L = np.linalg.inv(np.linalg.cholesky(total[len(P) :, len(P) :] + B.T @ P @ B)).T
     return Stage(A, B, K, L, *limited)

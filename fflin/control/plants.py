@@ -11,9 +11,9 @@ from fflin.linear.model import LinearModel
 from fflin.robot.inputs import ReactionWheel
 from fflin.robot.robot import Robot
 
-# Less than this, relative to the largest, is no difference.
+# A smaller difference, relative to the largest effect, is rounding.
 _ROUNDING = 1e-9
-# What a coordinate, or a rate, causes counts as this share of what the largest of them does.
+# Effects of a state count only if they exceed this fraction of the largest effect of any state.
 _LEAST = 1e-2
 
 
@@ -21,7 +21,7 @@ def notes_of(policy: Any, robot: Robot) -> tuple[str, ...]:
     """Return a note on how a robot differs from a policy's design; none if they are the same."""
     design = getattr(policy, "design", None)  # of an allocation
     along = getattr(policy, "trajectory", None)
-    # An allocation asks its design for wrenches, and the robot's own wheels for torques.
+    # An allocation commands the wrenches of its design, and torques of the robot's own wheels.
     own = {each.name: each for each in robot.inputs if isinstance(each, ReactionWheel)}
     asked = () if design is None else design.inputs
     inputs = [own.get(x.name, x) if isinstance(x, ReactionWheel) else x for x in asked]
@@ -51,18 +51,18 @@ def notes_of(policy: Any, robot: Robot) -> tuple[str, ...]:
 
 
 def _caused(lin: LinearModel, whole: bool, rows: list[int]) -> tuple[Array, Array]:
-    """Return the rows of what inputs cause, and of what states do: of a part, what inputs see."""
+    """Return the effects of inputs and of states; of a reduced model, of A B and A^2 B."""
     A, B = lin.A - np.eye(len(lin.A)) * bool(lin.dt), lin.B
     moved = A if whole else np.hstack((A @ B, A @ A @ B))
     return B[rows], np.column_stack((moved, lin.f0))[rows]
 
 
 def _usual(lin: LinearModel, own: Array, other: Array) -> Array:
-    """Return sizes (nx + 1,) below which what each state causes, and f0, is small beside others."""
+    """Return sizes (nx + 1,) below which the effect of each state, and f0, is negligible."""
     size = displacements(lin, 1.0)
     both = np.maximum(*(np.linalg.norm(each[:, :-1], axis=0) for each in (own, other)))
     largest = (both.reshape(2, -1) * size).max(axis=1, keepdims=True)
-    # Of f0, the point's own acceleration, what a displacement of usual size causes.
+    # f0 is compared with the effect of a displacement of the usual size.
     return np.append(_LEAST * largest / size, largest[0])
 
 

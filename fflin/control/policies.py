@@ -12,15 +12,12 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, as_double
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import Frame, StateMap
-from fflin.dynamics.state_rows import readout
+from fflin.dynamics.state import Frame, StateMap, readout
+from fflin.kernel.allocation import least_squares, solve
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
-
-# The added rows choose the least of what does the same; their effect is below rounding.
-_LEAST = 1e-7
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
@@ -36,8 +33,24 @@ class Gridded(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
-class StateFeedback:
+class Feedback:
+    """Law of states or outputs about the point of a model; subclasses follow grids and motions."""
+
+    lin: LinearModel
+
+    def state_map(self, robot: Robot) -> StateMap:
+        """Return the robot's states in the law's axes; `InputError` if the law does not fit."""
+        state = StateMap(robot, reference=self.lin.reference, frame=self.lin.frame)
+        require_fit(self.lin, robot, state)
+        return state
+
+    def bind(self, robot: Robot) -> Policy:
+        """Return policy(t, q, v) -> u for a robot."""
+        raise NotImplementedError
+
+
+@dataclass(eq=False)
+class StateFeedback(Feedback):
     """State feedback ``u = u0 - K (x - x0)`` about the point of a linear model.
 
     The angle of a continuous joint is unwrapped to within half a turn of x0.
@@ -85,7 +98,7 @@ class StateFeedback:
         if not np.isfinite(K).all():
             raise InputError("K has entries that are NaN or infinite, expected finite numbers")
         K.setflags(write=False)
-        object.__setattr__(self, "K", K)
+        self.K = K
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of u = offset - K x for a robot's whole state x, and its x0."""
@@ -105,18 +118,12 @@ class StateFeedback:
         InputError
             If the robot's states or inputs differ from the model's. Its masses may differ.
         """
-        lin = self.lin
-        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-        require_fit(lin, robot, state)
+        state = self.state_map(robot)
         command = readout(state, *self.terms(state))
-
-        def policy(_: float, q: Array, v: Array) -> Array:
-            return command(q, v)
-
-        return policy
+        return lambda _, q, v: command(q, v)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Allocation:
     """Allocation of a policy's commands to thrusters and motors within their limits.
 
@@ -138,7 +145,7 @@ class Allocation:
     >>> wheels = [each for each in cubesat.inputs if isinstance(each, fflin.ReactionWheel)]
     >>> design = cubesat.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce(), *wheels])
     >>> sampled = fflin.linearize(design).discretize(0.1)
-    >>> law = fflin.StateFeedback(sampled, fflin.acceleration_lqr(sampled, 1.0, 1.0, 1.0).K)
+    >>> law = fflin.StateFeedback(sampled, fflin.lqr(sampled).K)
     >>> fflin.simulate(cubesat, fflin.Allocation(law, design), duration=0.2).u.shape[1]
     15
     """
@@ -166,32 +173,43 @@ class Allocation:
                 f"the design's joints differ from the joints of '{robot.name}'; give the same "
                 "robot, with other inputs, as the design"
             )
-        require_turns(f"the design is a variant of '{self.design.name}'", self.design.nq, robot)
-        frame, reference = axes_of(self)
-        asked, given = (
-            StateMap(each, reference=reference, frame=frame) for each in (self.design, robot)
-        )
-        asking, giving = Actuation(asked), Actuation(given)
-        free = np.full(len(asking.names), np.inf)
-        inner = Law(bound(self.policy, self.design), asking.names, (-free, free), np.inf)
-        data, own = robot.create_data(), self.design.create_data()
+        require_turns(f"the design was made for '{self.design.name}'", self.design.nq, robot)
+        return AllocatedPolicy(self, robot)
+
+
+class AllocatedPolicy:
+    """Policy of an `Allocation` for one robot; `advance` is that of the inner policy, or None."""
+
+    def __init__(self, allocation: Allocation, robot: Robot) -> None:
+        frame, reference = axes_of(allocation)
+        self._states = [
+            StateMap(each, reference=reference, frame=frame) for each in (allocation.design, robot)
+        ]
+        self._design, self._robot = map(Actuation, self._states)
+        names = self._design.names
+        free = np.full(len(names), np.inf)
+        inner = bound(allocation.policy, allocation.design)
+        self._command = Law(inner, names, (-free, free), np.inf)
+        self.advance = self._command.advance
+        self._data, self._design_data = robot.create_data(), allocation.design.create_data()
         limits, open_ = limits_of(robot), (-np.inf, np.inf)
-        least, most = np.array([limits.get(name, open_) for name in giving.names]).T
+        self._least, self._most = np.array(
+            [limits.get(name, open_) for name in self._robot.names]
+        ).T
 
-        def policy(t: float, q: Array, v: Array) -> Array:
-            u = inner(t, q, v)
-            force = asking.columns(data, q) @ asking.in_base_axes(asked.chart(q), u)
-            columns = giving.columns(data, q)
-            for held in giving.held:
-                columns = columns.copy()
-                columns[:, held.columns] = columns[:, held.columns] @ given.chart(q).R.T
-            M = asked.project(pin.crba(self.design.model, own, q).T)
-            factor = np.linalg.cholesky(M)
-            A, b = np.linalg.solve(factor, columns), np.linalg.solve(factor, force)
-            return nearest(A, b, least, most)
-
-        vars(policy)["advance"] = inner.advance
-        return policy
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the inputs (nu,) whose force is nearest to the force of the inner command."""
+        asked, given = self._states
+        u = self._design.in_base_axes(asked.chart(q), self._command(t, q, v))
+        force = self._design.columns(self._data, q) @ u
+        columns = self._robot.columns(self._data, q)
+        for held in self._robot.held:
+            columns = columns.copy()
+            columns[:, held] = columns[:, held] @ given.chart(q).R.T
+        M = asked.project(pin.crba(asked.robot.model, self._design_data, q).T)
+        factor = np.linalg.cholesky(M)
+        A, b = np.linalg.solve(factor, columns), np.linalg.solve(factor, force)
+        return nearest(A, b, self._least, self._most)
 
 
 class Clock:
@@ -221,7 +239,8 @@ def axes_of(policy: Any) -> tuple[Frame | None, pin.SE3 | None]:
     lin, _ = feedback_of(policy)
     if lin is not None:
         return lin.frame, lin.reference
-    return getattr(decider(policy), "frame", None), None
+    by = decider(policy)
+    return getattr(by, "frame", None), getattr(by, "origin", None)
 
 
 def bound(policy: Any, robot: Robot) -> Policy:
@@ -242,50 +261,32 @@ def feedback_of(policy: Any) -> tuple[LinearModel | None, Array | None]:
 
 
 def fed_back(policy: Any) -> tuple[str, ...]:
-    """Return the names of the states that a policy about a model's point feeds back."""
-    lin, K = feedback_of(policy)
-    if lin is None:
+    """Return the names of the states that a policy feeds back, as far as that is known."""
+    (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
+    if schedule is not None:
+        K = np.abs(schedule.K).max(axis=0)  # the largest over time
+    of: Any = lin if schedule is None else schedule
+    if of is None:
         return ()
-    used = np.ones(len(lin.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
-    return tuple(name for name, size in zip(lin.state_names, used, strict=True) if size)
+    used = np.ones(len(of.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
+    return tuple(name for name, size in zip(of.state_names, used, strict=True) if size)
 
 
 def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
-    """Return u (k,) within its bounds (k,) that makes A u nearest to b, the least of these."""
-    size, unit = float(np.linalg.norm(b)), float(np.linalg.norm(A))
-    if size == 0.0 or unit == 0.0:
-        return np.clip(np.zeros(len(least)), least, most)
-    # Scaled to 1, as the solvers stop at absolute figures.
-    rows = np.vstack((A / unit, _LEAST * np.eye(len(least))))
-    wanted = np.concatenate((b / size, np.zeros(len(least))))
-    low, high = least * (unit / size), most * (unit / size)
-    high = np.maximum(high, low + 1e-15)  # the solver takes no bounds that are equal
-    # The rounding of what cannot be given would drown the added rows: the second time it is gone.
-    for _ in range(2):
-        given = _solved(rows, wanted, low, high, least == 0.0)
-        wanted[: len(b)] = rows[: len(b)] @ given
-    return np.clip(given * (size / unit), least, most)
+    """Return u (k,) within its bounds (k,) that makes A u nearest to b, the smallest of these."""
+    numbers, size = [0.0] * len(least), len(b)
+    # The entries of a list are read faster than the entries of an array.
+    problem = least_squares(least.tolist(), most.tolist(), size)._replace(
+        columns=np.concatenate((A.T.ravel(), b)),
+        R=numbers * len(least),
+        state=[0] * len(least),
+        **{name: numbers.copy() for name in ("x", "s", "low", "high")},
+    )
+    solve(problem, size, 0)
+    return np.array(problem.x)
 
 
-def _solved(
-    rows: Array, wanted: Array, low: Array, high: Array, pushing: NDArray[np.bool_]
-) -> Array:
-    from scipy.optimize import lsq_linear, nnls
-
-    free, given = rows[:, ~pushing], np.zeros(len(low))
-    # Most often no other bound is met: thrusts without a largest one, the others without any.
-    Q, R = np.linalg.qr(free)
-    apart = rows[:, pushing] - Q @ (Q.T @ rows[:, pushing])
-    if pushing.any():
-        given[pushing] = nnls(apart, wanted - Q @ (Q.T @ wanted))[0]
-    given[~pushing] = np.linalg.solve(R, Q.T @ (wanted - rows[:, pushing] @ given[pushing]))
-    if (given < low).any() or (given > high).any():
-        solved: Array = lsq_linear(rows, wanted, (low, high), method="bvls", tol=1e-20).x
-        return solved
-    return given
-
-
-def pushes_every_way(W: Array, pushing: NDArray[np.bool_]) -> bool:
+def gives_every_wrench(W: Array, pushing: NDArray[np.bool_]) -> bool:
     """Whether columns W (6, k), of which some only push, together give every wrench."""
     # They do where the rank is 6 and some thrusts, all of them positive, cancel one another.
     from scipy.optimize import nnls
@@ -300,7 +301,7 @@ def pushes_every_way(W: Array, pushing: NDArray[np.bool_]) -> bool:
     return bool(nnls(both, -both.sum(axis=1))[1] < 1e-9)
 
 
-def thrusters_push_every_way(robot: Robot) -> bool:
+def thrusters_give_every_wrench(robot: Robot) -> bool:
     """Whether a robot has thrusters that, with what else acts on its base, push it every way."""
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust")
@@ -308,4 +309,4 @@ def thrusters_push_every_way(robot: Robot) -> bool:
         return False
     W = actuation.columns(robot.create_data(), robot.neutral())[:6]
     pushing = np.isin(np.arange(W.shape[1]), thrusters)
-    return pushes_every_way(W, pushing)
+    return gives_every_wrench(W, pushing)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
@@ -13,6 +12,9 @@ from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
 
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
+
+# Jacobians are integrated by a quarter of these steps, but by no more than this number.
+_MOST_OF_JACOBIANS = 16
 
 Point = tuple[Array, Array]
 
@@ -32,11 +34,6 @@ class Shooting:
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
-    def halved(self, intervals: NDArray[np.intp]) -> "Shooting":
-        """Return it with a knot in the middle of some intervals."""
-        middle = self.t[intervals] + 0.5 * self.h[intervals]
-        return Shooting(self.state.robot, np.insert(self.t, intervals + 1, middle), self.held)
-
     def between(self, start: Point, end: Point) -> Array:
         """Return the step z (nx,) from a point to another; wheels may be at any angle."""
         state = self.state
@@ -54,21 +51,38 @@ class Shooting:
 
     def missed(self, q: Array, v: Array, u: Array) -> Array:
         """Return how far the ends of the intervals are from the next knots (N, nx)."""
-        flow = self._flow(q, v, u)
-        knots = enumerate(zip(q[1:], v[1:], strict=True))
+        return self.apart(q, v, self.parts(q, v, u, 1))
+
+    def apart(self, q: Array, v: Array, parts: Point) -> Array:
+        """Return how far the last parts of the intervals are from the next knots (N, nx)."""
+        knots, ends = zip(q[1:], v[1:], strict=True), (each[:, -1] for each in parts)
         return np.array(
-            [self.between(knot, flow.end(k, self.steps, q[k], v[k])) for k, knot in knots]
+            [self.between(*pair) for pair in zip(knots, zip(*ends, strict=True), strict=True)]
         )
+
+    def parts(self, q: Array, v: Array, u: Array, count: int) -> Point:
+        """Return q and v (N, count, ..) at equal parts of the motion from each knot to its end."""
+        flow, knots = self._flow(q, v, u), list(zip(q, v, strict=True))[:-1]
+        rows = [self._interval(flow, k, knot, count) for k, knot in enumerate(knots)]
+        return np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
 
     def flown(self, start: Point, u: Array, parts: int = 1) -> Point:
         """Return q and v of the motion from a point under inputs, so many rows an interval."""
-        rows, steps = parts * (len(self.t) - 1), max(1, self.steps // parts)
-        q, v = (np.tile(each, (rows + 1, 1)) for each in start)
-        flow = self._flow(q[::parts], v[::parts], u)
-        for row in range(rows):
-            k, part = divmod(row, parts)
-            over = (part / parts, (part + 1) / parts)
-            q[row + 1], v[row + 1] = flow.end(k, steps, q[row], v[row], over)
+        N, (q, v) = len(self.t) - 1, ([each] for each in start)
+        flow = self._flow(np.tile(q, (N + 1, 1)), np.tile(v, (N + 1, 1)), u)
+        for k in range(N):
+            rows = self._interval(flow, k, (q[-1], v[-1]), parts)
+            q.extend(rows[0])
+            v.extend(rows[1])
+        return np.array(q), np.array(v)
+
+    def _interval(self, flow: Flow, k: int, at: Point, parts: int) -> tuple[list[Array], ...]:
+        """Return q and v at the ends of equal parts of an interval."""
+        q, v, steps = list[Array](), list[Array](), max(1, self.steps // parts)
+        for part in range(parts):
+            at = flow.end(k, steps, *at, (part / parts, (part + 1) / parts))
+            q.append(at[0])
+            v.append(at[1])
         return q, v
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
@@ -81,12 +95,20 @@ class Shooting:
             if np.abs(missed - before).max() <= accuracy:
                 break
 
-    def slopes(self, q: Array, v: Array, u: Array) -> list[Array]:
-        """Return Jacobians of the intervals' ends over z, the input there and the next one."""
+    def slopes(
+        self, q: Array, v: Array, u: Array, parts: int = 1
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return Jacobians of the intervals' ends over z, the input there and the next one.
+
+        The last array (N, parts - 1, nx, nx + 2 nu) has the Jacobians, side by side, of the points
+        between equal parts of the intervals.
+        """
         # By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
         flow, (nx, nu), steps = self._flow(q, v, u), (len(self._size), u.shape[1]), self.steps // 4
+        steps = min(steps, _MOST_OF_JACOBIANS)
         h: Array = self.h[:, None, None] / steps
         Z = np.tile(np.eye(nx, nx + 2 * nu), (len(q) - 1, 1, 1))
+        shares, inside = np.arange(1, parts) / parts * steps, list[Array]()
         at = list(zip(q, v, strict=True))[:-1]
 
         def rates(half: int) -> tuple[Array, Array]:
@@ -104,13 +126,20 @@ class Shooting:
         last = rates(0)
         for step in range(steps):
             F = last, rates(2 * step + 1), rates(2 * step + 2)
-            total, rate = np.zeros_like(Z), np.zeros_like(Z)
+            total, rate, before = np.zeros_like(Z), np.zeros_like(Z), Z
             last = F[2]
             for i, share, weight in ((0, 0.0, 1.0), (1, 0.5, 2.0), (1, 0.5, 2.0), (2, 1.0, 1.0)):
                 rate = F[i][0] @ (Z + share * h * rate) + F[i][1]
                 total = total + weight * rate
             Z = Z + h / 6.0 * total
-        return np.split(Z, (nx, nx + nu), axis=2)
+            begin, end = (h * (f[0] @ z + f[1]) for f, z in ((F[0], before), (last, Z)))
+            for s in shares[(shares >= step) & (shares < step + 1)] - step:  # cubics of Hermite
+                bend = (
+                    s * (1.0 - s) * ((1.0 - s) * begin - s * end + (2.0 * s - 1.0) * (Z - before))
+                )
+                inside.append(before + s * (Z - before) + bend)
+        A, B, D = np.split(Z, (nx, nx + nu), axis=2)
+        return A, B, D, np.array(inside).reshape(parts - 1, *Z.shape).swapaxes(0, 1)
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
         """Return knots on cubics from a point to another, and inputs near to what these take."""

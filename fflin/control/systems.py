@@ -45,13 +45,14 @@ def system_of(given: Any) -> System:
         given = _realised(given)
     if not all(hasattr(given, key) for key in "ABC"):
         return _checked((), (), (), as_double("system", given))
-    names = [getattr(given, f"{kind}_labels", ()) for kind in ("input", "output")]
-    if hasattr(given, "input_names"):
-        names = [given.input_names, given.output_names]
+    inputs, outputs = (
+        getattr(given, f"{kind}_names", getattr(given, f"{kind}_labels", ()))
+        for kind in ("input", "output")
+    )
     dt = getattr(given, "dt", None)
     # SciPy's continuous systems have no names, and None for dt.
-    dt = 0.0 if dt is None and not names[0] else dt
-    return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, *names)
+    dt = 0.0 if dt is None and not inputs else dt
+    return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
 
 def _realised(given: Any) -> Any:
@@ -101,11 +102,10 @@ def _read(path: Path) -> System:
             found = struct  # of MATLAB
         dt = found.get("dt", found.get("Ts"))
         dt = None if dt is None else float(np.asarray(dt).item())
-        names = (
+        inputs, outputs = (
             texts(found.get(f"{kind}_names", found.get(f"{kind.title()}Name", ())))
             for kind in ("input", "output")
         )
-        said = (dt, *names)
     A, B, C, D = (found.get(key) for key in "ABCD")
     if any(each is None for each in (A, B, C)):
         if D is None or A is not None:
@@ -116,22 +116,22 @@ def _read(path: Path) -> System:
             )
         A = B = C = ()
     try:
-        return _checked(A, B, C, D, *said)
+        return _checked(A, B, C, D, dt, inputs, outputs)
     except FflinError as error:
         raise type(error)(f"{path}: {error}") from None
 
 
 def fitted(system: System, lin: LinearModel) -> System:
     """Return a system over all outputs and inputs of a model, in their order, by its names."""
-    columns = _places("input", system.inputs, system.D.shape[1], "output", lin.output_names)
-    rows = _places("output", system.outputs, len(system.D), "input", lin.input_names)
+    columns = _indices("input", system.inputs, system.D.shape[1], "output", lin.output_names)
+    rows = _indices("output", system.outputs, len(system.D), "input", lin.input_names)
     nz, ny, nu = len(system.A), len(lin.output_names), len(lin.input_names)
     B, C, D = np.zeros((nz, ny)), np.zeros((nu, nz)), np.zeros((nu, ny))
     B[:, columns], C[rows], D[np.ix_(rows, columns)] = system.B, system.C, system.D
     return System(system.A, B, C, D, system.dt, lin.output_names, lin.input_names)
 
 
-def _places(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -> list[int]:
+def _indices(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -> list[int]:
     """Return the indices of a controller's signals among the signals of a model."""
     named = not all(map(_NUMBERED.fullmatch, names))
     if size != len(names if named else known):

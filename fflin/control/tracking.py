@@ -1,4 +1,6 @@
-"""Trajectory tracking: feedback along a trajectory, and its reference."""
+"""Trajectory tracking: feedback of the state or of the outputs along a trajectory."""
+
+from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -7,32 +9,34 @@ from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
 from fflin.base.validation import Array
-from fflin.control.gain_schedule import GainSchedule
-from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Allocation, Policy, decider, fed_back
+from fflin.control.gain_schedule import FilterSchedule, GainSchedule
+from fflin.control.kalman import kalman
+from fflin.control.linear_controller import Compensation, LinearController, Loop, Sample
+from fflin.control.policies import Allocation, Feedback, Policy, decider
 from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import Frame, StateMap
-from fflin.dynamics.state_rows import moved_by, moving_error
-from fflin.linear.fit import require_same, require_turns
+from fflin.dynamics.outputs import Measuring
+from fflin.dynamics.state import Frame, StateMap, moved_by, moving_error
+from fflin.linear.fit import require_same, require_turns, sensed
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
-# A clock of many steps is rounded.
+# Sums of many time steps are rounded, so the end is reached within this factor.
 AT_THE_END = 1.0 + 1e-9
 
 # Returns q, v and u in the policy's axes at a time of the run.
 Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
 
 
-@dataclass(frozen=True, eq=False)
-class TrajectoryFeedback:
+@dataclass(eq=False)
+class TrajectoryFeedback(Feedback):
     """Trajectory tracking ``u = u*(t) - K(t) e`` with the error e relative to a trajectory.
 
     The error is defined as in `linearize_trajectory`. Torques and forces on the base are in base
@@ -155,7 +159,7 @@ class TrajectoryFeedback:
             If a state does not exist.
         """
         robot, (q, v, _) = self.trajectory.robot, self.reference(0.0)
-        # A chart about where it begins, which may be turned by any angle itself.
+        # The chart is centred at the start, whose attitude may be any rotation.
         chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame=self.frame)
         values = by_name("state", offset, (*chart.names, "roll", "pitch", "yaw"))
         e, angles = np.zeros(chart.nx), np.zeros(3)
@@ -188,6 +192,26 @@ class TrajectoryFeedback:
         """Return law(t, e) -> u: the inputs for an error e at time t of the run."""
         return lambda t, e: self.commanded(t)[2] - self.gain(t) @ e
 
+    def state_map(self, robot: Robot) -> StateMap:
+        """Return the robot's states in base axes; `InputError` if the trajectory does not fit."""
+        origin = self.trajectory.robot
+        state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
+        made = f"the trajectory was made for '{origin.name}'"
+        for kind, pair in (("input", map(Actuation, (own, state))), ("state", (own, state))):
+            require_same(made, robot, kind, *((each.names, each.units) for each in pair))
+        require_turns(made, origin.nq, robot)
+        return state
+
+    def deviation(self, robot: Robot) -> Callable[..., tuple[Array, Array]]:
+        """Return f(t, q, v) -> u*, e: the inputs of the trajectory, and the error from it."""
+        state = self.state_map(robot)
+
+        def deviation(t: float, q: Array, v: Array) -> tuple[Array, Array]:
+            q_star, v_star, u_star = self.commanded(t)
+            return u_star, moving_error(state, q_star, v_star, q, v)
+
+        return deviation
+
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
 
@@ -196,22 +220,20 @@ class TrajectoryFeedback:
         InputError
             If the robot's states or inputs differ from the trajectory's. Its masses may differ.
         """
-        origin = self.trajectory.robot
-        state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
-        made = f"the trajectory is a motion of '{origin.name}'"
-        for kind, pair in (("input", map(Actuation, (own, state))), ("state", (own, state))):
-            require_same(made, robot, kind, *((each.names, each.units) for each in pair))
-        require_turns(made, origin.nq, robot)
+        deviation = self.deviation(robot)
 
         def policy(t: float, q: Array, v: Array) -> Array:
-            q_star, v_star, u_star = self.commanded(t)
-            return u_star - self.gain(t).dot(moving_error(state, q_star, v_star, q, v))
+            u, e = deviation(t, q, v)
+            return u - self.gain(t).dot(e)
 
         return policy
 
 
 def followed(policy: Any, robot: Robot, held: float = 0.0) -> Any:
-    """Return a policy, for a schedule the feedback along its trajectory; held so long, if it is."""
+    """Return a policy as it is simulated, with commands held for `held` [s].
+
+    A gain schedule becomes the feedback along its trajectory.
+    """
     if isinstance(policy, Allocation):
         return replace(policy, policy=followed(policy.policy, policy.design, held))
     if isinstance(policy, GainSchedule):
@@ -235,19 +257,10 @@ def tracking_of(policy: Any) -> TrajectoryFeedback | None:
     return decides if isinstance(decides, TrajectoryFeedback) else None
 
 
-def steered_by(policy: Any) -> tuple[str, ...]:
-    """Return the names of the states that a policy feeds back, as far as that is known."""
-    if (follows := tracking_of(policy)) is None:
-        return fed_back(policy)
-    used, names = np.abs(follows.schedule.K).max(axis=(0, 1)), follows.schedule.state_names
-    return tuple(name for name, size in zip(names, used, strict=True) if size)
-
-
 @lru_cache(maxsize=2)  # half of a short run's time
 def largest_rate(schedule: GainSchedule) -> float:
-    """Return the magnitude [1/s] that the loop's poles pass for a twentieth of the time alone."""
-    # A large weight at the end makes K large for a moment, which is over before it does harm; the
-    # inputs of samples do not follow at all, 0.
+    """Return the 95th percentile over time of the largest pole magnitude [1/s]; 0 if sampled."""
+    # A large weight at the end makes K large only briefly, which a larger step may miss.
     if schedule.dt:
         return 0.0
     rates = np.abs(np.linalg.eigvals(schedule.A - schedule.B @ schedule.K)).max(axis=1)
@@ -255,3 +268,111 @@ def largest_rate(schedule: GainSchedule) -> float:
     order = rates.argsort()
     passed = np.searchsorted(held[order].cumsum(), 0.95 * held.sum())
     return float(rates[order][min(int(passed), len(rates) - 1)])
+
+
+@dataclass(eq=False)
+class TrajectoryOutputFeedback(TrajectoryFeedback):
+    r"""Feedback ``u = u*(t) - K(t) eh`` of the estimated error relative to a trajectory.
+
+    At each sample, u is applied. Then y is measured, and the filter advances the estimate eh to
+    the next sample, as in `OutputFeedback`. Positions and attitudes are measured relative to the
+    base pose of the trajectory. The policy that `bind` returns has an attribute ``estimate``
+    (nx,): the estimate for the next sample.
+
+    Parameters
+    ----------
+    trajectory : LinearTrajectory
+    schedule : GainSchedule
+        Result of `tvlqr` with a sampling time.
+    filter : FilterSchedule
+        Result of `tvkalman` with the same sampling time.
+    noise : callable, optional
+        noise(t) -> (ny,), added to y.
+
+    Raises
+    ------
+    InputError
+        If the gains and the filter differ in sampling time or trajectory.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> filtered = fflin.tvkalman(along, 1e-3, 1e-4, sample=0.1)
+    >>> policy = fflin.TrajectoryOutputFeedback(along, fflin.tvlqr(along, sample=0.1), filtered)
+    >>> fflin.simulate(robot, policy, duration=1.0).u.shape[1]
+    9
+    """
+
+    filter: FilterSchedule
+    noise: Callable[[float], ArrayLike] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.filter, FilterSchedule):
+            raise InputError(
+                f"filter is a {type(self.filter).__name__}, expected a FilterSchedule, as "
+                "fflin.tvkalman returns it"
+            )
+        gains, seen = self.schedule, self.filter
+        if not (gains.dt and gains.dt == seen.dt and np.array_equal(gains.A, seen.A)):
+            raise InputError(
+                f"the gains are sampled at dt = {gains.dt:g} s, the filter at {seen.dt:g} s, "
+                "expected the same sample= and the same trajectory for both"
+            )
+
+    def bind(self, robot: Robot) -> Policy:
+        """Return policy(t, q, v) -> u for a robot, with a separate estimate for each call.
+
+        Raises
+        ------
+        InputError
+            If the robot's states, inputs or outputs differ from the trajectory's.
+        """
+        origin, home = self.trajectory.robot, self.state_map(robot)
+        own = sensed(StateMap(origin, frame="local"))
+        made = f"the trajectory was made for '{origin.name}'"
+        require_same(made, robot, "output", own, sensed(home))
+
+        def there(t: float) -> tuple[Measuring, Array]:
+            q, v, _ = self.reference(t)
+            state = home.about(home.origin * pin.XYZQUATToSE3(q[:7]))
+            return Measuring(state, q), state.read(q, v)
+
+        return Loop(home, self.filter.dt, self.noise, self._size, self._sample, there)
+
+    def law(self) -> Callable[[float, Array], Array]:
+        """Return law(t, e) -> u at the samples, with the outputs of the linear models."""
+        law = Compensation(self._size, self._sample)
+        return lambda t, e: law.step(
+            t, lambda by, u: by.y0 + by.seen @ (e + by.jump) + by.through @ (u - by.u0)
+        )
+
+    @property
+    def _size(self) -> int:
+        return len(self.filter.state_names)
+
+    @cached_property
+    def _rest(self) -> tuple[LinearModel, Array]:
+        """The model after the end, and the gain of its steady filter."""
+        lin, seen = self.end.discretize(self.filter.dt), self.filter
+        return lin, kalman(lin, seen.W[-1], seen.V).L
+
+    def _sample(self, t: float) -> Sample:
+        gains, seen, dt = self.schedule, self.filter, self.filter.dt
+        k, jump = round(t / dt), np.zeros(self._size)
+        if k < len(seen.A):
+            A, B, K, L, C, D = (x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D))
+            # A held input is closest to a changing one at the middle of the sample.
+            u = self.reference(t + 0.5 * dt * (self.trajectory.hold == "linear"))[2]
+            y = seen.y[k]
+        else:
+            (lin, L), K = self._rest, self.end_gain
+            A, B, C, D, u, y = lin.A, lin.B, lin.C, lin.D, lin.u0, lin.y0
+            if k == len(seen.A):
+                # From here on the error is relative to the robot at rest.
+                stop = self.reference(self.duration)[1] - lin.v
+                jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(stop)
+        return Sample(A - B @ K - L @ (C - D @ K), L, -K, 0.0 * D.T, u, y, C, D, jump)

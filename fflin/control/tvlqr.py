@@ -1,32 +1,35 @@
-"""Time-varying linear quadratic regulator along a trajectory."""
+"""Time-varying linear quadratic regulator and Kalman filter along a trajectory."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from fflin.analysis.gramians import held_cost
-from fflin.analysis.momentum import momentum_reduction
-from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
-from fflin.base.threads import in_one_thread
+from fflin.analysis.reduction import momentum_reduction
+from fflin.base.errors import DetectabilityError, EquilibriumError, InputError, StabilizabilityError
+from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, number
 from fflin.control import differential_riccati as riccati
+from fflin.control.default_weights import pace_along, rule_weights
 from fflin.control.gain import Gain
-from fflin.control.gain_schedule import GainSchedule
+from fflin.control.gain_schedule import FilterSchedule, GainSchedule, Interpolant
+from fflin.control.kalman import disturbance, kalman
 from fflin.control.lqr import lqr
-from fflin.control.weight_rules import pace_along, rule_weights
 from fflin.control.weights import Weight, cost_weights, sampled_cost, weight
+from fflin.dynamics.inertia import rotor_names
 from fflin.linear.equilibrium import equilibrium
-from fflin.linear.ignorable import rotor_names
-from fflin.linear.linear_trajectory import LinearTrajectory
+from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
+from fflin.linear.sampling import HEAVY, LIGHT
 from fflin.linear.trajectory import Trajectory
-from fflin.linear.trajectory_sampling import transitions
 
 
 @in_one_thread
@@ -72,8 +75,9 @@ def tvlqr(
     sample : float, optional
         Sampling time [s]. It must divide the duration.
     weights : {"urdf", "identity"}, optional
-        Rule for the weights, instead of Q and R: the rule of `lqr` about that end point, for
-        displacements a tenth as large. The loop is fast enough for errors to decay within the
+        Rule that chooses the weights if Q and R are omitted. It is the rule of `lqr` for the linear
+        model at the last point of the trajectory, for displacements a tenth as large as those of
+        `lqr`. The loop is fast enough for errors to decay within the
         duration of the trajectory.
     rule : str
         Description of the rule that made Q and R.
@@ -131,19 +135,24 @@ def tvlqr(
 
     with riccati.bounded_by("smaller weights or a larger R"):
         if sample is not None:
-            return GainSchedule(**fields, **_sampled(traj, dt, Q, R, Qf))
-        t, P = riccati.solve_back(at, traj.t, Qf)
-    A, B = map(np.array, zip(*(traj.matrices(float(x)) for x in t), strict=True))
-    K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
-    residual = riccati.Passed(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
+            stages = list(held_stages(traj, dt, Q, R))
+            gains, costs, residual = riccati.samples_back(reversed(stages), Qf)
+            t, P, K = traj.samples(dt), costs[::-1], np.concatenate((gains[::-1], gains[:1]))
+            A, B = np.split(np.array([whole for _, whole in stages]), [len(Q)], axis=2)
+        else:
+            t, P = riccati.solve_back(at, traj.t, Qf)
+            models = [traj.matrices(float(x)) for x in t]
+            A, B = (np.array([model[k] for model in models]) for k in (0, 1))
+            K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
+            residual = Interpolant(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
     return GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=residual, **fields)
 
 
-def asks_steady(Qf: Any) -> bool:
-    """Return whether Qf is "steady"; raise `InputError` if it is another string."""
-    if isinstance(Qf, str) and Qf != "steady":
-        raise InputError(f"Qf is {Qf!r}, expected 'steady' or a weight")
-    return isinstance(Qf, str)
+def asks_steady(value: Any, name: str = "Qf", kind: str = "a weight") -> bool:
+    """Return whether a value is "steady"; raise `InputError` if it is another string."""
+    if isinstance(value, str) and value != "steady":
+        raise InputError(f"{name} is {value!r}, expected 'steady' or {kind}")
+    return isinstance(value, str)
 
 
 def held_stages(
@@ -213,10 +222,142 @@ def steady_regulator(
         return part.S.T @ gain.P @ part.S, gain.K @ part.S
 
 
-def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) -> dict[str, Any]:
-    """Return t, K, P, A, B and the residual of the regulator whose inputs are held."""
-    nx, stages = len(Q), list(held_stages(traj, dt, Q, R))
-    K, P, residual = riccati.samples_back(reversed(stages), P)
-    maps = np.array([whole for _, whole in stages])
-    found = {"t": traj.samples(dt), "K": np.concatenate((K[::-1], K[:1])), "P": P[::-1]}
-    return found | {"A": maps[:, :, :nx], "B": maps[:, :, nx:], "residual": residual}
+@in_one_thread
+def tvkalman(
+    traj: LinearTrajectory,
+    W: Weight,
+    V: Weight,
+    G: ArrayLike | None = None,
+    P0: Weight | str = "steady",
+    sample: float | None = None,
+) -> FilterSchedule:
+    r"""Return the time-varying Kalman filter along a trajectory.
+
+    White noise of intensities W and V acts on the error and on the outputs, as in `kalman`. The
+    covariance P of the estimation error is integrated forward from P0,
+
+    .. math:: \dot P = A P + P A^T - P C^T V^{-1} C P + W,\qquad L = P C^T V^{-1}.
+
+    In reversed time this is the equation of `tvlqr` with :math:`A, B, Q, R` replaced by
+    :math:`A^T, C^T, W, V`. It is solved in the same way.
+
+    With `sample`, the filter is sampled, (10.4): a computer measures y at the samples and holds
+    :math:`\delta u` between them. V is then the noise covariance per sample. W remains the
+    intensity of the continuous disturbance.
+
+    Parameters
+    ----------
+    traj : LinearTrajectory
+        Trajectory of a robot whose outputs are the measurements.
+    W : array_like (nx, nx) or (nx,), float, or mapping
+        Intensity of the disturbance, positive semidefinite, as in `kalman`.
+    V : array_like (ny, ny) or (ny,), float, or mapping
+        Intensity of the measurement noise, positive definite.
+    G : array_like (nx, nw) or (N, nx, nw), optional
+        Input matrix of the disturbance, linear between the knots; W is then (nw, nw). With
+        ``G=traj.B`` the disturbance acts at the inputs; if W is a mapping, its keys are then names
+        of inputs.
+    P0 : "steady", or as W
+        Covariance at the start. "steady" is the covariance of `kalman` about the start point: the
+        first configuration at rest, or in its initial motion if that motion is steady.
+    sample : float, optional
+        Sampling time [s]. It must divide the duration.
+
+    Returns
+    -------
+    FilterSchedule
+
+    Raises
+    ------
+    InputError
+        If a size or value is wrong, if P changes so fast that too many knots are needed, or if
+        the sampling time does not divide the duration.
+    UnknownNameError
+        If a name does not exist.
+    EquilibriumError, DetectabilityError
+        If P0 is "steady" and no inputs can hold the robot at the start point, or if the model
+        there is not detectable.
+
+    References
+    ----------
+    R. E. Kalman and R. S. Bucy, J. Basic Engineering 83(1), 1961.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> noise = {"tau_b": 0.1, "F_b": 0.1, "tau_m": 0.01}
+    >>> fflin.tvkalman(along, noise, 1e-4, G=along.B, sample=0.1).L.shape
+    (21, 18, 18)
+    """
+    require_continuous(traj)
+    dt = 0.0 if sample is None else number("sample", sample)
+    V = weight("V", V, traj.output_names, definite=True)
+    noise, columns = disturbance(traj, W, G)
+    through = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
+
+    @cache
+    def at(t: float) -> riccati.Coefficients:
+        (A, _), (C, by) = traj.matrices(t), traj.between(t, traj.C, through)
+        intensity = by @ noise @ by.T
+        return riccati.Coefficients(A.T, riccati.spread(C.T, V), 0.5 * (intensity + intensity.T))
+
+    names: Any = ("state_names", "input_names", "output_names", "verified")
+    fields: dict[str, Any] = {key: getattr(traj, key) for key in names}
+    fields |= {"robot": traj.robot.name, "V": V, "dt": dt}
+    if asks_steady(P0, "P0", "a covariance"):
+        P = _steady_filter(traj, at(float(traj.t[0])).Q, V, dt)
+    else:
+        P = weight("P0", P0, traj.state_names)
+    with riccati.bounded_by("a smaller W or a larger V"):
+        if sample is not None:
+            return FilterSchedule(**fields, **_sampled_filter(traj, dt, lambda t: at(t).Q, V, P))
+        times, found = riccati.solve_back(lambda time: at(-time), -traj.t[::-1], P)
+    t, P = -times[::-1], found[::-1]
+    own, clock = (traj.C, traj.D, traj.y), t.tolist()
+    rows = zip(*((*traj.matrices(x), *traj.between(x, *own)) for x in clock), strict=True)
+    fields |= dict(zip("ABCDy", map(np.array, rows), strict=True))
+    L = np.linalg.solve(V, fields["C"] @ P).transpose(0, 2, 1)
+    fields |= {"t": t, "L": L, "P": P, "W": np.array([at(float(x)).Q for x in t])}
+    made = FilterSchedule(residual=np.inf, **fields)
+    return replace(made, residual=made.interpolant.residual(at))
+
+
+def _steady_filter(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Array:
+    lin = steady_end(traj, 0)
+    if dt:
+        lin, W = lin.discretize(dt), held_cost(lin.A.T, W, dt)
+    try:
+        return kalman(lin, W, V).P
+    except (DetectabilityError, InputError) as error:
+        raise type(error)(
+            f"no steady filter exists at the start of the trajectory: {error}; or give P0"
+        ) from None
+
+
+def _sampled_filter(
+    traj: LinearTrajectory, dt: float, intensity: Callable[[float], Array], V: Array, P: Array
+) -> dict[str, Any]:
+    """Return what the schedule of a filter has whose measurements are sampled."""
+    at_samples, nx, disturbed = along(traj.resampled(dt)), len(P), list[Array]()
+    held = list(transitions(traj, traj.matrices, dt))
+
+    def stages() -> Iterator[tuple[Array, Array]]:
+        for C, (steps, whole) in zip(at_samples.C, held, strict=False):
+            W = np.zeros((nx, nx))
+            for F, h, step, (first, second) in steps:
+                mixed = HEAVY * intensity(first) + LIGHT * intensity(second)
+                W = step[:, :nx] @ W @ step[:, :nx].T + held_cost(F[:nx, :nx].T, mixed, h)
+            disturbed.append(W)
+            yield block_diag(W, V), np.hstack((whole[:, :nx].T, C.T))
+
+    K, P, residual = riccati.samples_back(stages(), P)
+    L, maps = K.transpose(0, 2, 1), np.array([whole for _, whole in held])
+    return {
+        **{"t": at_samples.t, "L": np.concatenate((L, L[-1:])), "P": P},
+        **{"A": maps[:, :, :nx], "B": maps[:, :, nx:], "W": np.array(disturbed)},
+        **{key: getattr(at_samples, key) for key in "CDy"},
+        "residual": residual,
+    }

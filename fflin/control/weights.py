@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from fflin.analysis.gramians import held_cost
 from fflin.base.errors import InputError
-from fflin.base.names import by_name, input_keys, matching
+from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import Array, dimension, instance, number, vector
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
@@ -164,7 +164,7 @@ def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool)
             f"{what} is not symmetric: {what}[{i}, {j}] is {matrix[i, j]:g} and {what}[{j}, {i}] "
             f"is {matrix[j, i]:g}; give a symmetric matrix"
         )
-    matrix = 0.5 * (matrix + matrix.T)
+    matrix = 0.5 * matrix + 0.5 * matrix.T
     try:
         np.linalg.cholesky(matrix)  # quicker than eigenvalues
     except np.linalg.LinAlgError:
@@ -269,3 +269,38 @@ def _negative(what: str, value: float, where: str, definite: bool) -> InputError
         f"{what} is not positive {kind}: it has the eigenvalue {value:.6g} with an eigenvector "
         f"mainly along {where}; increase the weight there"
     )
+
+
+class GivenWeight(NamedTuple):
+    """Given weight, and whether it was given as a largest value."""
+
+    value: float
+    largest: bool
+
+
+def weights_of(
+    lin: LinearModel, given: Mapping[str, Any], of_robot: bool
+) -> tuple[dict[int, GivenWeight], list[str]]:
+    """Return what is given by index among the states and then the inputs, and the names."""
+    parts = {part: dict(given.get(part, {})) for part in ("q", "r", "bryson")}
+    if of_robot:  # a reduced model has not all that a robot's weights name
+        names = (*lin.state_names, *input_keys(lin))
+        for part, values in parts.items():
+            parts[part] = {key: x for key, x in values.items() if stands_for_any(key, names)}
+    q, r = (
+        {key: GivenWeight(number(f"weight of '{key}'", x), False) for key, x in parts[part].items()}
+        for part in ("q", "r")
+    )
+    for name, size in parts["bryson"].items():
+        side = r if is_input("state or input", name, lin) else q
+        if name in side:
+            raise InputError(
+                f"'{name}' has both a weight and a largest value (bryson); give only one of them"
+            )
+        side[name] = GivenWeight(
+            inverse_square(f"largest value of '{name}' (--bryson)", size), True
+        )
+    of_inputs = by_name("input", r, input_keys(lin))
+    nx = len(lin.x0)
+    shifted = {nx + index: each for index, each in of_inputs.items()}
+    return by_name("state", q, lin.state_names) | shifted, [*q, *r]

@@ -9,7 +9,7 @@ from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import PIN_ANGULAR
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
-from fflin.robot.frames import ROOT
+from fflin.robot.joints import ROOT
 
 
 class Aba:
@@ -26,7 +26,7 @@ class Aba:
         # M^-1 in base axes as ABA has it, of the last slopes.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
         self.field = field_of(robot, state.frame)
-        self._resists = any(values.any() for values in robot.springs)
+        self._resists = bool(np.any(robot.springs))
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
     def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
@@ -60,11 +60,14 @@ class Aba:
         if field:
             q, v = field.near(q, v)
         external = self._pulls(q, v, u)
-        if state.S is None:
-            slopes = pin.computeABADerivatives(self._model, self._data, q, v, tau, external)
-            by_q, by_v, by_force = (state.project(slope) for slope in slopes)
-        else:
+        if state.robot.followers:
+            assert state.S is not None
             by_q, by_v, by_force = self._constrained_slopes(q, v, external, tau, state.S)
+        else:
+            slopes = pin.computeABADerivatives(self._model, self._data, q, v, tau, external)
+            by_q, by_v, by_force = (state.velocities(slope.T).T for slope in slopes)
+            by_q, by_v = state.columns(by_q), state.columns(by_v)
+            by_force = state.velocities(by_force)
         self.inverse = by_force
         for joint, momentum in state.robot.stored_momentum:
             jacobian, turning = self._turning(joint, q, v)
@@ -136,7 +139,7 @@ class Aba:
         self, model: pin.Model, q: Array, v: Array, forces: Array, external: pin.StdVec_Force
     ) -> Array:
         state = self.state
-        if state.S is None:
+        if not state.robot.followers:
             return pin.aba(model, self._data, q, v, state.lift(forces), external)
         # Mimic joints: S^T M S nudot = S^T (tau - b), with M from CRBA.
         M = state.project(pin.crba(model, self._data, q))

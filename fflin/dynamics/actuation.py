@@ -1,6 +1,6 @@
 """Generalised forces of the inputs: the columns that multiply u, and the wrenches on links."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -12,16 +12,9 @@ from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
-from fflin.robot.frames import find_frame
+from fflin.robot.joints import find_frame
 
 _LOCAL = pin.ReferenceFrame.LOCAL
-
-
-class Held(NamedTuple):
-    """Three inputs that form a vector on the base in reference axes."""
-
-    columns: slice
-    rows: slice
 
 
 class Actuation:
@@ -30,9 +23,11 @@ class Actuation:
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
         self._state, self._model = state, robot.model
-        signals: list[tuple[str, str, str]] = []
+        names: list[str] = []
+        units: list[str] = []
+        groups: list[str] = []
         columns: list[Array] = []
-        held: list[Held] = []
+        held: list[slice] = []
         # Thrusters and wheels that are no joints, by the Pinocchio joint that carries them:
         # (input, wrench (6,) of a unit in its frame).
         carried: dict[int, list[tuple[int, Array]]] = {}
@@ -44,7 +39,7 @@ class Actuation:
                 rows = ANGULAR if torque else LINEAR
                 columns += list(identity[rows])
                 if state.axes[0 if torque else 1]:
-                    held.append(Held(slice(at, at + 3), rows))
+                    held.append(slice(at, at + 3))
             elif isinstance(item, kinds.JointTorque):
                 index = robot.joints.index(robot.joint(item.joint))
                 unit = robot.joints[index].force_unit
@@ -57,21 +52,21 @@ class Actuation:
                 wrench = np.array(placement.act(pin.Force(item.wrench)).vector)
                 carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))
-            signals += [(name, unit, item.GROUP) for name in own]
-        names, units, groups = (tuple(signal[i] for signal in signals) for i in range(3))
-        twice = [name for index, name in enumerate(names) if name in names[:index]]
-        if twice:
-            raise InputError(f"two inputs are named '{twice[0]}'; give one of them another name")
+            names += own
+            units += [unit] * len(own)
+            groups += [item.GROUP] * len(own)
+        if len({*names}) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"two inputs are named '{twice}'; give one of them another name")
         # As a model calls them too.
-        self.names = self.input_names = names
-        self.units = self.input_units = units
+        self.names = self.input_names = tuple(names)
+        self.units = self.input_units = tuple(units)
         # {group: indices}: tau_b, F_b, tau_m, thrust, wheel, in order of appearance.
         self.groups = {
-            group: np.flatnonzero([group == other for other in groups])
-            for group in dict.fromkeys(groups)
+            group: np.flatnonzero(np.array(groups) == group) for group in dict.fromkeys(groups)
         }
-        # What the frame holds in reference axes.
-        self.held, self._held = tuple(held), tuple(vector.columns for vector in held)
+        # Inputs that form a vector on the base in reference axes, three each.
+        self.held = tuple(held)
         # Generalised force (6 + n, nu) of the inputs that the configuration does not change.
         self.fixed: Array = np.column_stack(columns) if columns else np.zeros((nv, 0))
         # Whether they are tau_b, F_b and every joint's, so that the columns are the identity.
@@ -99,20 +94,20 @@ class Actuation:
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
         """Return u (.., nu) with what is held in reference axes in base axes."""
-        if not self._held:
+        if not self.held:
             return u
-        return chart.to_base(self._held, u[..., None])[..., 0]
+        return chart.to_base(self.held, u[..., None])[..., 0]
 
     def rows_in_base_axes(self, q: Array, u: Array) -> Array:
         """Return rows u (N, nu) in base axes at valid configurations (N, nq), at any turn."""
-        if not self._held:
+        if not self.held:
             return u
         R = self._state.origin.rotation @ rotation_matrices(q[:, 3:7])
         return self.in_base_axes(Chart(q[:, 3:6], q[:, 6:7], R), u)
 
     def turn_columns(self, chart: Chart, by_u: Array) -> None:
         """Convert derivatives (.., k, nu) over `in_base_axes` to those over u: F_u^T of (4.7)."""
-        chart.turn_columns(self._held, by_u)
+        chart.turn_columns(self.held, by_u)
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
         """Return the wrench of thrusters and wheels on every joint, in its frame, if any."""

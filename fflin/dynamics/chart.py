@@ -12,6 +12,8 @@ from fflin.base.validation import Array
 # Where q0 is below the square root of the rounding unit, sqrt(1 - |q_b|^2) has no correct digit.
 SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 
+_IDENTITY = np.eye(3)
+
 
 @dataclass(frozen=True)
 class Chart:
@@ -35,7 +37,7 @@ class Chart:
     @cached_property
     def Q(self) -> Array:
         """Q (.., 3, 3) of the quaternion kinematics (1.2): d q_b/dt = Q omega / 2."""
-        return self._scalar + skew(self.q_b)
+        return np.asarray(self.q0)[..., None] * _IDENTITY + skew(self.q_b)
 
     @cached_property
     def N(self) -> Array:
@@ -45,99 +47,62 @@ class Chart:
     @cached_property
     def J(self) -> Array:
         """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes (1.3)."""
-        return 2.0 * (self._scalar - skew(self.q_b) + self._over_q0(self.q_b))
+        # Q^-1 = Q^T + q_b q_b^T / q0.
+        return 2.0 * (self.Q.mT + self._over_q0(self.q_b))
 
     @cached_property
     def _back(self) -> Array:
         return np.ascontiguousarray(self.R.mT)
 
-    @property
-    def _scalar(self) -> Array:
-        return np.asarray(self.q0)[..., None] * np.eye(3)
-
     def rate(self, omega: Array) -> Array:
         """Return d q_b/dt = N omega (.., 3), omega in base axes (1.2)."""
-        return times(self.N, omega)
+        return 0.5 * omega if self.standing else times(self.N, omega)
 
     def rotated(self, vectors: Array) -> Array:
         """Return vectors (.., 3) in base axes in reference axes."""
-        return times(self.R, vectors)
+        return vectors if self.standing else times(self.R, vectors)
 
     def turned(self, columns: Array) -> Array:
         """Return columns (.., 3, k) in base axes in reference axes."""
-        return product(self.R, columns)
+        return columns if self.standing else product(self.R, columns)
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return the derivative (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
-        return -0.5 * (crossed + self._over_q0(omega))
+        return -0.5 * (crossed if self.standing else crossed + self._over_q0(omega))
 
     def _over_q0(self, omega: Array) -> Array:
         return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
 
-    def over_q_b(self, by_turn: Array, out: Array | None = None) -> Array:
+    def over_q_b(self, by_turn: Array) -> Array:
         """Return derivatives (.., k, 3) over base rotations as derivatives over q_b (1.3)."""
-        return np.matmul(by_turn, self.J, out=out)
+        return 2.0 * by_turn if self.standing else product(by_turn, self.J)
 
     def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
         """Turn parts of x (.., m, k), three rows each, by R where they stand."""
-        _turn(self.R, parts, x)
+        _turn(self.R, () if self.standing else parts, x)
 
     def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
         """Turn parts of x (.., k, m), three columns each, by R^T where they stand."""
-        for columns in parts:
+        for columns in () if self.standing else parts:
             x[..., columns] = product(x[..., columns], self._back)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts, three rows each, turned by R."""
-        return _turned(self.R, parts, x)
+        return x if self.standing or not parts else _turn(self.R, parts, x.copy("K"))
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts, three rows each, turned to base axes by R^T."""
-        return _turned(self._back, parts, x)
+        return x if self.standing or not parts else _turn(self._back, parts, x.copy("K"))
 
 
 class Standing(Chart):
-    """Chart of one or many bases at the reference: R = Q = E and J = 2 E cost nothing."""
+    """Chart of one or many bases at the reference, where R = Q = I and J = 2 I."""
 
     standing = True
-    N = 0.5 * np.eye(3)
+    N = 0.5 * _IDENTITY
 
     def __init__(self, *count: int) -> None:
-        super().__init__(np.zeros((*count, 3)), 1.0, np.eye(3))
-
-    def rate(self, omega: Array) -> Array:
-        """Return omega / 2."""
-        return 0.5 * omega
-
-    def rotated(self, vectors: Array) -> Array:
-        """Return the vectors themselves."""
-        return vectors
-
-    def turned(self, columns: Array) -> Array:
-        """Return the columns themselves."""
-        return columns
-
-    def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
-        """Return -[omega]x / 2."""
-        return -0.5 * crossed
-
-    def over_q_b(self, by_turn: Array, out: Array | None = None) -> Array:
-        """Return twice the derivatives."""
-        return np.multiply(2.0, by_turn, out=out)
-
-    def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Leave x as it is."""
-
-    def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Leave x as it is."""
-
-    def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x itself."""
-        return x
-
-    def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x itself."""
-        return x
+        super().__init__(np.zeros((*count, 3)), 1.0, _IDENTITY)
 
 
 def times(matrices: Array, vectors: Array) -> Array:
@@ -145,14 +110,7 @@ def times(matrices: Array, vectors: Array) -> Array:
     return (matrices @ vectors[..., None])[..., 0]
 
 
-def _turned(R: Array, parts: tuple[slice, ...], x: Array) -> Array:
-    if not parts:
-        return x
-    turned = x.copy("K")
-    _turn(R, parts, turned)
-    return turned
-
-
-def _turn(R: Array, parts: tuple[slice, ...], x: Array) -> None:
+def _turn(R: Array, parts: tuple[slice, ...], x: Array) -> Array:
     for rows in parts:
         x[..., rows, :] = product(R, x[..., rows, :])
+    return x

@@ -7,9 +7,11 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, SingularInertiaError, listed
+from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
-from fflin.robot.massless import coordinate_names
+from fflin.robot.joints import Joint
+from fflin.robot.model_checks import coordinate_names
 from fflin.robot.robot import Robot
 
 # The coupling of a coordinate, M_ii (M^-1)_ii, is 1 where it is decoupled and grows as it loses
@@ -33,6 +35,9 @@ STROKE = 1.0  # [m] that a sliding joint is taken to be out at most, for those m
 # From this size on LAPACK is quicker than a sparse factor.
 _DENSE_SIZE = 64
 
+# Relative rounding error that numbers of a URDF leave of an exact symmetry.
+_ASYMMETRY = 1e-12
+
 # Bound once: the look-up of a name in a module costs as much as a small matrix.
 _crba, _decompose, _invert_factor, _compute_inverse = (
     pin.crba,
@@ -54,10 +59,13 @@ class Inertia:
         # Views, since Pinocchio overwrites in place what they show.
         self._inverse = data.Minv
         self._inverse_diagonal = self._inverse.diagonal()
-        self._constrained = bool(robot.followers)
+        # By a dense factor where v is no permutation of nu.
+        self._constrained = state.S is not None
         self._bounds = bounds_of(robot)
         self._in_order = np.zeros(0) if self._bounds is None else state.velocities(self._bounds)
-        self._slides = [joint.idx_q for joint in robot.joints if joint.prismatic]
+        self._slides = [
+            joint.idx_q for joint in robot.joints if joint.prismatic and joint.kind != "modal"
+        ]
         # The base at the world's origin: M does not depend on where it is, but Pinocchio works in
         # world axes and would lose digits to a base far away.
         self._still = pin.neutral(robot.model)
@@ -71,7 +79,9 @@ class Inertia:
         # from a slope M^-1 K the exactness of what M^-1 leaves alone. Else by a Cholesky factor,
         # whose rounding no scaling of M changes.
         bounds = self._bounds if quick else None
-        if bounds is not None and all(abs(still[index]) <= STROKE for index in self._slides):
+        if bounds is not None and (
+            not self._slides or np.abs(still.take(self._slides)).max() <= STROKE
+        ):
             _compute_inverse(self._model, self._data, still)
             self._state.project(self._inverse, out)
             # Written so that NaN, from a pivot that is zero, fails too.
@@ -149,9 +159,9 @@ _BOUNDS: WeakKeyDictionary[Robot, Array | None] = WeakKeyDictionary()
 
 
 def bounds_of(robot: Robot) -> Array | None:
-    """Return `inertia_bounds` of a robot; None also if it has mimic joints."""
+    """Return `inertia_bounds` of a robot; None also if it has mimic joints or modes."""
     if robot not in _BOUNDS:
-        _BOUNDS[robot] = None if robot.followers else inertia_bounds(robot.model)
+        _BOUNDS[robot] = None if robot.followers or robot.modes else inertia_bounds(robot.model)
     return _BOUNDS[robot]
 
 
@@ -183,3 +193,36 @@ def inertia_bounds(model: pin.Model) -> Array | None:
         moments[parents[index]] += moments[index]
     bounds[:3], bounds[3:6] = masses[1], moments[1]
     return bounds
+
+
+def rotor_names(robot: Robot) -> tuple[str, ...]:
+    """Return the names of the joints whose turning changes no inertia and that carry nothing."""
+    model = robot.model
+    index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
+    named = set(robot.used_frames)
+    # What carries another joint, leads one, has a spring, or has something fixed on it.
+    busy = set(model.parents.tolist())
+    busy |= {index_of[follower.leader.name] for follower in robot.followers}
+    busy |= {index_of[name] for name, stiffness in robot.stiffness.items() if stiffness}
+    if named:
+        busy |= {frame.parentJoint for frame in model.frames if frame.name in named}
+    free = (joint for joint in robot.joints if index_of[joint.name] not in busy)
+    return tuple(joint.name for joint in free if _is_symmetric(robot, joint, index_of[joint.name]))
+
+
+def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
+    """Whether the body behind a joint stays as it is when the joint turns."""
+    if joint.prismatic:
+        return False
+    pin_joint = robot.model.joints[index]
+    data = pin_joint.createData()
+    pin_joint.calc(data, robot.neutral())
+    linear, axis = np.split(np.asarray(data.S).ravel(), 2)
+    if linear.any():  # a screw
+        return False
+    body, turn = robot.model.inertias[index], skew(axis)
+    inertia = body.inertia
+    uneven = float(np.abs(turn @ inertia - inertia @ turn).max())
+    largest = float(np.abs(inertia).max())
+    offset = body.mass * float(np.square(turn @ body.lever).sum())
+    return uneven <= _ASYMMETRY * largest and offset <= _ASYMMETRY**2 * largest

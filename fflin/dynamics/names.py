@@ -66,29 +66,23 @@ class Groups(NamedTuple):
     qdot_m: slice
 
 
-def groups_of(n: int) -> Groups:
-    """Return the groups of the state of a robot with n joints."""
-    ends = (0, 3, 6, 6 + n, 9 + n, 12 + n, 12 + 2 * n)
-    return Groups(*map(slice, ends, ends[1:]))
-
-
 def states_of(robot: Robot) -> dict[str, str]:
     """Return {name: unit} of the 12 + 2n states."""
-    return {
-        **_of_base(q_b="1", r_b="m"),
-        **{f"q_m.{joint.name}": joint.unit for joint in robot.joints},
-        **_of_base(omega_b="rad/s", v_b="m/s"),
-        **{f"qdot_m.{joint.name}": f"{joint.unit}/s" for joint in robot.joints},
-    }
+    units = dict.fromkeys(("q_b.x", "q_b.y", "q_b.z"), "1")
+    units |= dict.fromkeys(("r_b.x", "r_b.y", "r_b.z"), "m")
+    for joint in robot.joints:
+        units[f"q_m.{joint.name}"] = joint.unit
+    units |= dict.fromkeys(("omega_b.x", "omega_b.y", "omega_b.z"), "rad/s")
+    units |= dict.fromkeys(("v_b.x", "v_b.y", "v_b.z"), "m/s")
+    for joint in robot.joints:
+        units[f"qdot_m.{joint.name}"] = f"{joint.unit}/s"
+    return units
 
 
 def forces_of(robot: Robot) -> dict[str, str]:
     """Return {name: unit} of the 6 + n generalised forces."""
-    return {
-        **_of_base(tau_b=BaseTorque.UNIT, F_b=BaseForce.UNIT),
-        **{f"tau_m.{joint.name}": joint.force_unit for joint in robot.joints},
-    }
-
-
-def _of_base(**groups: str) -> dict[str, str]:
-    return {f"{group}.{axis}": unit for group, unit in groups.items() for axis in "xyz"}
+    units = dict.fromkeys(("tau_b.x", "tau_b.y", "tau_b.z"), BaseTorque.UNIT)
+    units |= dict.fromkeys(("F_b.x", "F_b.y", "F_b.z"), BaseForce.UNIT)
+    for joint in robot.joints:
+        units[f"tau_m.{joint.name}"] = joint.force_unit
+    return units

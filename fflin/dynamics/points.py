@@ -11,9 +11,9 @@ from fflin.base.names import by_name, input_keys, rates_by_name
 from fflin.base.validation import Array, numbers, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.robot.frames import ROOT
+from fflin.robot.fields import combined
 from fflin.robot.inputs import named_wheels
-from fflin.robot.joints import by_joint
+from fflin.robot.joints import ROOT, by_joint
 from fflin.robot.robot import Robot
 
 LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
@@ -74,12 +74,16 @@ def require_slow(what: str, v: Array) -> None:
         )
 
 
+def base_of(state: Mapping[str, Any]) -> pin.SE3:
+    """Return the base placement of a robot's point, start or target."""
+    rotation = pin.rpy.rpyToMatrix(*np.radians(state.get("rpy", np.zeros(3))))
+    return pin.SE3(rotation, np.array(state.get("position", np.zeros(3))))
+
+
 def start_of(robot: Robot) -> tuple[Array, Array]:
     """Return the configuration (nq,) and velocity (nv,) at which a robot starts."""
-    start = robot.start
-    rotation = pin.rpy.rpyToMatrix(*np.radians(start.get("rpy", np.zeros(3))))
-    base = pin.SE3(rotation, np.array(start.get("position", np.zeros(3))))
-    q = configuration(robot, start.get("joints"), base)
+    start = combined(robot.point, robot.start)
+    q = configuration(robot, start.get("joints"), base_of(start))
     return q, velocity(robot, start.get("velocity", {}))
 
 

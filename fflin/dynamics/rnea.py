@@ -10,9 +10,8 @@ from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.names import ANGULAR, LINEAR, PIN_ANGULAR
-from fflin.dynamics.orbital import field_of
+from fflin.dynamics.orbital import Tide, field_of
 from fflin.dynamics.state import StateMap
-from fflin.dynamics.tidal import Tide
 
 
 class Rates(NamedTuple):
@@ -60,12 +59,16 @@ class Accelerations:
         self._state, self._actuation, self._data = state, actuation, data
         self._model, self._nv = robot.model, 6 + robot.n
         self._inertia = Inertia(state, data)
-        self._passive = robot.springs
-        self._resists = any(values.any() for values in robot.springs)
-        self._joints = np.arange(6, self._nv)
-        # Slopes of the forces over the same as those of the accelerations.
-        self._bias = np.zeros((self._nv, 2 * self._nv))
-        self._bias_by_q, self._bias_by_nu = np.split(self._bias, 2, axis=1)
+        self._springs = robot.springs
+        self._resists = bool(np.any(robot.springs))
+        # Derivatives of M a + b - B u - springs over the same as those of the accelerations. The
+        # first six columns, over attitude and position of the base, stay zero without an orbit.
+        self._force_slopes = np.zeros((self._nv, 2 * self._nv))
+        self._by_turn, self._by_q_m = self._force_slopes[:, :3], self._force_slopes[:, 6 : self._nv]
+        self._by_nu = self._force_slopes[:, self._nv :]
+        # Views of the diagonals on which the derivatives of springs and dampers stand.
+        self._of_stiffness = np.einsum("ii->i", self._by_q_m[6:])
+        self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
         self._field = field_of(robot, state.frame)
         self._still = np.zeros(robot.nq), np.zeros(robot.nv)
@@ -81,7 +84,7 @@ class Accelerations:
 
         Their slopes and by_u are the C-contiguous arrays of their shapes that are given.
         """
-        model, data, state = self._model, self._data, self._state
+        model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and Tide.at(self._field, q)
         # Without the base's position and linear velocity: nothing here depends on them, and
         # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
@@ -91,52 +94,44 @@ class Accelerations:
         if tide:
             v_still[PIN_ANGULAR] += tide.spin
             pull = tide.force(model, data, q_still)
-        default = self._actuation.default
-        inverse = by_u if default else np.empty((self._nv, self._nv))
+            pull_by_q, pull_by_turn = tide.slopes(model, data, q_still)
+        inverse = by_u if actuation.default else np.empty((self._nv, self._nv))
         self._inertia.invert(q_still, inverse)
-        columns = self._actuation.columns(data, q_still)
+        columns = actuation.columns(data, q_still)
         bias = pin.nonLinearEffects(model, data, q_still, v_still)
         gyroscopic = self._gyroscopic(q_still, v_still, u) if self._stored else None
         if gyroscopic:
             bias = bias - gyroscopic.force
         if tide:
             bias = bias - pull
-        force = (u if default else columns.dot(u)) - state.forces(bias)
+        force = (u if actuation.default else columns.dot(u)) - state.forces(bias)
         if self._resists:
-            force[6:] += self._passive.force(q_m, nu[6:])
+            force[6:] += self._springs.force(q_m, nu[6:])
         c = inverse.dot(force)
-        rates = Rates(c, slopes, by_u, tide.fall if tide else state.gravity(q))
-        self._write_bias_slopes(q_still, v_still, c, u, gyroscopic)
-        if not default:
-            np.dot(inverse, columns, out=by_u)
-        np.dot(-inverse, self._bias, out=slopes)
-        slopes[:, :6] = 0.0
-        rates.by_nu[:, LINEAR] = 0.0
-        if tide:
-            pull_by_q, pull_by_turn = tide.slopes(model, data, q_still)
-            rates.by_q_m[:] += inverse.dot(state.project(pull_by_q)[:, 6:])
-            rates.by_turn[:] = inverse.dot(state.forces(pull_by_turn))
-            rates.by_turn[:] += rates.by_nu[:, ANGULAR].dot(skew(tide.spin))
-        return rates
 
-    def _write_bias_slopes(
-        self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None
-    ) -> None:
-        """Write the derivatives of M a + b - B u + passive forces over q_m and nu (3.3), (7.1)."""
-        model, data, state = self._model, self._data, self._state
-        # Constant in the frames of their links, so that RNEA's derivatives hold -d(B u)/dq.
-        wrenches = gyroscopic.wrenches if gyroscopic else self._actuation.wrenches(u)
+        # Derivatives of M a + b - B u - springs (3.3), (7.1). Wrenches are constant in the frames
+        # of their links, so that RNEA's derivatives include -d(B u)/dq.
+        wrenches = gyroscopic.wrenches if gyroscopic else actuation.wrenches(u)
         external = () if wrenches is None else (wrenches,)
-        full_q, full_v, _ = pin.computeRNEADerivatives(
-            model, data, q, v, state.spread(c), *external
+        by_q, by_v, _ = pin.computeRNEADerivatives(
+            model, data, q_still, v_still, state.spread(c), *external
         )
         if gyroscopic:
-            full_q, full_v = full_q - gyroscopic.by_q, full_v - gyroscopic.by_v
-        self._bias_by_q[:], self._bias_by_nu[:] = state.project(full_q), state.project(full_v)
+            by_q, by_v = by_q - gyroscopic.by_q, by_v - gyroscopic.by_v
+        if tide:
+            by_q = by_q - pull_by_q
+        self._by_q_m[:], self._by_nu[:] = state.project(by_q)[:, 6:], state.project(by_v)
+        self._by_nu[:, LINEAR] = 0.0
         if self._resists:
-            joints = self._joints
-            self._bias_by_q[joints, joints] += self._passive.stiffness
-            self._bias_by_nu[joints, joints] += self._passive.damping
+            self._of_stiffness += self._springs.stiffness
+            self._of_damping += self._springs.damping
+        if tide:
+            by_spin = self._by_nu[:, ANGULAR].dot(skew(tide.spin))
+            self._by_turn[:] = by_spin - state.forces(pull_by_turn)
+        np.dot(-inverse, self._force_slopes, out=slopes)
+        if not actuation.default:
+            np.dot(inverse, columns, out=by_u)
+        return Rates(c, slopes, by_u, tide.fall if tide else state.gravity(q))
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
         """Return the torques of stored momentum; the wrenches include the inputs'."""

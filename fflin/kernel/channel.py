@@ -1,4 +1,7 @@
-"""How a command reaches the robot in the loop, as `control.channel` has it for one in Python."""
+"""The way of a command to the actuators: limits, sample and hold, delay, pulses and wheel speeds.
+
+Both engines call these functions, see `control.channel`.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,22 @@ from fflin.kernel.vectors import copy
 class Wheels(
     namedtuple("Wheels", "at row least_torque most_torque least_speed most_speed stiffness")
 ):
-    """Wheels with largest speeds (k,): their inputs, coordinates, torques, speeds, and J / dt."""
+    r"""Wheels (k,) that turn no faster than their limits: :math:`u \le J (w_{max} - w) / dt`.
+
+    Of each the index of its input (`at`) and of its speed in nu (`row`), the limits of its torque
+    [N m] and speed [rad/s], and the stiffness J / dt. Within a step of dt a torque u changes the
+    speed w by u dt / J, where J is what it turns against the rest of the robot, both free. A torque
+    limit that the motor cannot exceed applies as well.
+    """
 
 
 class Pulses(namedtuple("Pulses", "at on_off most least quantum left level end time")):
-    """Thrusters that fire in pulses (k,), and what is left of their commands, see `Pulses`.
+    """Pulsed thrusters (k,) that realise the command of each sample by an impulse.
 
-    `level` acts until the step `end`; `time` is that of a sample.
+    Of each the index of its input (`at`), whether it is on-off, its largest thrust [N], its least
+    impulse [N s] and the impulse of one step (`quantum`). The impulse that is commanded but not
+    fired is `left` for the next sample. `level` acts until the step `end`; `time` [s] is the
+    sample time.
     """
 
 
@@ -50,7 +62,7 @@ CHANNEL = Struct(
 
 @inlined
 def clipped(value, low, high):
-    """Return a number within limits; what is no number stays none."""
+    """Return a number within limits; NaN remains NaN."""
     value = chosen(value, low, low, value)
     return chosen(high, value, high, value)
 
@@ -64,15 +76,28 @@ def limit(channel, u):
 
 
 @inlined
-def send(channel, step, u):
-    """Put the command of a sample on its way."""
-    count = len(channel.low)
-    copy(u, 0, channel.pending, (step // channel.sample) % channel.slots * count, count)
+def is_asked(channel, step):
+    """Whether the policy is asked for a command at the start of a step."""
+    return channel.sample == 0 or step % channel.sample == 0
 
 
 @inlined
-def arrive(channel, step, u):
-    """Write what acts in a step of what has arrived."""
+def transmit(channel, step, nu, u):
+    """Replace u, a new command wherever the policy is asked, by the inputs that act in a step."""
+    if is_asked(channel, step):
+        limit(channel, u)
+        if channel.sample > 0:
+            count = len(channel.low)
+            first = (step // channel.sample) % channel.slots * count
+            copy(u, 0, channel.pending, first, count)
+    if channel.sample > 0:
+        _arrive(channel, step, u)
+    _limit_wheel_speeds(channel, nu, u)
+
+
+@inlined
+def _arrive(channel, step, u):
+    """Write the command that has arrived last, or its pulses, into the inputs of a step."""
     count, any_fresh = len(channel.low), False
     for lane in range(width(channel.delay)):
         since = step - int(peek(channel.delay, 0, lane))
@@ -96,7 +121,7 @@ def arrive(channel, step, u):
 
 @inlined
 def _begin_pulses(channel, step, u):
-    """Take the command of a sample, and carry on what is not fired of it."""
+    """Fire the command of a sample, and carry the rest of its impulse to the next sample."""
     pulses, sample, fresh = channel.pulses, channel.sample, load(channel.fresh, 0)
     for index in range(len(pulses.at)):
         most, least = load(pulses.most, index), load(pulses.least, index)
@@ -118,8 +143,8 @@ def _begin_pulses(channel, step, u):
 
 
 @inlined
-def spare_wheels(channel, nu, u):
-    """Cut what would take a wheel beyond its speed within a step; it drives nothing of itself."""
+def _limit_wheel_speeds(channel, nu, u):
+    """Limit torques that would exceed a wheel's speed limit within a step, to zero at most."""
     wheels = channel.wheels
     for index in range(len(wheels.at)):
         least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)

@@ -6,13 +6,14 @@ import logging
 import math
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from threading import Lock, RLock
+from threading import Event, Lock, RLock, Thread
 from typing import Any
 
 from fflin.base.errors import unknown
@@ -31,6 +32,7 @@ VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 
 # Wait for another process's compilation for so long [s] before saying so, and at most.
 _SILENCE, _LONGEST_WAIT = 2.0, 600.0
+_INTERVAL = 1.0  # [s] between the seconds that a terminal shows during a compilation
 
 _log = logging.getLogger("fflin")
 _TURN, _COMPILING = Lock(), RLock()
@@ -71,7 +73,9 @@ def kernel(module: str, name: str, what: str = "the batch kernel") -> Any:
 
 @cache
 def _prepared(module: str, name: str, what: str) -> Any:
-    compiled = getattr(import_module(f"fflin.kernel.{module}"), name)
+    from fflin.kernel.machine_code import translated
+
+    compiled = translated(getattr(import_module(f"fflin.kernel.{module}"), name))
     folder = Path(compiled.stats.cache_path)
     with _between_processes(folder / f"{module}.{name}.lock"):
         older = set(_entries(folder, module, name)) - set(_kept(folder, module, name))
@@ -90,7 +94,32 @@ def _compile_alone(
     with _COMPILING, _between_processes(folder / f"{module}.{name}.lock"):
         if not _kept(folder, module, name):
             _log.warning("fflin: compiling %s once; the code is stored in %s", what, folder)
+            with _seconds_shown(what):
+                return compile(signature)
         return compile(signature)
+
+
+@contextmanager
+def _seconds_shown(what: str) -> Iterator[None]:
+    """Count the seconds of a compilation on a terminal."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield
+        return
+    done, begun = Event(), time.monotonic()
+
+    def count() -> None:
+        while not done.wait(_INTERVAL):
+            said = f"\rcompiling {what}: {time.monotonic() - begun:.0f} s "
+            print(said, end="", file=sys.stderr, flush=True)
+
+    thread = Thread(target=count, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+        print("\r\x1b[2K", end="", file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -1,21 +1,176 @@
-"""M^-1, accelerations and their slopes at many points, eight to an instruction."""
+r"""M^-1, accelerations and their derivatives at many points, eight to an instruction.
+
+RNEA is differentiated in closed form: with the spatial axis S of a joint, the velocity v and
+acceleration a of what carries it, and Psi' = v x S, Psi'' = a x S + v x Psi', the derivatives of
+the joint forces tau with respect to the positions q and velocities q' are, for a joint j inwards
+of i,
+
+.. math::
+    \partial\tau_j/\partial q_i &= S_j^T (2 B_i \Psi'_i + I_i \Psi''_i + S_i \times^* f_i) \\
+    \partial\tau_j/\partial q'_i &= S_j^T (2 B_i S_i + 2 I_i \Psi'_i) \\
+    \partial\tau_i/\partial q_j &= (2 B_i^T S_i)^T \Psi'_j + (I_i S_i)^T \Psi''_j \\
+    \partial\tau_i/\partial q'_j &= (2 B_i^T S_i)^T S_j + 2 (I_i S_i)^T \Psi'_j
+
+where I, B and f are inertia, Coriolis matrix and force of all that joint i carries. 2 B takes a
+turn w to the force 2 w x p and the moment 2 (tr G - G) w + w x h, with the momentum p, the first
+moments of momentum G = sum m v r^T about the joint, and stored momentum h.
+
+References
+----------
+S. Singh, R. P. Russell and P. M. Wensing, Efficient analytical derivatives of rigid-body dynamics
+using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
+"""
 
 from __future__ import annotations
 
-from fflin.kernel import factor, rnea
-from fflin.kernel.crba import inwards, outwards
+from fflin.kernel import inertia, rnea
+from fflin.kernel import vectors as vec
+from fflin.kernel.inertia import inwards, outwards
 from fflin.kernel.lanes import compiled, inlined, load, splat, store
-from fflin.kernel.slopes import differentiate
-from fflin.kernel.tree import LANES
+from fflin.kernel.rnea import (
+    FORCE,
+    LOAD,
+    MOMENTS,
+    MOMENTUM,
+    MOTION,
+    PSI,
+    PSI2,
+    STORED,
+    at_parent,
+    joint_axis,
+    spatial_inertia_times,
+)
+from fflin.kernel.tree import INERTIA, LANES, PLACE
 from fflin.kernel.vectors import get6, minus6, put6, times6
+
+
+@inlined
+def _coriolis(work, at, w):
+    """Return 2 B w, moment and force, of what a joint carries."""
+    G = vec.get_columns(work, at + MOMENTS)
+    trace = G[0][0] + G[1][1] + G[2][2]
+    moment = vec.minus(vec.times(w, trace), vec.product(G, w))
+    moment = vec.plus(vec.plus(moment, moment), vec.cross(w, vec.get3(work, at + STORED)))
+    force = vec.cross(w, vec.get3(work, at + MOMENTUM))
+    return moment, vec.plus(force, force)
+
+
+@inlined
+def _coriolis_transposed(work, at, along):
+    """Return 2 B^T s of a motion vector s, which is a moment."""
+    G = vec.get_columns(work, at + MOMENTS)
+    trace = G[0][0] + G[1][1] + G[2][2]
+    w = along[0]
+    carried = vec.dot(G[0], w), vec.dot(G[1], w), vec.dot(G[2], w)
+    moment = vec.plus(
+        vec.minus(vec.times(w, trace), carried), vec.cross(vec.get3(work, at + MOMENTUM), along[1])
+    )
+    return vec.plus(vec.plus(moment, moment), vec.cross(vec.get3(work, at + STORED), w))
+
+
+@inlined
+def _passive_slopes(work, tree, layout, loads):
+    """Write those of springs and dampers, and zeros."""
+    size = len(tree.row)
+    n, width = size - 6, 2 * size
+    for entry in range(size * width):
+        store(work, layout.lower + entry, 0.0)
+    for index in range(n):
+        row = layout.lower + (6 + index) * width
+        store(work, row + (6 + index), load(loads.stiffness, index))
+        store(work, row + (12 + n + index), load(loads.damping, index))
+
+
+@inlined
+def _add_column(work, at, width, force):
+    """Add a moment and force to the rows of the base in a column."""
+    for index in range(3):
+        vec.add(work, at + index * width, force[0][index])
+        vec.add(work, at + (3 + index) * width, force[1][index])
+
+
+@inlined
+def _joint_slopes(work, tree, layout):
+    """Add those over each joint, and those of each joint's force over omega_b."""
+    n, width = len(tree.row) - 6, 2 * len(tree.row)
+    spin = vec.get3(work, layout.motion)
+    for body in range(len(tree.parent) - 1, 0, -1):
+        at = layout.load + body * LOAD
+        moving = layout.motion + body * MOTION
+        inertia = tree.inertias + body * INERTIA
+        column = tree.coordinate[body]
+        axis = joint_axis(work, tree, body)
+        psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
+        momentum = spatial_inertia_times(work, inertia, axis)
+        coriolis = _coriolis_transposed(work, at, axis)
+        moment, force = vec.get6(work, at + FORCE)
+        by_q = vec.plus6(_coriolis(work, at, psi[0]), spatial_inertia_times(work, inertia, psi2))
+        turned = (
+            vec.plus(vec.cross(axis[0], moment), vec.cross(axis[1], force)),
+            vec.cross(axis[0], force),
+        )
+        by_q = vec.plus6(by_q, turned)
+        weight = spatial_inertia_times(work, inertia, psi)
+        by_v = vec.plus6(_coriolis(work, at, axis[0]), vec.plus6(weight, weight))
+        own = layout.lower + column * width
+        q, v = column, (column + 6 + n)
+        above = body
+        while above > 0:
+            place = tree.places + above * PLACE
+            other = tree.coordinate[above]
+            axis = joint_axis(work, tree, above)
+            row = layout.lower + other * width
+            vec.add(work, row + q, vec.dot6(axis, by_q))
+            vec.add(work, row + v, vec.dot6(axis, by_v))
+            if above != body:
+                moving = layout.motion + above * MOTION
+                psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
+                value = vec.dot(coriolis, psi[0]) + vec.dot6(momentum, psi2)
+                vec.add(work, own + other, value)
+                value = vec.dot6(momentum, psi)
+                value = vec.dot(coriolis, axis[0]) + (value + value)
+                vec.add(work, own + (other + 6 + n), value)
+            momentum = at_parent(work, place, momentum)
+            by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
+            above = tree.parent[above]
+        vec.add3(work, own + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
+        _add_column(work, layout.lower + q, width, by_q)
+        _add_column(work, layout.lower + v, width, by_v)
+
+
+@inlined
+def _base_slopes(work, tree, layout):
+    """Write those of the base's force over omega_b."""
+    n, width = len(tree.row) - 6, 2 * len(tree.row)
+    zero, one = 0.0, 1.0
+    spin = vec.get3(work, layout.motion)
+    axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
+    for index in range(3):
+        e = axes[index]
+        weight = spatial_inertia_times(
+            work, tree.inertias, (vec.cross(spin, e), (zero, zero, zero))
+        )
+        moment, force = vec.plus6(_coriolis(work, layout.load, e), weight)
+        for axis in range(3):
+            row = layout.lower + (axis * width + 6 + n + index)
+            store(work, row, moment[axis])
+            store(work, row + 3 * width, force[axis])
+
+
+@inlined
+def differentiate(work, tree, layout, loads):
+    """Write the slopes of M c + bias less the forces over the state, rows of 12 + 2 n."""
+    _passive_slopes(work, tree, layout, loads)
+    _joint_slopes(work, tree, layout)
+    _base_slopes(work, tree, layout)
 
 
 @inlined
 def _invert(work, robot):
     """Write M^-1, and what tells whether it is sound."""
     tree, size = robot.tree, len(robot.tree.row)
-    factor.invert_factor(work, tree)
-    factor.multiply(work, tree, robot.judged)
+    inertia.invert_factor(work, tree)
+    inertia.multiply(work, tree, robot.judged)
     total = splat(work, 0.0)
     for row in range(size):
         total = total + robot.bounds[row] * load(work, tree.square + row * (size + 1))
@@ -72,35 +227,35 @@ def derive(robot, points, out, lanes, work, moves):
     for block in range(0, len(q), LANES):
         # The last block begins early enough to fill the lanes; some points are done twice.
         first = min(block, len(q) - LANES)
-        factor.pack(q, first, lanes.q)
+        inertia.pack(q, first, lanes.q)
         outwards(work, tree, lanes.q)
         if moves:
-            factor.pack(nu, first, lanes.nu)
-            factor.pack(force, first, lanes.force)
-            factor.pack(u, first, lanes.u)
+            inertia.pack(nu, first, lanes.nu)
+            inertia.pack(force, first, lanes.force)
+            inertia.pack(u, first, lanes.u)
             rnea.move_bodies(work, tree, layout, lanes.nu)
             rnea.load_bodies(work, tree, layout, loads)
             rnea.load_carried(work, tree, layout, loads, lanes.u)
             rnea.load_momenta(work, tree, layout, loads)
         rnea.write_columns(work, tree, layout, loads)
         inwards(work, tree)
-        factor.keep_diagonal(work, tree)
-        factor.factorise(work, tree)
+        inertia.keep_diagonal(work, tree)
+        inertia.factorise(work, tree)
         if moves:
             rnea.collect(work, tree, layout)
             rnea.collect_momenta(work, tree, layout)
             for index in range(size):
                 value = load(lanes.force, index) - load(work, layout.bias + index)
                 store(work, layout.c + index, value)
-            factor.solve(work, tree, layout.c)
+            inertia.solve(work, tree, layout.c)
         _invert(work, robot)
         _push(work, robot)
-        factor.unpack(work, robot.by_u, by_u.shape[1], by_u, first, 0)
-        factor.unpack(work, robot.judged, judged.shape[1], judged, first, 0)
+        inertia.unpack(work, robot.by_u, by_u.shape[1], by_u, first, 0)
+        inertia.unpack(work, robot.judged, judged.shape[1], judged, first, 0)
         if moves:
             rnea.accelerate_bodies(work, tree, layout)
             differentiate(work, tree, layout, loads)
             _solve(work, robot)
-            factor.unpack(work, layout.c, size, c, first, 0)
+            inertia.unpack(work, layout.c, size, c, first, 0)
             lower = size * 2 * size
-            factor.unpack(work, robot.slopes, lower, A, first, A.shape[1] - lower)
+            inertia.unpack(work, robot.slopes, lower, A, first, A.shape[1] - lower)

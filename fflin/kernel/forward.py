@@ -8,39 +8,38 @@ from __future__ import annotations
 
 from collections import namedtuple
 
-import numba
+import numpy as np
 
 from fflin.kernel import vectors as vec
-from fflin.kernel.accelerations import Layout, Loads
-from fflin.kernel.arguments import FLAGS, INDICES, LANED, REALS, WHOLE, Struct
-from fflin.kernel.crba import inwards, outwards
-from fflin.kernel.factor import factorise, solve
+from fflin.kernel.arguments import FLAGS, INDICES, LANED, REALS, WHOLE, Kind, Struct
+from fflin.kernel.displacements import attitude, axes_of, columns_of, quaternion_times
+from fflin.kernel.inertia import factorise, inwards, outwards, solve
 from fflin.kernel.lanes import angle, called, chosen, inlined, load, store
-from fflin.kernel.places import attitude, axes_of, columns_of, quaternion_times
 from fflin.kernel.rnea import collect, load_bodies, move_bodies, write_columns
-from fflin.kernel.tree import Tree
+from fflin.kernel.tree import Layout, Loads, Tree
 
 
 class Mechanics(
     namedtuple(
         "Mechanics",
-        "tree layout loads gravity index circling springy rest row held triads origin drives",
+        "tree layout loads gravity index circling scale springy rest row held triads origin faults",
     )
 ):
     """A robot as the loop reads it; each array of doubles may have a second axis of eight lanes.
 
     Gravity (3,); of each joint its entry of q (`index`), whether that is the cosine of an angle,
-    whether it has a spring or damper, and where the spring is at rest; the coordinate that each
-    input drives (`row`), -1 for one that is carried; the first of three inputs each that are a
-    vector on the base in reference axes (`held`), and in any (`triads`); the placement (7,) of
-    the world's origin seen from the reference; and the errors of the inputs.
+    the entry for a unit of q_m (`scale`, 1 except for modal amplitudes), whether it has a spring or
+    damper, and where the spring is at rest; the coordinate that each input drives (`row`), -1 for
+    one that is carried; the first of three inputs each that are a vector on the base in reference
+    axes (`held`), and in any (`triads`); the placement (7,) of the world's origin seen from the
+    reference; and the errors of the inputs.
     """
 
 
-class Drives(namedtuple("Drives", "gain bias until turn")):
-    """What inputs (nu,) give of what is commanded: gain u + bias, and nothing from `until` [s].
+class ActuatorFaults(namedtuple("ActuatorFaults", "gain bias until turn")):
+    """Faults: a command u gives the input gain u + bias (nu,), and zero from `until` [s] on.
 
-    Of each triad the columns (9,) say along what its three act.
+    `turn` has the columns (9,) along which the three inputs of each vector on the base act.
     """
 
 
@@ -60,23 +59,23 @@ TREE = Struct(
     **dict.fromkeys(_SIZES.split(), WHOLE),
     **dict.fromkeys(("fixed", "bodies"), LANED),
     unbounded=FLAGS,
-    axes=numba.types.Array(numba.float64, 3, "C"),
-    common=numba.types.Array(numba.intp, 2, "C"),
+    axes=Kind(np.float64, 3),
+    common=Kind(np.intp, 2),
 )
 LAYOUT = Struct(Layout, WHOLE)
 LOADS = Struct(Loads, LANED, body=INDICES, input=INDICES, stored_body=INDICES)
-DRIVES, POINT = Struct(Drives, LANED), Struct(Point, LANED)
+ACTUATOR_FAULTS, POINT = Struct(ActuatorFaults, LANED), Struct(Point, LANED)
 # One that is the same for all lanes.
-COMMON_POINT = Struct(Point, name="CommonPoint")
+COMMON_POINT = Struct(Point, REALS, "CommonPoint")
 MECHANICS = Struct(
     Mechanics,
     INDICES,
     tree=TREE,
     layout=LAYOUT,
     loads=LOADS,
-    drives=DRIVES,
+    faults=ACTUATOR_FAULTS,
     **dict.fromkeys(("circling", "springy"), FLAGS),
-    **dict.fromkeys(("gravity", "rest", "origin"), REALS),
+    **dict.fromkeys(("gravity", "scale", "rest", "origin"), REALS),
 )
 
 
@@ -89,12 +88,12 @@ def configure(work, robot, q):
 
 @inlined
 def joint_position(robot, q, joint):
-    """Return a joint's angle, in (-pi, pi] where it turns without end, or length."""
+    """Return a joint's angle, in (-pi, pi] where it turns without end, length or amplitude."""
     at = robot.index[joint]
     value = load(q, at)
     if robot.circling[joint]:
         value = angle(load(q, at + 1), value)
-    return value
+    return value / load(robot.scale, joint)
 
 
 @inlined
@@ -104,16 +103,14 @@ def seen(robot, q):
 
 
 @inlined
-def turn_inputs(robot, point, t):
-    """Write the inputs as they act at a time, in base axes."""
-    drives, pushing = robot.drives, point.pushing
-    for index in range(len(robot.row)):
-        given = load(drives.gain, index) * load(point.u, index) + load(drives.bias, index)
-        store(pushing, index, chosen(t, load(drives.until, index), given, 0.0))
-    for index in range(len(robot.triads)):
-        at, columns = robot.triads[index], vec.get_columns(drives.turn, 9 * index)
-        vec.put3(pushing, at, vec.product(columns, vec.get3(pushing, at)))
-    turn_held(robot, point)
+def apply_faults(faults, triads, t, u, given):
+    """Write the inputs that faulty actuators give of a command u at a time."""
+    for index in range(len(faults.gain)):
+        value = load(faults.gain, index) * load(u, index) + load(faults.bias, index)
+        store(given, index, chosen(t, load(faults.until, index), value, 0.0))
+    for index in range(len(triads)):
+        at, columns = triads[index], vec.get_columns(faults.turn, 9 * index)
+        vec.put3(given, at, vec.product(columns, vec.get3(given, at)))
 
 
 @inlined

@@ -1,235 +1,84 @@
-"""One number or eight side by side in numba code, by the same lines.
+"""The operations and decorators of which the kernel's functions are written.
 
-An array of one axis holds numbers, and one of two axes, the second of eight, holds lanes: one
-configuration each, and one instruction for all. `load` gives what an array holds, a double or a
-`Lanes`, and arithmetic takes both; a double counts for every lane. So a function that reads as for
-one number is compiled for either, and each array that it reads may say a thing for all lanes or
-lane by lane.
-
-LLVM does not vectorise loops over several arrays that may overlap. A type of its own leaves it no
-choice. Where a machine has narrower registers, LLVM splits the eight over several.
+A function of the kernel is a Python function. Called as it stands, with arrays or lists of one
+axis, it computes with one number at a time; the simulation in Python calls it so, and a debugger
+works in it. `kernel.lane_code` compiles the same function, also for arrays of two axes with eight
+lanes side by side, where each operation has its machine code.
 """
 
 from __future__ import annotations
 
-import operator
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
-import numba
-from llvmlite import ir
-from numba.core import cgutils
-from numba.extending import (
-    intrinsic,
-    lower_builtin,
-    models,
-    register_model,
-    type_callable,
-)
+import numpy as np
 
-from fflin.kernel.parts import PartCompiler
-from fflin.kernel.tree import LANES
+F = TypeVar("F", bound=Callable[..., Any])
 
-_DOUBLE, _INT32 = ir.DoubleType(), ir.IntType(32)
-_VECTOR = ir.VectorType(_DOUBLE, LANES)
-_BYTES = 8  # alignment of a double
-
-# A product and a sum may become one fused instruction, which rounds once; a quotient by zero is
-# infinite; and no references to arrays are counted, which takes three quarters of the time else,
-# and makes no function able to allocate.
-_OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
-_PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
-inlined = numba.njit(forceinline=True, **_PART)
-# For what is a list of calls: compiled with its caller, and not for itself before.
-listed = numba.njit(inline="always", **_OPTIONS)
-# Called where it is seldom needed: what is inlined takes longest to compile.
-called = numba.njit(**_PART)
-compiled = numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS)
+# How each function of the kernel is compiled.
+HOW: dict[Callable[..., Any], str] = {}
+# The loop that is compiled in place of an operation of NumPy.
+LOOPS: dict[Callable[..., Any], Callable[..., Any]] = {}
 
 
-class Lanes(numba.types.Type):
-    """The type of eight doubles side by side."""
+def _decorator(how: str) -> Callable[[F], F]:
+    def noted(function: F) -> F:
+        HOW[function] = how
+        return function
 
-    def __init__(self) -> None:
-        super().__init__(name="Lanes")
-
-
-lanes = Lanes()
-double = numba.types.float64
-_NUMBERS = (lanes, double)
+    return noted
 
 
-@register_model(Lanes)
-class _LanesModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _VECTOR)
+inlined = _decorator("inlined")
+# For a list of calls: compiled with its caller, and not for itself before.
+listed = _decorator("listed")
+# Called where it is seldom needed: inlined functions take longest to compile.
+called = _decorator("called")
+# Called from Python; its machine code is kept on disk.
+compiled = _decorator("compiled")
+
+floor, whole, root, angle = np.floor, np.rint, np.sqrt, math.atan2
 
 
-def _spread(builder: Any, value: Any) -> Any:
-    """Return a double in all lanes; lanes as they are."""
-    if value.type == _VECTOR:
-        return value
-    nothing = ir.Constant(_VECTOR, ir.Undefined)
-    one = builder.insert_element(nothing, value, _INT32(0))
-    return builder.shuffle_vector(one, nothing, ir.Constant(ir.VectorType(_INT32, LANES), None))
+def load(array: Any, index: int) -> Any:
+    """Return the number or the lanes at an index."""
+    return array[index]
 
 
-def _alike(builder: Any, values: Any) -> list[Any]:
-    """Return numbers as lanes where one of them is."""
-    if any(value.type == _VECTOR for value in values):
-        return [_spread(builder, value) for value in values]
-    return list(values)
+def store(array: Any, index: int, value: Any) -> None:
+    """Write a number or lanes at an index."""
+    array[index] = value
 
 
-def _together(*kinds: Any) -> Any:
-    """Return the type that such numbers make, or None where one is no number."""
-    if any(kind not in _NUMBERS for kind in kinds):
-        return None
-    return lanes if lanes in kinds else double
-
-
-def _arithmetic(python: Callable[..., Any], instruction: str) -> None:
-    @type_callable(python)
-    def typed(_: Any) -> Any:
-        def typer(left: Any, right: Any) -> Any:
-            return lanes if _together(left, right) == lanes else None
-
-        return typer
-
-    def lowered(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return getattr(builder, instruction)(*_alike(builder, arguments), flags=["contract"])
-
-    for pair in ((Lanes, Lanes), (Lanes, numba.types.Float), (numba.types.Float, Lanes)):
-        lower_builtin(python, *pair)(lowered)
-
-
-for _python, _instruction in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
-    _arithmetic(_python, _instruction)
-
-
-@type_callable(operator.neg)
-def _typed_negative(_: Any) -> Any:
-    return lambda value: lanes if value == lanes else None
-
-
-@lower_builtin(operator.neg, Lanes)
-def _negative(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-    return builder.fneg(arguments[0])
-
-
-def _held(array: Any) -> Any:
-    """Return the type of what an array holds."""
-    return lanes if array.ndim == 2 else double
-
-
-def _flat_place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
-    """Return where a double of a contiguous array is, all of its axes taken for one."""
-    return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
-
-
-def _place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
-    if _held(kind) == double:
-        return _flat_place(context, builder, kind, array, index)
-    index = builder.mul(index, ir.Constant(index.type, LANES))
-    return builder.bitcast(_flat_place(context, builder, kind, array, index), _VECTOR.as_pointer())
-
-
-def _write(builder: Any, value: Any, place: Any) -> None:
-    builder.store(value, place).align = _BYTES
-
-
-@intrinsic
-def load(typing: Any, array: Any, index: Any) -> Any:
-    """Read the number or the lanes at an index of a contiguous array."""
-
-    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        value = builder.load(_place(context, builder, array, *arguments))
-        value.align = _BYTES
-        return value
-
-    return _held(array)(array, numba.types.intp), generate
-
-
-@intrinsic
-def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write a number or lanes at an index of a contiguous array."""
-
-    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        written = arguments[2]
-        if _held(array) == lanes:
-            written = _spread(builder, written)
-        _write(builder, written, _place(context, builder, array, *arguments[:2]))
-        return context.get_dummy_value()
-
-    given = value if _held(array) == lanes and value == lanes else double
-    return numba.types.void(array, numba.types.intp, given), generate
-
-
-@intrinsic
-def splat(typing: Any, array: Any, value: Any) -> Any:
+def splat(array: Any, value: float) -> Any:
     """Return a number as an array holds them, alone or in all lanes."""
-
-    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return _spread(builder, arguments[1]) if _held(array) == lanes else arguments[1]
-
-    return _held(array)(array, double), generate
+    return value
 
 
-def _rounding(name: str) -> Any:
-    @intrinsic
-    def rounded(typing: Any, value: Any) -> Any:
-        def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-            kind = arguments[0].type
-            of = f"v{LANES}f64" if kind == _VECTOR else "f64"
-            function = cgutils.get_or_insert_function(
-                builder.module, ir.FunctionType(kind, [kind]), f"llvm.{name}.{of}"
-            )
-            return builder.call(function, arguments)
-
-        return value(value), generate
-
-    return rounded
+def peek(array: Any, index: int, lane: int) -> Any:
+    """Return the number of a lane at an index."""
+    return array[index]
 
 
-floor, whole, root = _rounding("floor"), _rounding("rint"), _rounding("sqrt")
+def poke(array: Any, index: int, lane: int, value: float) -> None:
+    """Write the number of a lane at an index."""
+    array[index] = value
 
 
-def _one(builder: Any, kind: Any, index: Any, lane: Any) -> Any:
-    """Return which double of all a lane at an index is; a number is its only one."""
-    if _held(kind) == double:
-        return index
-    return builder.add(builder.mul(index, ir.Constant(index.type, LANES)), lane)
+def chosen(left: Any, right: Any, less: Any, other: Any) -> Any:
+    """Return `less` where left < right, and `other` elsewhere and where one is NaN."""
+    return less if left < right else other
 
 
-@intrinsic
-def peek(typing: Any, array: Any, index: Any, lane: Any) -> Any:
-    """Read a lane at an index of a contiguous array."""
-
-    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        values, *at = arguments
-        place = _flat_place(context, builder, array, values, _one(builder, array, *at))
-        return builder.load(place)
-
-    return double(array, numba.types.intp, numba.types.intp), generate
+def below(value: Any, bound: Any) -> Any:
+    """Whether a number, or every lane, is less than a bound; false where one is NaN."""
+    return value < bound
 
 
-@intrinsic
-def poke(typing: Any, array: Any, index: Any, lane: Any, value: Any) -> Any:
-    """Write a double to a lane at an index of a contiguous array."""
-
-    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        values, *at, written = arguments
-        place = _flat_place(context, builder, array, values, _one(builder, array, *at))
-        builder.store(written, place)
-        return context.get_dummy_value()
-
-    return numba.types.void(array, numba.types.intp, numba.types.intp, double), generate
+def transpose(source: Any, index: int, target: Any, start: int, stride: int) -> None:
+    """Write eight entries in eight lanes, lane k to ``target`` from ``start + k stride`` on."""
+    raise NotImplementedError("eight lanes need compiled code")
 
 
 @inlined
@@ -238,86 +87,39 @@ def width(array: Any) -> Any:
     return array.size // max(len(array), 1)
 
 
-@intrinsic
-def chosen(typing: Any, left: Any, right: Any, less: Any, other: Any) -> Any:
-    """Return `less` where left < right, and `other` elsewhere and where one is no number."""
-
-    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        left, right, less, other = _alike(builder, arguments)
-        return builder.select(builder.fcmp_ordered("<", left, right), less, other)
-
-    return _together(left, right, less, other)(left, right, less, other), generate
+def row_product(a: Any, first: int, b: Any, second: int, count: int) -> Any:
+    """Return the scalar product of `count` entries of two arrays of numbers."""
+    return a[first : first + count].dot(b[second : second + count])
 
 
-@intrinsic
-def below(typing: Any, value: Any, bound: Any) -> Any:
-    """Whether a number, or every lane, is less than a bound; not where one is no number."""
-
-    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        value, bound = _alike(builder, arguments)
-        less = builder.fcmp_ordered("<", value, bound)
-        if value.type != _VECTOR:
-            return less
-        return builder.icmp_signed(
-            "==", builder.bitcast(less, ir.IntType(LANES)), ir.Constant(ir.IntType(LANES), -1)
-        )
-
-    return numba.types.boolean(value, bound), generate
+def add_row(a: Any, first: int, share: float, b: Any, second: int, count: int) -> None:
+    """Add `share` times `count` entries of an array of numbers to entries of another."""
+    a[first : first + count] += share * b[second : second + count]
 
 
-@intrinsic
-def angle(typing: Any, sine: Any, cosine: Any) -> Any:
-    """Return the angle of a sine and a cosine, in (-pi, pi]."""
-
-    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        kind = ir.FunctionType(_DOUBLE, [_DOUBLE, _DOUBLE])
-        atan2 = cgutils.get_or_insert_function(builder.module, kind, "atan2")
-        pair = _alike(builder, arguments)
-        if pair[0].type == _DOUBLE:
-            return builder.call(atan2, pair)
-        result = ir.Constant(_VECTOR, ir.Undefined)
-        for lane in map(_INT32, range(LANES)):
-            one = builder.call(atan2, [builder.extract_element(each, lane) for each in pair])
-            result = builder.insert_element(result, one, lane)
-        return result
-
-    return _together(sine, cosine)(sine, cosine), generate
+def write_scaled(source: Any, lane: int, share: float, target: Any) -> None:
+    """Write `share` times the first entries of a lane of an array into an array of numbers."""
+    target[:] = share * source[: len(target)]
 
 
-@intrinsic
-def transpose(typing: Any, source: Any, index: Any, target: Any, start: Any, stride: Any) -> Any:
-    """Write eight vectors that stand one after the other lane by lane.
+@called
+def _row_product(a: Any, first: int, b: Any, second: int, count: int) -> Any:
+    total = 0.0
+    for index in range(count):
+        total += a[first + index] * b[second + index]
+    return total
 
-    Lane k goes to the eight doubles of `target` from ``start + k stride`` on.
-    """
 
-    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        values, first, out, begin, step = arguments
-        rows = []
-        for row in range(LANES):
-            at = builder.add(first, ir.Constant(first.type, row))
-            rows.append(builder.load(_place(context, builder, source, values, at)))
-            rows[-1].align = _BYTES
-        # Swap blocks of 1, 2 and 4 lanes between rows that lie as far apart.
-        for size in (1, 2, 4):
-            low = [lane if not lane & size else lane - size + LANES for lane in range(LANES)]
-            high = [lane + size if not lane & size else lane + LANES for lane in range(LANES)]
-            masks = [
-                ir.Constant(ir.VectorType(_INT32, LANES), [_INT32(i) for i in picks])
-                for picks in (low, high)
-            ]
-            for row in range(LANES):
-                if not row & size:
-                    pair = rows[row], rows[row + size]
-                    rows[row], rows[row + size] = (
-                        builder.shuffle_vector(*pair, mask) for mask in masks
-                    )
-        for row, value in enumerate(rows):
-            at = builder.add(begin, builder.mul(step, ir.Constant(step.type, row)))
-            place = _flat_place(context, builder, target, out, at)
-            _write(builder, value, builder.bitcast(place, _VECTOR.as_pointer()))
-        return context.get_dummy_value()
+@called
+def _add_row(a: Any, first: int, share: float, b: Any, second: int, count: int) -> None:
+    for index in range(count):
+        a[first + index] += share * b[second + index]
 
-    index_type = numba.types.intp
-    signature = numba.types.void(source, index_type, target, index_type, index_type)
-    return signature, generate
+
+@called
+def _write_scaled(source: Any, lane: int, share: float, target: Any) -> None:
+    for index in range(len(target)):
+        target[index] = share * peek(source, index, lane)
+
+
+LOOPS |= {row_product: _row_product, add_row: _add_row, write_scaled: _write_scaled}

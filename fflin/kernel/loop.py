@@ -4,14 +4,30 @@ from __future__ import annotations
 
 from collections import namedtuple
 
-from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, Struct, opener
-from fflin.kernel.channel import CHANNEL, arrive, limit, send, spare_wheels
-from fflin.kernel.course import COURSE, add_wrench, begin_step, end_step, impose, kept_at, start_at
-from fflin.kernel.forward import MECHANICS, POINT, accelerate, configure, seen, turn_inputs
+from fflin.kernel.allocation import allocate
+from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, Opener, Struct
+from fflin.kernel.channel import CHANNEL, is_asked, transmit
+from fflin.kernel.conservation import (
+    MOMENTUM_REFERENCE,
+    add_wrench,
+    begin_step,
+    end_step,
+    impose,
+    kept_at,
+    start_at,
+)
+from fflin.kernel.displacements import displace, turn_back
+from fflin.kernel.forward import (
+    MECHANICS,
+    POINT,
+    accelerate,
+    apply_faults,
+    configure,
+    seen,
+    turn_held,
+)
 from fflin.kernel.lanes import below, called, compiled, inlined, listed, load, store
-from fflin.kernel.laws import LAW, NOTHING, command
-from fflin.kernel.places import displace, turn_back
-from fflin.kernel.sharing import share_out
+from fflin.kernel.policies import LAW, NOTHING, command
 from fflin.kernel.vectors import copy, put3, put6
 
 
@@ -26,7 +42,7 @@ class Method(namedtuple("Method", "h origin way speed nodes weights moments tang
     """
 
 
-class Watch(namedtuple("Watch", "squares sign")):
+class StopConditions(namedtuple("StopConditions", "squares sign")):
     """When to stop: squares of speeds (6 + n,), and the sign (1,) of q0 in the chart, or 0."""
 
 
@@ -38,9 +54,9 @@ class Stages(namedtuple("Stages", "rates along total first second u")):
 
 
 class Arguments(
-    namedtuple("Arguments", "robot method law channel course project pushed watch point stages")
+    namedtuple("Arguments", "robot method law channel reference project pushed stop point stages")
 ):
-    """What `advance` reads: whether the course is imposed and anything pushes from outside, too."""
+    """What `advance` reads; also whether to `project`, and whether anything pushes from outside."""
 
 
 ARGUMENTS = Struct(
@@ -49,14 +65,14 @@ ARGUMENTS = Struct(
     method=Struct(Method, h=REAL, origin=INDICES, tangent=FLAG),
     law=LAW,
     channel=CHANNEL,
-    course=COURSE,
+    reference=MOMENTUM_REFERENCE,
     project=FLAG,
     pushed=FLAG,
-    watch=Struct(Watch),
+    stop=Struct(StopConditions),
     point=POINT,
     stages=Struct(Stages, LANED),
 )
-_opened = opener(ARGUMENTS)
+_opened = Opener(ARGUMENTS)
 
 
 @inlined
@@ -73,42 +89,37 @@ def _combine(shares, row, rates, out):
 
 
 @inlined
-def _record(rows, row, point, course, t):
+def _record(rows, row, point, reference, t):
     """Write a row: q, nu, u, and momentum and centre of mass as they are to be."""
     at = row * (len(point.q) + len(point.nu) + len(point.u) + 9)
     for values in (point.q, point.nu, point.u):
         copy(values, 0, rows, at, len(values))
         at += len(values)
-    momentum, center = kept_at(course, t)
+    momentum, center = kept_at(reference, t)
     put6(rows, at, momentum)
     put3(rows, at + 6, center)
 
 
 @inlined
-def _goes_on(robot, watch, point):
+def _goes_on(robot, stop, point):
     """Whether all is finite, within bounds, and in the chart."""
-    good = below(-(load(watch.sign, 0) * seen(robot, point.q)[1]), 1e-300)
-    for index in range(len(watch.squares)):
+    good = below(-(load(stop.sign, 0) * seen(robot, point.q)[1]), 1e-300)
+    for index in range(len(stop.squares)):
         rate = load(point.nu, index)
-        good = good and below(rate * rate, load(watch.squares, index))
+        good = good and below(rate * rate, load(stop.squares, index))
     return good
 
 
 @inlined
 def _act(work, channel, law, robot, point, step, stage, t):
     """Write the inputs at a stage, as they are commanded and in base axes."""
-    sample = channel.sample
-    if law.kind != NOTHING and (sample == 0 or stage == 0):
-        if sample == 0 or step % sample == 0:
-            command(work, robot, law, point, t, step // max(sample, 1), stage)
-            share_out(law.sharing, point, law.u)
-            limit(channel, point.u)
-            if sample > 0:
-                send(channel, step, point.u)
-        if sample > 0:
-            arrive(channel, step, point.u)
-        spare_wheels(channel, point.nu, point.u)
-    turn_inputs(robot, point, t)
+    if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
+        if is_asked(channel, step):
+            command(work, robot, law, point, t, step // max(channel.sample, 1), stage)
+            allocate(law.allocation, point, law.u)
+        transmit(channel, step, point.nu, point.u)
+    apply_faults(robot.faults, robot.triads, t, point.u, point.pushing)
+    turn_held(robot, point)
 
 
 @called
@@ -148,7 +159,7 @@ def _move(robot, method, stages, point, stage):
 @listed
 def go_on(of, clock, last, every, rows, work):
     """Do as `advance`, of arguments that are opened."""
-    robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.course
+    robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
     point, stages = of.point, of.stages
     h, row = method.h, 0
     configure(work, robot, point.q)
@@ -179,18 +190,18 @@ def go_on(of, clock, last, every, rows, work):
         if of.project:
             impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
-        if not _goes_on(robot, of.watch, point):
+        if not _goes_on(robot, of.stop, point):
             break
 
 
 @compiled
 def advance(words, clock, last, every, rows, work):
-    """Go on with eight runs up to a step, or to one that led where `watch` stops.
+    """Advance eight runs up to a step, or to a step that meets a stop condition.
 
-    `words` are of `Arguments`. The point, the sums of the course, and what law and channel remember
-    are brought up to there, clock (1,) how many steps are done of `last`; at the first the momentum
-    and the centre of mass of the start are written into the course. Each `every` steps, where that
-    is not 0, a row gets q, nu, u, and the momentum (6,) and centre of mass (3,) that are kept.
-    `work` has `Layout.size` entries.
+    `words` are of `Arguments`. The point, the momentum reference and the memory of policy and
+    channel are updated; clock (1,) is the number of steps done of `last`. At the first step the
+    momentum and the centre of mass of the start are written into the momentum reference. Every
+    `every` steps, if that is not 0, a row gets q, nu, u, and the momentum (6,) and centre of mass
+    (3,) of the reference. `work` has `Layout.size` entries.
     """
     go_on(_opened(words), clock, last, every, rows, work)

@@ -1,6 +1,6 @@
 """Velocities, accelerations and forces of all bodies: RNEA in base axes.
 
-All vectors stand in base axes and all moments are about the joints, as in `kernel.crba`.
+All vectors stand in base axes and all moments are about the joints, as in `kernel.inertia`.
 
 References
 ----------
@@ -10,18 +10,16 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5.
 from __future__ import annotations
 
 from fflin.kernel import vectors as vec
-from fflin.kernel.crba import inertia_times
+from fflin.kernel.inertia import inertia_times
 from fflin.kernel.lanes import inlined, load, splat, store
-from fflin.kernel.tree import INERTIA, PLACE
+from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
 
 # Where the motion vectors of every body begin: velocity, Psi', acceleration without c, that of c
 # alone, and Psi''.
 VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
-MOTION = 30
 # Where these begin, of all that its joint carries: momentum p, columns of G, stored momentum h,
 # moment and force without c, and those of c on what is carried.
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
-LOAD = 27
 
 _NONE = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 

@@ -11,7 +11,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from fflin.base.validation import Array
-from fflin.robot.frames import ROOT
+from fflin.dynamics.actuation import Actuation
+from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 LANES = 8  # configurations that the kernel does at once
@@ -22,6 +23,8 @@ PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 # How many numbers are a body's place (x, y and z axes, and its origin from its parent's) and its
 # inertia (m, m c, I as xx xy xz yy yz zz).
 PLACE, INERTIA = 12, 10
+# The same of its motion and of what its joint carries, see `kernel.rnea`.
+MOTION, LOAD = 30, 27
 
 
 class Tree(
@@ -48,6 +51,14 @@ class Tree(
     (`target`, `share`), last the first of the base's six. Then the number of entries, and where
     the parts of the work space begin; its size.
     """
+
+
+class Layout(namedtuple("Layout", "motion load bias c columns lower held size")):
+    """Where the parts of the kernel's work space begin, beyond those of the tree; its size."""
+
+
+class Loads(namedtuple("Loads", "body wrench input stored_body stored stiffness damping")):
+    """Body, unit wrench at its joint and number of carried inputs; stored momenta; springs."""
 
 
 # By robot, as long as it is alive; robots do not change.
@@ -155,7 +166,7 @@ def _screw(model: pin.Model, joint: Any) -> tuple[pin.SE3, float, float] | None:
 
 def _coordinates(robot: Robot) -> tuple[list[int], list[float]]:
     """Return the coordinate that moves each body, and how far it moves it for a unit."""
-    at = {joint.idx_v: (6 + index, 1.0) for index, joint in enumerate(robot.joints)}
+    at = {joint.idx_v: (6 + index, joint.scale) for index, joint in enumerate(robot.joints)}
     for joint, leader, multiplier, _ in robot.followers:
         at[joint.idx_v] = (at[leader.idx_v][0], multiplier)
     moved = [at[joint.idx_v] for joint in robot.model.joints.tolist()[ROOT + 1 :]]
@@ -206,3 +217,46 @@ def _common(paths: list[list[int]]) -> NDArray[np.intp]:
             common[index, :index] = common[:index, index] = common[path[-2], :index]
         common[index, index] = len(path)
     return common
+
+
+def work_space(size: int) -> Array:
+    """Return an array (size, LANES) with nothing in it yet."""
+    space = np.empty((size + 1) * LANES)
+    # The kernel's vectors are 64 bytes; where they begin at such an address it is faster.
+    first = -(space.ctypes.data // 8) % LANES
+    return space[first : first + size * LANES].reshape(size, LANES)
+
+
+def loads_of(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
+    """Return what acts on a robot."""
+    body: list[int] = []
+    inputs: list[int] = []
+    wrenches: list[Array] = []
+    for joint, numbers, columns in actuation.wrench_columns:
+        turned = tree.axes[joint - ROOT].T
+        for number, column in zip(numbers.tolist(), columns.T, strict=True):
+            body.append(joint - ROOT)
+            inputs.append(number)
+            wrenches.append(
+                np.concatenate((turned @ column[PIN_ANGULAR], turned @ column[PIN_LINEAR]))
+            )
+    stored = [(joint - ROOT, momentum) for joint, momentum in robot.stored_momentum]
+    return Loads(
+        np.array(body, dtype=np.intp),
+        np.array(wrenches).ravel(),
+        np.array(inputs, dtype=np.intp),
+        np.array([index for index, _ in stored], dtype=np.intp),
+        np.array([tree.axes[index].T @ h for index, h in stored]).ravel(),
+        np.array(robot.springs.stiffness),
+        np.array(robot.springs.damping),
+    )
+
+
+def layout_of(tree: Tree, carried: int) -> Layout:
+    """Return the work space for a tree with so many inputs that are carried."""
+    size, bodies = len(tree.row), len(tree.parent)
+    sizes = (
+        *(bodies * MOTION, bodies * LOAD, size, size, size * carried),
+        *(size * 2 * size, size * 6),
+    )
+    return Layout(*(tree.size + int(x) for x in np.cumsum([0, *sizes])))

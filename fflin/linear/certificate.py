@@ -173,9 +173,7 @@ def _largest(x: Array) -> float:
 def inertia_matrix(robot: Robot, lin: LinearModel, state: StateMap | None = None) -> Array:
     """Return M (6 + n, 6 + n) of a linear model, in state order and in the frame's axes."""
     state = state or StateMap(robot, reference=lin.reference, frame=lin.frame)
-    M = state.project(pin.crba(robot.model, robot.create_data(), lin.q).T)
-    chart = state.chart(lin.q)
-    M = state.to_frame(chart, state.to_frame(chart, M).T).T
+    M = _in_frame(state, lin.q, state.project(pin.crba(robot.model, robot.create_data(), lin.q).T))
     M.setflags(write=False)
     return M
 
@@ -185,5 +183,10 @@ def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
     nv = 6 + state.robot.n
     inverse: Array = np.empty((nv, nv))
     Inertia(state, state.robot.create_data()).invert(lin.q, inverse)
-    chart = state.chart(lin.q)
-    return state.to_frame(chart, state.to_frame(chart, inverse).T).T
+    return _in_frame(state, lin.q, inverse)
+
+
+def _in_frame(state: StateMap, q: Array, matrix: Array) -> Array:
+    """Return M or its inverse (6 + n, 6 + n), given in base axes, in the axes of the frame."""
+    chart = state.chart(q)
+    return state.to_frame(chart, state.to_frame(chart, matrix).T).T

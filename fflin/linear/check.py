@@ -2,14 +2,16 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.tables import folded, grid, width
 from fflin.base.validation import Array, share
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.orbital import field_of
-from fflin.dynamics.outputs import Measuring, Sensing
+from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.certificate import (
     aba_route,
@@ -21,8 +23,7 @@ from fflin.linear.certificate import (
     scaled_condition,
     speeds,
 )
-from fflin.linear.check_report import Row, check_report
-from fflin.linear.fit import require_same
+from fflin.linear.fit import require_same, sensed
 from fflin.linear.model import LinearModel
 from fflin.linear.nonlinear import (
     ErrorDynamics,
@@ -33,6 +34,100 @@ from fflin.linear.nonlinear import (
 )
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
+
+
+class Row(NamedTuple):
+    """One error of a check, with its tolerance."""
+
+    test: str
+    block: str
+    error: float
+    tolerance: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether the error is within the tolerance; False if the error is NaN."""
+        return self.error <= self.tolerance
+
+
+def check_report(every: tuple[Row, ...], title: str) -> str:
+    """Show the verdict of a check, a table of blocks, and the single figures."""
+    states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
+    blocks = [row.block for row in every]
+    inputs = dict.fromkeys(b[:-1].split(", ")[1] for b in blocks if b.startswith("B["))
+    parts = [_verdict(every), folded([f"{title}, {len(every)} figures"])]
+    columns = {f"A[{{}}, {each}]": each for each in states}
+    columns |= {f"B[{{}}, {each}]": each for each in inputs}
+    found: dict[str, dict[str, Row]] = {
+        route: {row.block: row for row in every if row.test == test}
+        for test, route in _ROUTES.items()
+    }
+    allowed = []
+    for test, route in _ROUTES.items():
+        tolerance = next(iter(found[route].values())).tolerance
+        allowed.append(f"{route}: {test} (allowed {tolerance:.1e})")
+    body = [
+        [route, state, *(_error(rows[key.format(state)]) for key in columns)]
+        for route, rows in found.items()
+        for state in states
+        if any(rows[key.format(state)].error for key in columns)
+    ]
+    if not body:
+        said = f"A and B compared with {' and '.join(_ROUTES)}: no difference in any of "
+        parts.append(folded([f"{said}{len(states) * len(columns)} blocks"]))
+    else:
+        heads = [["", "", *columns.values()], *body]
+        said = f"relative errors of the blocks of A and B compared with {', '.join(allowed)}; "
+        said += "a dot is an error of exactly zero"
+        parts.append(f"{folded([said])}\n\n{_fitted(heads, 2 + len(states))}")
+    single = [row for row in every if row.test not in _ROUTES]
+    rest = [["figure", "error", "allowed"]]
+    rest += [[f"{r.test}: {r.block}", _error(r), f"{r.tolerance:.1e}"] for r in single if r.error]
+    if rest[1:]:
+        parts.append(grid(rest, "l"))
+    exact: dict[str, list[str]] = {}
+    for row in single:
+        if not row.error:
+            exact.setdefault(row.test, []).append(row.block)
+    if exact:
+        said = "; ".join(f"{test} {', '.join(each)}" for test, each in exact.items())
+        parts.append(folded([f"without any error: {said}"]))
+    return "\n\n".join(parts)
+
+
+# The independent computations that A and B are compared with, and the rows of each.
+_ROUTES = {"ABA derivatives": "ABA", "differences": "diff"}
+
+
+def _verdict(every: tuple[Row, ...]) -> str:
+    failures = [row for row in every if not row.ok]
+    if not failures:
+        largest = max(every, key=lambda row: row.error)
+        said = f"largest error {largest.error:.1e} (allowed {largest.tolerance:.1e})"
+        return folded([f"A and B hold: {said}"])
+    names = [f"{row.block} ({row.test})" for row in failures[:6]]
+    names += ["..."] * (len(failures) > 6)
+    said = f"{len(failures)} of {len(every)} figures FAILED"
+    return folded([f"A and B do not hold: {said}: {', '.join(names)}"])
+
+
+def _fitted(rows: list[list[str]], split: int) -> str:
+    """Show a table, or its columns from `split` on below where it is too wide."""
+    table = grid(rows, "ll")
+    if max(map(len, table.splitlines())) <= width():
+        return table
+    halves = [row[:split] for row in rows], [[*row[:2], *row[split:]] for row in rows]
+    tables = []
+    for head, *body in halves:
+        errors = [row for row in body if any(cell != "." for cell in row[2:])]
+        tables.append(grid([head, *errors], "ll"))
+    return "\n\n".join(tables)
+
+
+def _error(row: Row) -> str:
+    text = "." if row.error == 0.0 else f"{row.error:.0e}"
+    return text if row.ok else f"{text}!"
+
 
 _EPS = float(np.finfo(float).eps)
 # Rounding of a difference of outputs: its weights add up to two ulp, each output brings a few.
@@ -174,14 +269,11 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     rows = [
         Row("ABA derivatives", *block, by_aba) for block in compare(state, actuation, lin, M, A, B)
     ]
-    steps = difference_steps(state, lin, M)
+    steps, rounding = difference_steps(state, lin, M), _STEP_ULPS * _EPS / difference
+    A, B = _differences(model, lin, M, steps)
     rows += [
         Row("differences", *block, difference)
-        for block in compare(
-            *(state, actuation, lin, M, *_differences(model, lin, M, steps)),
-            steps=steps[0],
-            rounding=_STEP_ULPS * _EPS / difference,
-        )
+        for block in compare(state, actuation, lin, M, A, B, steps=steps[0], rounding=rounding)
     ]
     rows += _output_rows(model, lin, M, difference)
     rows.append(Row("flow", "f", flow_error(model, lin), difference))
@@ -245,13 +337,9 @@ def _differences(
 def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:
     """Rows of C, D and y0 against differences of what the nonlinear model measures."""
     state = model.state
-    names, units = state.names, state.units
-    if state.robot.outputs != (FullState(),):
-        sensing = Sensing(state, state.robot.outputs)
-        names, units = sensing.names, sensing.units
     outputs = (lin.output_names, lin.output_units)
     require_same(
-        f"the model was made for '{lin.robot}'", state.robot, "output", outputs, (names, units)
+        f"the model was made for '{lin.robot}'", state.robot, "output", outputs, sensed(state)
     )
     if state.robot.outputs == (FullState(),):
         errors = (lin.y0 - lin.x0, lin.C - np.eye(state.nx), lin.D)

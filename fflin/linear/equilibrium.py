@@ -9,19 +9,18 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, listed
-from fflin.base.frozen import FrozenArrays
-from fflin.base.validation import Array
+from fflin.base.validation import Array, FrozenArrays
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import ORBITAL, forces_of
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import Frame, StateMap
-from fflin.linear.least_norm import TOLERANCE, least_norm
 from fflin.linear.linearization import Linearizer
-from fflin.robot.frames import ROOT
+from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
+
 
 # Round-off of M a and of the accelerations themselves, relative to the terms that they sum.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
@@ -181,7 +180,7 @@ def equilibrium(
     at, u = held.lin.q, held.u
     if reference is not None or robot.orbit:
         chart = state.chart(at)
-        for columns, _ in actuation.held:
+        for columns in actuation.held:
             u[columns] = chart.R @ u[columns]
     names = actuation.names, actuation.units, tuple(pushes), tuple(pushes.values())
     return Equilibrium(at, u, state.joints_apart(given, at), held.residual, *names)
@@ -278,3 +277,58 @@ def _unbalanced(
         f"forces: {listed(left)}; add inputs that balance them (thrusters only push), or choose "
         "another point"
     )
+
+
+_EPS = float(np.finfo(float).eps)
+
+# Largest share of what is to be balanced that may be left over.
+TOLERANCE = 1e-9
+
+
+def least_norm(C: Array, d: Array, one_sided: Any) -> tuple[Array, Array]:
+    """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``."""
+    u = _pseudo_solve(C, d)
+    if (u[one_sided] < 0.0).any():
+        u = _least_distance(C, u, one_sided)
+        # Exactly the least on the face that was found: those that do not push stay out.
+        pushing = ~one_sided | (u > TOLERANCE * float(np.abs(u).max(initial=0.0)))
+        polished: Array = np.zeros(len(u))
+        polished[pushing] = _pseudo_solve(C[:, pushing], d)
+        left = C @ polished - d
+        most = TOLERANCE * np.linalg.norm(d)
+        if (polished[one_sided] < 0.0).any() or np.linalg.norm(left) > most:
+            from scipy.optimize import lsq_linear
+
+            bounds = np.where(one_sided, 0.0, -np.inf), np.inf
+            polished = lsq_linear(C, d, bounds, method="bvls").x
+        u = polished
+    return u, C @ u - d
+
+
+def _pseudo_solve(C: Array, d: Array) -> Array:
+    """Return the u of least norm among those with the least ``|C u - d|``."""
+    u: Array = np.linalg.lstsq(C, d, rcond=None)[0]
+    u += np.linalg.lstsq(C, d - C @ u, rcond=None)[0]
+    # An input below the rounding of the largest one is noise: it counts as zero.
+    u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
+    return u
+
+
+def _least_distance(C: Array, start: Array, one_sided: Any) -> Array:
+    """Return the least u = start + Z z with u[one_sided] >= 0, where C Z = 0."""
+    from scipy.linalg import null_space
+    from scipy.optimize import nnls
+
+    # min |z| subject to G z >= h is solved by the residual r = E y - e of min |E y - e|, y >= 0,
+    # with E = [G^T; h^T] and e = (0, ..., 0, 1): z = -r_z / r_e.
+    Z = null_space(C)
+    size = float(np.linalg.norm(start))
+    E = np.vstack((Z[one_sided].T, -start[one_sided] / size))
+    e = np.zeros(len(E))
+    e[-1] = 1.0
+    y = nnls(E, e, maxiter=100 * max(E.shape))[0]
+    r = E @ y - e
+    # r_e = -|r|^2, and zero where the inequalities contradict each other.
+    z = -r[:-1] / r[-1] if r[-1] < -TOLERANCE else np.zeros(Z.shape[1])
+    u: Array = start + Z @ (size * z)
+    return np.where(one_sided, np.maximum(u, 0.0), u)

@@ -163,6 +163,44 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     return ToolModel(tool=tool, robot=lin.robot, reference=about, verified=lin.verified, **fields)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class ToolGain(Design):
+    """State feedback in another tool's coordinates, ``u = u0 - K (x - x0)``; see `Gain.to`.
+
+    Attributes
+    ----------
+    K : ndarray (nu, nx)
+        Gain. If the tool's q is on a manifold (mujoco, pinocchio), ``x - x0`` is the tool's own
+        difference of q and `q`, followed by the difference of the velocities.
+    model : ToolModel
+        The model in the tool's coordinates: names, x0, u0, and the reference `q` and `v`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> gain = fflin.lqr(fflin.linearize(robot)).to("mujoco")
+    >>> gain.K.shape, gain.model.q.shape
+    ((9, 18), (10,))
+    """
+
+    K: Array
+    model: ToolModel
+
+    def __repr__(self) -> str:
+        nu, nx = self.K.shape
+        return f"ToolGain('{self.model.robot}', '{self.model.tool}', nx={nx}, nu={nu})"
+
+
+def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
+    """Return the gain of a model in a tool's coordinates; its closed-loop poles are the same."""
+    model, whole = lin.to(tool), lin.generator
+    assert whole is not None and lin._robot is not None
+    _, own, to, _ = _bridge(lin._robot, whole, tool)
+    # An input that is held in one of the two axes turns in the other (15.4).
+    turned = np.linalg.solve(to.V, (to.H - own.H) @ to.left)
+    return ToolGain(model.T_u @ K @ model.T_left + turned, model, verified=lin.verified)
+
+
 def from_tool(
     robot: Robot,
     tool: str,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import json
 from functools import partial
@@ -68,7 +67,7 @@ def write_model(path: Path, entries: Record, *, sealed: bool) -> None:
     record.require_finite(entries)
     contents = {key: _csv_text(rows) for key, rows in _tables(entries).items()}
     if sealed:
-        contents["info"] += f"{record.SEAL},{_seal(contents)}\n".encode()
+        contents["info"] += f"{record.SEAL},{record.content_digest(contents)}\n".encode()
     write_whole({_csv_path(path, key): content for key, content in contents.items()})
 
 
@@ -169,13 +168,6 @@ def _vectors_of(signal: str) -> list[str]:
     return [key for key, of in _VECTORS.items() if of == signal]
 
 
-def _seal(contents: dict[str, bytes]) -> str:
-    digest = hashlib.sha256()
-    for key in _TABLES:
-        digest.update(f"{key} {len(contents[key])}\n".encode() + contents[key])
-    return digest.hexdigest()
-
-
 def _from_csv(path: Path) -> tuple[Record, bool]:
     if not _csv_path(path, "info").exists() and path.exists():
         raise ValueError("give the name NAME.csv without the matrix, not NAME.A.csv")
@@ -183,7 +175,7 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
     body, mark, seal = contents["info"].rpartition(f"\n{record.SEAL},".encode())
     if mark:
         contents["info"] = body + b"\n"
-        if seal != f"{_seal(contents)}\n".encode():
+        if seal != f"{record.content_digest(contents)}\n".encode():
             raise ValueError(
                 f"{record.DAMAGED}; to read it as it is, delete that line of the info table"
             )
@@ -213,6 +205,14 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
         **entries,
         **{key: info[key] for key in (*_TEXTS, *_FIGURES) if key in info},
     }, bool(mark)
+
+
+def foreign_table(path: Path) -> Path | None:
+    """Return a file in the place of a table of NAME.csv if these are not the tables of a model."""
+    info = _csv_path(path, "info")
+    own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
+    tables = [] if own else [_csv_path(path, key) for key in _TABLES]
+    return next((table for table in tables if table.is_file() and table.stat().st_size), None)
 
 
 def _csv_path(path: Path, key: str) -> Path:

@@ -37,8 +37,7 @@ def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
 
 
 def require_sensed(lin: LinearModel, robot: Robot, state: StateMap) -> None:
-    """Raise `InputError` if a model's states, inputs or outputs differ from the robot's."""
-    require_fit(lin, robot, state)
+    """Raise `InputError` if a model's outputs differ from the robot's."""
     own = lin.output_names, lin.output_units
     require_same(f"the model was made for '{lin.robot}'", robot, "output", own, sensed(state))
 
@@ -65,8 +64,9 @@ def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signal
     else:
         return
     raise InputError(
-        f"{made} and does not fit the given robot '{robot.name}', which {said}; linearise this "
-        "robot, or give it the same fields (Robot.replace)"
+        f"{made} and does not fit the given robot '{robot.name}', which {said}; make it "
+        "again for the given robot, or give this robot the same joints, inputs and outputs "
+        "(Robot.replace)"
     )
 
 
@@ -75,8 +75,8 @@ def require_turns(made: str, size: int, robot: Robot) -> None:
     if size != robot.nq:
         raise InputError(
             f"{made} and does not fit the given robot '{robot.name}', whose configuration has "
-            f"{robot.nq} entries, not {size}, because other joints are continuous; linearise this "
-            "robot"
+            f"{robot.nq} entries, not {size}, because other joints are continuous; make it "
+            "again for the given robot"
         )
 
 

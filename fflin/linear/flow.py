@@ -12,10 +12,9 @@ import pinocchio as pin
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.actuation import Held
+from fflin.dynamics.inertia import rotor_names
 from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import StateMap
-from fflin.linear.ignorable import rotor_names
 
 # Steps are halved until the end of an interval is this accurate, relative to the largest rates.
 _ACCURACY, _MOST_STEPS = 1e-8, 128
@@ -36,7 +35,7 @@ class Flow:
         self._t, self._q, self._v, self._u = t, q, v, u
 
     @property
-    def held(self) -> tuple[Held, ...]:
+    def held(self) -> tuple[slice, ...]:
         """Inputs in reference axes."""
         return self._aba.actuation.held
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
 from math import hypot
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -10,23 +12,180 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import __version__
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, vector
+from fflin.base.validation import Array, frozen, truth, vector
+from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart, Standing
-from fflin.dynamics.rnea import Accelerations
-from fflin.dynamics.state import Frame
-from fflin.kernel.compiled import checked_engine
+from fflin.dynamics.inertia import rotor_names
+from fflin.dynamics.names import refuse_orbit, unknown_frame
+from fflin.dynamics.orbital import mean_motion
+from fflin.dynamics.rnea import Accelerations, Rates
+from fflin.dynamics.state import Frame, StateMap
+from fflin.kernel.compiled import checked_engine, numba_is_there
+from fflin.linear.certificate import certify, inertia_matrix
 from fflin.linear.model import LinearModel
-from fflin.linear.output_equations import output_equations
-from fflin.linear.prepared import LARGEST, prepare
-from fflin.linear.state_equations import assemble, drift
+from fflin.linear.state_equations import assemble, at_rest, drift, output_equations
+from fflin.robot.joints import ROOT
+from fflin.robot.limits import magnitudes_of
+from fflin.robot.model_checks import require_inertia
+from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
+# A model whose squares add up to more counts as not finite, since its eigenvalues would overflow.
+LARGEST = 1e200
+
 if TYPE_CHECKING:
-    from fflin.kernel.accelerations import RowOfOne
+    from fflin.dynamics.outputs import Sensing
+    from fflin.kernel.accelerations import RowOfOne, RowRates
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Data that are the same for all points of linearisation of a robot; arrays are read-only."""
+
+    robot: Robot
+    map: StateMap
+    actuation: Actuation
+    sensing: Sensing | None  # None where the outputs are the state
+    moving: bool
+    own_reference: bool  # the base's own placement at each point, not that of `map`
+    reference: Array  # (7,) the placement of `map`: position [m] and quaternion x, y, z, w
+    free: bool  # whether at rest all of a model but M^-1 is in `common` and `rest`
+    common: Mapping[str, Any]  # fields of a model that are the same about all points
+    rest: Mapping[str, Array]  # its A, f0, u0 and v where nothing moves, pulls or pushes
+
+    @cached_property
+    def fields(self) -> dict[str, Any]:
+        """Fields of a model at rest except B and q; some take as long to make as the dynamics."""
+        at_rest = partial(_state_at_rest, self.map)
+        asked = {"x0": at_rest, "y0": at_rest, "_reference": partial(own_reference, self.robot)}
+        other = {} if self.own_reference else {"_reference": self.reference}
+        return {**self.common, **self.rest, "_when_asked": asked, **other}
+
+    def kernel(self) -> RowRates:
+        """Return the compiled accelerations; `InputError` if the robot has none."""
+        from fflin.kernel.accelerations import RowRates
+        from fflin.kernel.tree import batch_tree
+
+        tree, reason = batch_tree(self.robot), self.not_compilable
+        if tree is None or reason:
+            raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
+        return RowRates(self.map, self.actuation, tree)
+
+    @property
+    def not_compilable(self) -> str:
+        """Reason why the robot has no compiled accelerations; empty if it has."""
+        from fflin.kernel.tree import batch_tree
+
+        name = self.robot.name
+        if not numba_is_there():
+            return "numba is not installed (pip install 'fflin[fast]')"
+        if self.robot.orbit:
+            return f"'{name}' is in orbit"
+        return "" if batch_tree(self.robot) else f"a joint of '{name}' has an unsupported type"
+
+
+def prepare(
+    robot: Robot, *, frame: Frame | None, reference: pin.SE3 | None, moving: bool
+) -> Prepared:
+    """Prepare a robot; arguments and errors are as in `Linearizer`."""
+    moving = truth("moving", moving)
+    if moving:
+        refuse_orbit(robot, "models with moving=True")
+    if frame is None:
+        frame = "local" if moving else None
+    elif not isinstance(frame, str):  # nor one whose comparison below is an array
+        raise unknown_frame(frame)
+    if moving and (reference is not None or frame != "local"):
+        raise InputError(
+            "moving=True gives the error in the moving base's own axes, but a reference or a frame "
+            "other than 'local' is given; leave both out"
+        )
+    state = StateMap(robot, reference=reference, frame=frame)
+    own = reference is None and robot.orbit is None  # in orbit it is the orbit's frame
+    require_inertia(robot)
+    actuation = Actuation(state)
+    sensing = None
+    if robot.outputs != (FullState(),):
+        from fflin.dynamics.outputs import Sensing
+
+        sensing = Sensing(state, robot.outputs, own_reference=own)
+    acts = robot.orbit or any(robot.gravity) or robot.stored_momentum or np.any(robot.springs)
+    nu = len(actuation.names)
+    seen = sensing or state
+    return Prepared(
+        robot=robot,
+        map=state,
+        actuation=actuation,
+        sensing=sensing,
+        moving=moving,
+        own_reference=own,
+        reference=frozen(pin.SE3ToXYZQUAT(state.reference)),
+        free=sensing is None and not moving and not acts,
+        common={
+            "C": frozen(np.eye(state.nx)),
+            "D": frozen(np.zeros((state.nx, nu))),
+            "dt": 0.0,
+            "state_names": state.names,
+            "input_names": actuation.names,
+            "output_names": seen.names,
+            "state_units": state.units,
+            "input_units": actuation.units,
+            "output_units": seen.units,
+            "frame": state.frame,
+            "moving": moving,
+            "robot": robot.name,
+            "urdf_sha256": robot.urdf_sha256,
+            "locked": robot.locked,
+            "fflin_version": __version__,
+            "pinocchio_version": pin.__version__,
+            "_inertia": partial(inertia_matrix, robot),
+            "_certify": partial(certify, robot),
+            "_ignorable": partial(ignorable_states, robot),
+            "_limits": partial(magnitudes_of, robot),
+            "weights": robot.weights,
+            "mean_motion": mean_motion(robot),
+            "_robot": robot,
+        },
+        rest={
+            "A": frozen(at_rest(state)),
+            "f0": frozen(np.zeros(state.nx)),
+            "u0": frozen(np.zeros(nu)),
+            "v": frozen(np.zeros(robot.nv)),
+        },
+    )
+
+
+def _state_at_rest(state: StateMap, q: Array) -> Array:
+    x0: Array = np.zeros(state.nx)
+    x0[state.groups.q_m] = state.joint_positions(q)
+    return frozen(x0)
+
+
+def own_reference(robot: Robot, q: Array) -> Array:
+    """Return the base placement (7,) at a configuration, the default reference of a model."""
+    root = robot.model.jointPlacements[ROOT]
+    if root.isIdentity(0.0):
+        return q[:7]
+    return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))
+
 
 # With velocities and inputs below this nothing overflows on the way to `LARGEST`.
 _MODERATE = 1e50
+
+_STANDING: Chart = Standing()
+
+
+def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
+    """Return the names of the ignorable coordinates of a linear model of this robot."""
+    # Found on the robot and not at a point: uniform gravity is the same everywhere, and without it
+    # error dynamics do not depend on the attitude either. In an orbit all of it matters.
+    if robot.orbit:
+        return tuple(f"q_m.{name}" for name in rotor_names(robot))
+    groups = ["r_b"] if any(robot.gravity) or not lin.moving else ["q_b", "r_b"]
+    base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
+    return (*base, *(f"q_m.{name}" for name in rotor_names(robot)))
 
 
 class Linearizer:
@@ -124,11 +283,10 @@ class Linearizer:
             from fflin.kernel.accelerations import RowOfOne
 
             self._source = RowOfOne(ready.kernel(), self._accelerations)
-        self._standing: Chart = Standing()
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
-        given = hypot(*robot.gravity, *np.concatenate(robot.springs).tolist())
-        self._moderate = given < _MODERATE
+        given = np.concatenate((robot.gravity, *robot.springs))
+        self._moderate = hypot(*given.tolist()) < _MODERATE
         self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
         # What stands for rest and no input.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
@@ -176,42 +334,76 @@ class Linearizer:
         return LinearModel.from_fields(self._fields | {"B": B, "q": q})
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
-        ready = self.prepared
-        state = ready.map
-        chart, r_b = self._standing, self._standing.q_b
+        ready, lower = self.prepared, self._lower
+        state, actuation = ready.map, ready.actuation
+        chart, r_b = _STANDING, _STANDING.q_b
         if not ready.own_reference:
             chart, r_b = state.chart(q), state.positions(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
-        u_base = ready.actuation.in_base_axes(chart, u)
-        A, B = ready.fields["A"].copy(), np.zeros(self._shape_B)
+        u_base = actuation.in_base_axes(chart, u)
+        A, B = ready.rest["A"].copy(), np.zeros(self._shape_B)
         x0 = state.compose(chart, r_b, q_m, nu)
-        made = {"A": A, "B": B, "x0": x0}
-        rates = self._source.rates(q, v, nu, q_m, u_base, A[self._lower], B[self._lower])
+        rates = self._source.rates(q, v, nu, q_m, u_base, A[lower], B[lower])
+        seen: dict[str, Array] = {"y0": x0}
         if ready.sensing is not None:
-            made |= output_equations(ready, self._data, chart, rates, x0, (q, v, nu, u_base))
-        rate = assemble(state, ready.actuation, chart, nu, u_base, rates, A, moving=ready.moving)
-        for array in (rate, *made.values()):
-            flat = array.ravel()
-            if array is not x0 and not flat.dot(flat) < LARGEST:  # nor NaN
-                raise InputError(
-                    "the model is not finite, because q, v or u is too large; check their units"
-                )
+            point = (q, v, nu, u_base)
+            seen = output_equations(ready.sensing, actuation, self._data, chart, rates, x0, point)
+            _require_finite(*seen.values())
+        rate = assemble(state, actuation, chart, nu, u_base, rates, A, moving=ready.moving)
+        _require_finite(A, B, rate)
         rate = drift(state, rate, rates.gravity) if ready.moving else rate
-        return self._model(q, v, u, rate, made)
-
-    def _model(
-        self, q: Array, v: Array, u: Array, rate: Array, made: dict[str, Array]
-    ) -> LinearModel:
-        """Put a model together, of arrays that nobody else has."""
-        made["q"], made[self._rate] = q, rate
+        made = seen | {"A": A, "B": B, "x0": x0, "q": q, self._rate: rate}
         if v is not self._still[0]:
             made["v"] = v
         if u is not self._still[1]:
             made["u0"] = u
         for array in made.values():
             array.setflags(write=False)
-        made.setdefault("y0", made["x0"])
         return LinearModel.from_fields(self._fields | made)
+
+    def along(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
+        """Return A, B, C, D and y (N, ..) about rows of valid points, with u in base axes.
+
+        Only for models relative to the placement of the base itself.
+        """
+        ready, lower, count = self.prepared, self._lower, len(q)
+        state, actuation, sensing = ready.map, ready.actuation, ready.sensing
+        chart, nu, q_m = Standing(count), state.velocities(v), state.joint_positions(q)
+        A, B = np.tile(ready.rest["A"], (count, 1, 1)), np.zeros((count, *self._shape_B))
+        ny = len(ready.common["output_names"])
+        x0 = state.compose(chart, chart.q_b, q_m, nu)
+        C, D, y = np.empty((count, ny, state.nx)), np.empty((count, ny, u.shape[1])), x0
+        if sensing is None:
+            C[:], D[:] = ready.common["C"], ready.common["D"]
+        else:
+            y = np.empty((count, ny))
+        c, gravity = np.empty_like(nu), np.empty((count, 3))
+        with self._lock:
+            for k in range(count):
+                slopes, by_u = A[k, lower], B[k, lower]
+                rates = self._source.rates(q[k], v[k], nu[k], q_m[k], u[k], slopes, by_u)
+                c[k], gravity[k] = rates.c, rates.gravity
+                if sensing is not None:
+                    point = (q[k], v[k], nu[k], u[k])
+                    seen = output_equations(
+                        sensing, actuation, self._data, _STANDING, rates, x0[k], point
+                    )
+                    C[k], D[k], y[k] = seen["C"], seen["D"], seen["y0"]
+        all_rates = Rates(c, A[:, lower], B[:, lower], gravity)
+        f0 = assemble(state, actuation, chart, nu, u, all_rates, A, moving=ready.moving)
+        for arrays in zip(A, B, C, D, f0, y, strict=True):
+            _require_finite(*arrays)
+        return {"A": A, "B": B, "C": C, "D": D, "y": y}
+
+
+def _require_finite(*arrays: Array) -> None:
+    """Raise `InputError` if the squares of the entries of an array overflow."""
+    for array in arrays:
+        entries = array.ravel()
+        if not entries.dot(entries) < LARGEST:  # nor NaN
+            raise InputError(
+                "the model is not finite, because q, v or u is too large; check their units"
+            )
 
 
 def linearize(

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError, MissingPackageError
-from fflin.base.frozen import FrozenArrays
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, FrozenArrays, number
 from fflin.linear.sampling import held_exponential
 
 if TYPE_CHECKING:

@@ -14,10 +14,9 @@ from fflin.dynamics.aba import Aba
 from fflin.dynamics.chart import Chart, times
 from fflin.dynamics.names import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import moving_errors, state_history
+from fflin.dynamics.state import StateMap, moving_errors, state_history
 from fflin.linear.certificate import mobilities
-from fflin.linear.fit import require_sensed
+from fflin.linear.fit import require_fit, require_sensed
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -155,6 +154,7 @@ def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None
             "the model has a moving reference, expected a fixed one; linearise with moving=False"
         )
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    require_fit(lin, robot, state)
     require_sensed(lin, robot, state)
     at = robot.checked_configuration(q)
     moving = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)

@@ -1,15 +1,21 @@
-"""A, B and f0, assembled from accelerations and their derivatives at one or many points.
+"""A, B, f0, C and D, assembled from accelerations, outputs and their derivatives.
 
 Equation numbers refer to docs/derivation.md.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.rotation import product, skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart, times
 from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.rnea import Rates
 from fflin.dynamics.state import StateMap
 
@@ -35,18 +41,18 @@ def assemble(
 ) -> Array:
     """Write A (.., nx, nx) and the lower half of B about one point or many; return f0 (.., nx).
 
-    The rates' slopes are A's lower half itself, and their by_u that of B: both are carried from
-    base axes to the chart and frame where they stand. A's upper half is that of `at_rest`.
+    The slopes of `rates` are the lower half of A itself, and their by_u that of B: both are
+    converted in place from base axes to the chart and the frame. The upper half of A is that of
+    `at_rest`.
     """
     g, nv, lower = state.groups, state.nx // 2, rates.slopes
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
     W = skew(w)
-    by_turn = _over_turns(state, actuation, u, rates, w, W)
     f0 = np.concatenate((chart.rate(w), chart.rotated(v), nu[..., 6:], rates.c), -1)  # (4.8)
-    if state.orbit:  # (14.5)
-        spin = chart.R.mT @ state.orbit[0]
-        by_turn[..., ANGULAR, :] += W @ skew(spin)
+
+    theta = _over_rotations(state, actuation, chart, u, rates, W)
+    lower[..., g.q_b] = chart.over_q_b(theta)
 
     # Attitude and position; `at_rest` is what does not change at the reference.
     if moving:
@@ -61,12 +67,8 @@ def assemble(
         A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
         if not v_in_reference:
             A[..., g.r_b, g.v_b] = chart.R
-    if not v_in_reference:
-        V = skew(v)
-        A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.turned(V))  # (4.3)
 
-    # Accelerations.
-    chart.over_q_b(by_turn, out=lower[..., g.q_b])
+    # Accelerations, still in base axes.
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
         chart.turn_columns(state.in_reference, lower[..., nv:])
@@ -76,11 +78,14 @@ def assemble(
         f0[..., g.v_b] += rates.gravity
     if state.orbit:  # (14.6)
         turn, pull = state.orbit
+        spin = chart.R.mT @ turn
         A[..., g.v_b, g.r_b], A[..., g.v_b, g.v_b] = pull, 0.0 - 2.0 * skew(turn)
         A[..., g.omega_b, g.omega_b] -= skew(spin)
         f0[..., g.omega_b] += times(W, spin)
         f0[..., g.v_b] -= 2.0 * times(skew(spin), v)
     if not v_in_reference:
+        V = skew(v)
+        A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.turned(V))  # (4.3)
         A[..., g.v_b, g.omega_b] += V  # (4.5)
         A[..., g.v_b, g.v_b] -= W
         f0[..., g.v_b] -= times(W, v)  # (3.2)
@@ -89,22 +94,25 @@ def assemble(
     return f0
 
 
-def _over_turns(
-    state: StateMap, actuation: Actuation, u: Array, rates: Rates, w: Array, W: Array
+def _over_rotations(
+    state: StateMap, actuation: Actuation, chart: Chart, u: Array, rates: Rates, W: Array
 ) -> Array:
-    """Return the derivatives of the rates over base rotations, Theta (.., 6 + n, 3) of (4.4)."""
+    """Return the derivatives Theta (.., 6 + n, 3) of `rates` over base rotations (4.4)."""
     omega_in_reference, v_in_reference = state.axes
-    by_turn, c = rates.by_turn.copy(), rates.c
-    for columns, _ in actuation.held:
-        by_turn += product(rates.by_u[..., columns], skew(u[..., columns]))
+    # Derivatives of the accelerations alone are zero here without an orbit.
+    theta, c = rates.by_turn, rates.c
+    for columns in actuation.held:
+        theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
     if omega_in_reference:
-        by_turn += product(rates.by_nu[..., ANGULAR], W)
-        by_turn[..., ANGULAR, :] -= skew(c[..., ANGULAR])
+        theta = theta + product(rates.by_nu[..., ANGULAR], W)
+        theta[..., ANGULAR, :] -= skew(c[..., ANGULAR])
     if v_in_reference:
-        by_turn[..., LINEAR, :] -= skew(c[..., LINEAR])
+        theta[..., LINEAR, :] -= skew(c[..., LINEAR])
     elif state.falls:
-        by_turn[..., LINEAR, :] += skew(rates.gravity)
-    return by_turn
+        theta[..., LINEAR, :] += skew(rates.gravity)
+    if state.orbit:  # (14.5)
+        theta[..., ANGULAR, :] += W @ skew(chart.R.mT @ state.orbit[0])
+    return theta
 
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
@@ -115,3 +123,50 @@ def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
         turning = rate[..., state.groups.q_b]
         turning -= (turning * gravity).sum(axis=-1, keepdims=True) / weight * gravity
     return rate
+
+
+def output_equations(
+    sensing: Sensing,
+    actuation: Actuation,
+    data: pin.Data,
+    chart: Chart,
+    rates: Rates,
+    x0: Array,
+    point: Sequence[Array],
+) -> dict[str, Array]:
+    """Return C, D and y0 at a point: q, v, and nu (6 + n,) and u (nu,) in base axes."""
+    state, a = sensing.state, rates.c.copy()
+    q, v, nu, u = point
+    if sensing.needs_acceleration:
+        a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])  # (3.2)
+    sensed = sensing.evaluate(data, q, v, state.spread(a))
+    g = state.groups
+    by_q, by_nu = state.columns(sensed.by_q), state.columns(sensed.by_v)
+    turn, by_q_m = by_q[:, ANGULAR].copy(), by_q[:, 6:]
+    D: Array = np.zeros((len(by_q), len(u)))
+    if sensed.by_a is not None:
+        by_rate = state.columns(sensed.by_a)
+        rate_by_nu = rates.by_nu.copy()
+        rate_by_nu[LINEAR, ANGULAR] += skew(nu[LINEAR])  # (4.5)
+        rate_by_nu[LINEAR, LINEAR] -= skew(nu[ANGULAR])
+        by_nu += by_rate.dot(rate_by_nu)
+        by_q_m = by_q_m + by_rate.dot(rates.by_q_m)
+        turn += by_rate[:, LINEAR].dot(skew(rates.gravity))
+        by_u = by_rate.dot(rates.by_u)
+        for columns in actuation.held:
+            turn += by_u[:, columns].dot(skew(u[columns]))
+        actuation.turn_columns(chart, by_u)
+        D[:] = by_u  # (8.3)
+    for turned, part in zip(state.axes, (ANGULAR, LINEAR), strict=True):
+        if turned:
+            turn += by_nu[:, part].dot(skew(nu[part]))
+
+    C = np.zeros((len(by_q), state.nx))
+    C[:, g.q_b] = chart.over_q_b(turn)  # (8.2)
+    C[:, g.r_b] = by_q[:, LINEAR].dot(chart.R.T)
+    C[:, g.q_m] = by_q_m  # (8.3)
+    C[:, -len(nu) :] = state.to_frame(chart, by_nu.T).T
+    for row, index in sensing.states:
+        C[row, index] = 1.0
+        sensed.y[row] = x0[index]
+    return {"C": C, "D": D, "y0": sensed.y}

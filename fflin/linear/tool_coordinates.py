@@ -15,8 +15,7 @@ from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import SMALLEST_Q0
 from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR, refuse_orbit
 from fflin.dynamics.state import StateMap
-from fflin.robot.frames import ROOT
-from fflin.robot.link_masses import pieces_of
+from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 # Along a motion by so little that its square is nothing: derivatives without any difference.
@@ -77,6 +76,9 @@ class ToolCoordinates:
         if kind.stored in ("wxyz", "matrix") and robot.file_joints:
             self.joints.sort(key=lambda joint: _way(robot, joint.name))
         self._idx_v = [joint.idx_v for joint in self.joints]
+        # Of Pinocchio's v, for a unit of the tool's; only Pinocchio itself scales modal amplitudes.
+        scales = np.array([1.0 if kind.stored == "xyzw" and tool else j.scale for j in self.joints])
+        self._scales = scales
         self.actuation = acting = Actuation(state)
         self._wrench = wrench = acting.fixed[:6]  # of the inputs
         if wrench[LINEAR].any() and not wrench[ANGULAR].any() and self._X[LINEAR, ANGULAR].any():
@@ -115,7 +117,7 @@ class ToolCoordinates:
         pose = np.concatenate((_angles(R) if stored == "euler" else attitude, at.translation))
         twist = self._turn(R, rates=self.convention.rates) @ self._X @ self.state.velocities(v)[:6]
         joints = [joint.value(q) for joint in self.joints]
-        parts = (pose, joints), (twist, v[self._idx_v])
+        parts = (pose, joints), (twist, v[self._idx_v] / self._scales)
         q, v = (np.concatenate((np.roll(base, self._roll), rest)) for base, rest in parts)
         return q, v
 
@@ -135,7 +137,7 @@ class ToolCoordinates:
             joint.place(at, value)
         nu = np.linalg.solve(self._turn(R, rates=self.convention.rates) @ self._X, twist)
         speed = state.spread(np.concatenate((nu, np.zeros(robot.n))))
-        speed[self._idx_v] = v[6:]
+        speed[self._idx_v] = v[6:] * self._scales
         return robot.checked_configuration(at), robot.checked_velocity(speed)
 
     def _rotation(self, attitude: Array) -> Array:
@@ -202,7 +204,7 @@ class ToolCoordinates:
         P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
         rows, columns = [*range(k), *range(first, first + 6)], [*range(6), *range(6 + n, 12 + n)]
         P[np.ix_(rows, columns)] = base @ np.kron(np.eye(2), X)
-        of_joints = self.state.spread(np.eye(6 + n))[6:, self._idx_v].T
+        of_joints = (self.state.spread(np.eye(6 + n))[6:, self._idx_v] / self._scales).T
         P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
         extra = np.zeros((len(P), len(P)))
         if k == 7:
@@ -230,7 +232,7 @@ def _centre(robot: Robot) -> pin.SE3:
     """Return the placement of the root link's centre of mass and inertia axes."""
     frames = (f for f in robot.model.frames.tolist() if f.type == pin.FrameType.BODY)
     name = next((frame.name for frame in frames if frame.parentJoint == ROOT), "")
-    if piece := pieces_of(robot)[0].get(name):
+    if piece := robot.pieces.get(name):
         return piece.placement
     return pin.SE3(np.eye(3), np.array(robot.model.inertias[ROOT].lever))
 

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinError, FflinWarning, InputError
-from fflin.base.frozen import frozen
 from fflin.base.record import Design
 from fflin.base.tables import folded
-from fflin.base.validation import Array, as_double, number, vector
+from fflin.base.validation import Array, as_double, frozen, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import refuse_orbit

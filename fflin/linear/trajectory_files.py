@@ -73,9 +73,9 @@ def arguments(
     state = StateMap(robot, reference=reference, frame=frame)
     u = as_double("u", entries["u"])
     u = u[:, None] if u.ndim == 1 else u.copy()
-    for vector in Actuation(state).held:
+    for columns in Actuation(state).held:
         # In the axes of the world, which those of the reference may not be.
-        u[:, vector.columns] = u[:, vector.columns] @ reference.rotation.T
+        u[:, columns] = u[:, columns] @ reference.rotation.T
     found_as: dict[str, Any] = {"t": as_double("t", entries["t"]).ravel(), "u": u}
     found_as |= {"hold": hold, "frame": frame, "verified": verified}
     if states:

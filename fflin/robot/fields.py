@@ -1,12 +1,14 @@
-"""Fields of a robot that the user may set, checked once: inputs, passive joints, gravity, start."""
+"""Fields of a robot that the user may set: their checks, and how a robot file gives them."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
+from fflin.base.toml_file import NAME, NUMBER, Kind
 from fflin.base.validation import dimension, number, numbers
 from fflin.robot import inputs as kinds
 from fflin.robot.inputs import Input, JointTorque, named_inputs, named_wheels, three_numbers
@@ -19,45 +21,32 @@ Range: TypeAlias = tuple[float, float]
 
 _OF_JOINTS = ("q_m", "qdot_m")
 
-# In the order in which a robot file gives them: names of inputs are known after the inputs.
-FIELDS = (
-    *("passive", "inputs", "outputs", "stiffness", "damping", "rest", "gravity", "orbit"),
-    *("limits", "weights", "start"),
-)
 RULES = ("urdf", "identity")
-_START = ("joints", "rpy", "position", "velocity")
+_STATE = ("joints", "rpy", "position", "velocity")
 _WEIGHTS = ("rule", "q", "r", "bryson")
 
 
-def checked_fields(
-    fields: Mapping[str, Any],
-    find: Find,
-    joints: Sequence[str],
-    own: Sequence[str],
-    inputs: Sequence[Input],
-    urdf_damping: Mapping[str, float],
-) -> dict[str, Any]:
-    """Return fields of `Robot.replace`, but passive and inputs; `own` are the joints but wheels."""
+class Scope(NamedTuple):
+    """Parts of a robot that its fields name."""
+
+    find: Find  # the joint of a name
+    joints: Sequence[str]
+    own: Sequence[str]  # the joints without the wheels
+    inputs: Sequence[Input]
+    urdf_damping: Mapping[str, float]
+
+
+def checked_fields(fields: Mapping[str, Any], scope: Scope) -> dict[str, Any]:
+    """Return the checked fields of `Robot.replace`, except for passive joints and inputs."""
     if "friction" in fields:
         raise ModelError(
             "dry friction is not differentiable at rest, so a linear model cannot contain it; use "
             "damping, or add the friction in a simulation"
         )
-    check: dict[str, Callable[[Any], Any]] = {
-        "outputs": _outputs,
-        "gravity": lambda value: three_numbers("gravity", value),
-        "orbit": checked_orbit,
-        "limits": lambda value: given_limits(inputs, joints, value),
-        "weights": lambda value: _weights(value, joints, inputs),
-        "start": lambda value: _start(value, find, joints),
-        "stiffness": lambda value: _by_joint("stiffness", value, find, own),
-        "damping": lambda value: _damping(value, find, own, urdf_damping),
-        "rest": lambda value: _by_joint("rest", value, find, own),
-    }
     for name in fields:
-        if name not in check:
+        if name not in FIELDS:
             raise unknown("field of a robot", name, FIELDS)
-    return {name: check[name](value) for name, value in fields.items()}
+    return {name: FIELDS[name].check(value, scope) for name, value in fields.items()}
 
 
 def checked_inputs(
@@ -127,7 +116,7 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> 
     }
 
 
-def _outputs(value: Any) -> tuple[Output, ...]:
+def _outputs(value: Any, _: Scope) -> tuple[Output, ...]:
     if isinstance(value, str) or not isinstance(value, Sequence) or not value:
         raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
     for item in value:
@@ -136,25 +125,29 @@ def _outputs(value: Any) -> tuple[Output, ...]:
     return tuple(value)
 
 
-def _by_joint(what: str, value: Any, find: Find, joints: Sequence[str]) -> dict[str, float]:
-    """Return {joint: value} from a mapping, or (except for rest) from one value for all joints."""
+def _rest(value: Any, scope: Scope) -> dict[str, float]:
     if not isinstance(value, Mapping):
-        if what == "rest":
-            raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
-        value = dict.fromkeys(joints, value)
+        raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
+    return by_joint(numbers("rest", value, "joint", "rest of joint"), scope.own, scope.find)
+
+
+def _stiffness(value: Any, scope: Scope, what: str = "stiffness") -> dict[str, float]:
+    """Return {joint: value} from a mapping, or from one value for all joints except wheels."""
+    if not isinstance(value, Mapping):
+        value = dict.fromkeys(scope.own, value)
     checked = numbers(what, value, "joint", f"{what} of joint")
     for name, entry in checked.items():
-        if what != "rest" and entry < 0.0:
+        if entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
-    return by_joint(checked, joints, find)
+    return by_joint(checked, scope.own, scope.find)
 
 
-def _damping(value: Any, find: Find, joints: Sequence[str], urdf: Mapping[str, float]) -> Any:
+def _damping(value: Any, scope: Scope) -> dict[str, float]:
     if not isinstance(value, str):
-        return _by_joint("damping", value, find, joints)
+        return _stiffness(value, scope, "damping")
     if value != "urdf":
         raise InputError(f"damping is '{value}', expected 'urdf', a number or a mapping")
-    return dict(urdf)
+    return dict(scope.urdf_damping)
 
 
 def range_of(name: str, value: Any) -> Range:
@@ -171,35 +164,44 @@ def range_of(name: str, value: Any) -> Range:
     return least, largest
 
 
-def _start(value: Any, find: Find, joints: Sequence[str]) -> dict[str, Any]:
-    """Return a robot's initial state, with joints and rates by their full names."""
-    start = _parts("start", value, _START)
-    if "joints" in start:
-        values = numbers("start joints", start["joints"], "joint", "start of joint")
-        start["joints"] = by_joint(values, joints, find)
+def _state(what: str, value: Any, scope: Scope) -> dict[str, Any]:
+    """Return a point, start or target of a robot, with joints and rates by their full names."""
+    state = _parts(what, value, _STATE)
+    if "joints" in state:
+        values = numbers(f"{what} joints", state["joints"], "joint", f"{what} of joint")
+        state["joints"] = by_joint(values, scope.joints, scope.find)
     for name in ("rpy", "position"):
-        if name in start:
-            start[name] = three_numbers(f"start {name}", start[name])
-    if "velocity" in start:
-        rates = numbers("start velocity", start["velocity"], "name", "start velocity")
-        start["velocity"] = rates_by_name(joints, rates)
-    return start
+        if name in state:
+            state[name] = three_numbers(f"{what} {name}", state[name])
+    if "velocity" in state:
+        rates = numbers(f"{what} velocity", state["velocity"], "name", f"{what} velocity")
+        state["velocity"] = rates_by_name(scope.joints, rates)
+    return state
 
 
-def kept_start(start: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]:
-    """Return of a start what is of these joints, of which some wheels are none."""
+def of_joints(state: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]:
+    """Return a point, start or target without the joints and wheels that are not among `joints`."""
     names = {*joints, *state_keys(joints)}
-    of_joints = {part: start[part] for part in ("joints", "velocity") if part in start}
-    kept = {part: {k: x for k, x in of.items() if k in names} for part, of in of_joints.items()}
-    return {**start, **kept}
+    by_name = {part: state[part] for part in ("joints", "velocity") if part in state}
+    kept = {part: {k: x for k, x in of.items() if k in names} for part, of in by_name.items()}
+    return {**state, **kept}
 
 
-def _weights(value: Any, joints: Sequence[str], inputs: Sequence[Input]) -> dict[str, Any]:
+def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a state with the parts, joints and rates of another in place of its own."""
+    both = {**state, **other}
+    for part in ("joints", "velocity"):
+        if part in both:
+            both[part] = {**state.get(part, {}), **other.get(part, {})}
+    return both
+
+
+def _weights(value: Any, scope: Scope) -> dict[str, Any]:
     """Return the weights of a robot's regulator, by names of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)
     if str(weights.get("rule", RULES[0])) not in RULES:
         raise unknown("rule of weights", weights["rule"], RULES)
-    states, keys = state_keys(joints), _input_keys(inputs)
+    states, keys = state_keys(scope.joints), _input_keys(scope.inputs)
     parts = {
         "q": ("state", states),
         "r": ("input", keys),
@@ -239,3 +241,111 @@ def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
         if name not in known:
             raise unknown(f"part of {what}", name, known)
     return dict(value)
+
+
+class Field(NamedTuple):
+    """Key of a robot file: what its values are, what they mean, and the check of a field."""
+
+    meaning: str  # for the guide
+    check: Callable[[Any, Scope], Any] = lambda value, _: value
+    kind: Kind = NUMBER  # of a value, and of the entries of a list
+    table: Kind | None = NUMBER  # of the entries of a table; None if it must not be a table
+    parts: bool = False  # whether it is a table of named parts, some of which are tables
+    word: str | None = None  # the part that may be a word; empty for the value itself
+    merged: bool = False  # whether the entries of a call are added to the entries of a file
+    heading: str = ""  # as a file writes it, if that is not the name alone
+
+
+# In the order in which a file applies them: the names of inputs are known after the inputs.
+FIELDS = {
+    "passive": Field(
+        "joints without a motor. They have no torque input by default, and "
+        '`joint = "*"` omits them',
+        kind=NAME,
+        table=None,
+    ),
+    "inputs": Field(
+        'the inputs in the order of u; `joint = "*"` means every joint with a motor. Default: '
+        "torque and force on the base and a torque on every joint with a motor",
+        heading="[[input]]",
+    ),
+    "appendages": Field(
+        "flexible appendages and slosh, as `[[flexible]]` and `[[slosh]]`",
+        heading="[[flexible]]",
+    ),
+    "outputs": Field(
+        "the outputs, written as for `--output`; the state by default",
+        _outputs,
+        kind=NAME,
+        table=None,
+    ),
+    "stiffness": Field(
+        "joint stiffness [N m/rad]; one number applies to all joints",
+        _stiffness,
+        merged=True,
+        heading="[stiffness]",
+    ),
+    "damping": Field(
+        'joint damping [N m s/rad]; one number applies to all joints; `damping = "urdf"` takes '
+        "the URDF's damping",
+        _damping,
+        word="",
+        merged=True,
+        heading="[damping]",
+    ),
+    "rest": Field(
+        "joint positions at which the springs are relaxed [rad, m]",
+        _rest,
+        merged=True,
+        heading="[rest]",
+    ),
+    "gravity": Field(
+        "uniform gravity in world axes [m/s²]",
+        lambda value, _: three_numbers("gravity", value),
+    ),
+    "orbit": Field(
+        "altitude of a circular orbit above the earth [m]; or a table `[orbit]` with `altitude` "
+        'or `mean_motion` [rad/s], and `body`, such as "mars", or `mu` and `body_radius`. `orbit` '
+        "replaces `gravity`",
+        lambda value, _: checked_orbit(value),
+        word="body",
+    ),
+    "limits": Field(
+        "limits of inputs and states: largest magnitude, or `[least, largest]`. They override "
+        "limits of the URDF and of the inputs",
+        lambda value, scope: given_limits(scope.inputs, scope.joints, value),
+        merged=True,
+        heading="[limits]",
+    ),
+    "weights": Field(
+        'weights that `lqr` uses by default. `rule` ("urdf" or "identity") sets all weights that '
+        "the other keys do not set; `[weights.q]` and `[weights.r]` set weights of states and "
+        "inputs; `[weights.bryson]` sets largest acceptable values of states or inputs",
+        _weights,
+        parts=True,
+        word="rule",
+        heading="[weights]",
+    ),
+    "point": Field(
+        "`rpy` [deg], `position` [m], `joints`, `velocity`: operating point of the commands "
+        "`linearize`, `check`, `lqr`, `modes` and others. Omitted parts are neutral and at rest. "
+        "Functions in Python take their operating point from their arguments alone",
+        partial(_state, "point"),
+        parts=True,
+        heading="[point]",
+    ),
+    "target": Field(
+        "keys as in `[point]`: state to which the commands `simulate` and `montecarlo` bring the "
+        "robot. Omitted parts are as in `[point]`",
+        partial(_state, "target"),
+        parts=True,
+        heading="[target]",
+    ),
+    "start": Field(
+        "keys as in `[point]`: initial state of `simulate`, `montecarlo`, `plan` and `view`. "
+        "Omitted parts are as in `[point]`",
+        partial(_state, "start"),
+        parts=True,
+        heading="[start]",
+    ),
+}

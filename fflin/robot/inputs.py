@@ -203,7 +203,8 @@ class Thruster(WrenchInput):
             self._set("least_impulse", _positive("thruster least_impulse", impulse, "N s"))
         self._set("position", three_numbers("thruster position", self.position))
         self._set(
-            "direction", _unit("thruster direction", self.direction, "the direction of its force")
+            "direction",
+            unit_vector("thruster direction", self.direction, "the direction of its force"),
         )
 
     @property
@@ -241,7 +242,8 @@ class ReactionWheel(WrenchInput):
     name : str, optional
         Name of the input, and of the joint if there is one; wheel_1, wheel_2, ... by default.
     momentum : float
-        h [N m s] along the axis, relative to the carrier; only for a wheel without inertia.
+        Constant angular momentum h [N m s] along the axis, relative to the carrier; only if
+        `inertia` is omitted.
     max, min : float, optional
         Limits [N m] of the motor's torque; keyword only, like all parameters that follow.
     max_speed : float, optional
@@ -267,7 +269,7 @@ class ReactionWheel(WrenchInput):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("axis", _unit("wheel axis", self.axis, "the direction it turns about"))
+        self._set("axis", unit_vector("wheel axis", self.axis, "the direction it turns about"))
         self._set("momentum", number("wheel momentum", self.momentum))
         if self.max_speed is not None:
             speed = _positive("wheel max_speed", self.max_speed, "rad/s")
@@ -316,7 +318,7 @@ def _positive(what: str, value: float, unit: str, hint: str = "") -> float:
     return size
 
 
-def _unit(what: str, value: Vector3, hint: str) -> tuple[float, float, float]:
+def unit_vector(what: str, value: Vector3, hint: str) -> tuple[float, float, float]:
     """Return three numbers scaled to length 1, or raise `InputError` if they are zero."""
     x, y, z = three_numbers(what, value)
     largest = max(abs(x), abs(y), abs(z))

@@ -1,13 +1,27 @@
-"""Joints of one degree of freedom, independent or following another."""
+"""Joints and frames of a tree by name, and its configurations in Pinocchio's order."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
-from fflin.base.validation import Array
+from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
+
+ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
+
+_CONFIGURATION = "a configuration in Pinocchio's order"
+
+# What renormalising a unit quaternion leaves: two ulp of unity.
+ROUND_OFF = 2.0 * float(np.finfo(float).eps)
+
+# Data holds a third-order tensor of nv^3 entries among others: about 32 nv^3 bytes in all.
+_DATA_BYTES_PER_NV3 = 32
+_DATA_LIMIT = 2**30
 
 T = TypeVar("T")
 
@@ -20,29 +34,46 @@ class Joint(NamedTuple):
     idx_v: int
     unbounded: bool  # stored as (cos, sin), two entries of q; one angle in the state
     prismatic: bool  # a length in metres; otherwise an angle in radians
+    # "joint", "slosh", or "modal" for the amplitude of a mode.
+    kind: str = "joint"
+    scale: float = 1.0  # entry of q for a unit of q_m; 1 except for modal amplitudes
+    # Of a mode alone: its inertia with the link clamped, 1 for a modal amplitude, and the rotation
+    # [rad] that a unit of it stands for, 0 if it stands for none.
+    inertia: float = 1.0
+    rotation: float = 0.0
 
     @property
     def unit(self) -> str:
         """Unit of the joint's position; the unit of its rate is this per second."""
-        return "m" if self.prismatic else "rad"
+        return "kg^0.5 m" if self.kind == "modal" else "m" if self.prismatic else "rad"
 
     @property
     def force_unit(self) -> str:
         """Unit of the joint's force or torque."""
-        return "N" if self.prismatic else "N m"
+        return "kg^0.5 m/s^2" if self.kind == "modal" else "N" if self.prismatic else "N m"
+
+    @property
+    def mode(self) -> bool:
+        """Whether it is a degree of freedom of a flexible appendage or of slosh."""
+        return self.kind != "joint"
+
+    def oscillation(self, stiffness: float, damping: float) -> tuple[float, float]:
+        """Return the clamped frequency [rad/s] and damping ratio of a mode with a spring."""
+        omega = math.sqrt(stiffness / self.inertia)
+        return omega, 0.5 * damping / (self.inertia * omega)
 
     def place(self, q: Array, value: float) -> None:
-        """Write this joint's angle [rad] or length [m] into a configuration q (nq,)."""
+        """Write this joint's value [rad|m|kg^0.5 m] into a configuration q (nq,)."""
         if self.unbounded:
             q[self.idx_q : self.idx_q + 2] = np.cos(value), np.sin(value)
         else:
-            q[self.idx_q] = value
+            q[self.idx_q] = self.scale * value
 
     def value(self, q: Array) -> float:
-        """Return this joint's angle [rad] or length [m]; continuous joints are in (-pi, pi]."""
+        """Return this joint's value [rad|m|kg^0.5 m]; continuous joints are in (-pi, pi]."""
         if self.unbounded:
             return float(np.arctan2(q[self.idx_q + 1], q[self.idx_q]))
-        return float(q[self.idx_q])
+        return float(q[self.idx_q]) / self.scale
 
     def within(self, model: pin.Model) -> "Joint":
         """Return the joint of the same name with its offsets in another model."""
@@ -70,3 +101,187 @@ Find: TypeAlias = Callable[[str], Joint]
 def by_joint(values: Mapping[str, T], joints: Sequence[str], find: Find) -> dict[str, T]:
     """Return {joint: value} of {joint or pattern: value}; the group ``q_m`` is all joints."""
     return joints_by_name("joint", values, joints, lambda name: find(name).name)
+
+
+class Carried(NamedTuple):
+    """Location of a frame: the joint that carries it, and its placement on that joint."""
+
+    joint: int
+    placement: pin.SE3
+
+
+def frame_index(model: pin.Model, name: str) -> int:
+    """Return the index of a frame of the robot; a link's comes before a joint's of that name."""
+    # Pinocchio's own look-up refuses a name that a link and a joint share, and takes a link called
+    # universe for the world.
+    frames = {i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT}
+    # The comparison with an array would be one.
+    found = [i for i, f in frames.items() if isinstance(name, str) and f.name == name]
+    if not found:
+        raise unknown("frame", str(name), [frame.name for frame in frames.values()])
+    return next((i for i in found if frames[i].type == pin.FrameType.BODY), found[0])
+
+
+def find_frame(model: pin.Model, name: str | None) -> Carried:
+    """Return the location of a frame, see `frame_index`; of the base's root frame for None."""
+    if name is None:
+        return Carried(ROOT, pin.SE3.Identity())
+    frame = model.frames[frame_index(model, name)]
+    return Carried(frame.parentJoint, pin.SE3(frame.placement))
+
+
+def find_joint(model: pin.Model, name: str) -> Carried:
+    """Return the location of a joint's frame, even if the joint was welded."""
+    if model.existJointName(name):
+        return Carried(model.getJointId(name), pin.SE3.Identity())
+    frame = model.frames[model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
+    return Carried(frame.parentJoint, pin.SE3(frame.placement))
+
+
+class Coordinates:
+    """Configuration q and velocity v of a robot, and checks of given values."""
+
+    model: pin.Model
+    name: str
+    joints: tuple[Joint, ...]
+    followers: tuple[Follower, ...]
+    _as_made: tuple[pin.Model, pin.Model] | None
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the n independent joints, in state order."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def n(self) -> int:
+        """Number of independent joints."""
+        return len(self.joints)
+
+    @cached_property
+    def nq(self) -> int:
+        """Size of Pinocchio's configuration vector q."""
+        return int(self.model.nq)
+
+    @cached_property
+    def nv(self) -> int:
+        """Size of Pinocchio's velocity vector v: 6 + n, plus one for each mimic joint."""
+        return int(self.model.nv)
+
+    @cached_property
+    def unbounded(self) -> dict[int, str]:
+        """Continuous joints: {index of the cosine in q: joint name}."""
+        joints = (*self.joints, *(follower.joint for follower in self.followers))
+        return {joint.idx_q: joint.name for joint in joints if joint.unbounded}
+
+    def neutral(self) -> Array:
+        """Return the neutral configuration (nq,), with mimic joints placed by their leaders."""
+        q = pin.neutral(self.model)
+        self.follow(q)
+        return q
+
+    def follow(self, q: Array) -> None:
+        """Place the mimic joints of a configuration q (nq,) by their leaders, in place."""
+        for follower in self.followers:
+            follower.place(q)
+
+    def checked_configuration(self, q: Array) -> Array:
+        """Return a valid configuration q (nq,), corrected within 1e-6, or raise `InputError`."""
+        if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
+            q = vector("q", q, self.nq, _CONFIGURATION)
+        entries = q.tolist()
+        if not math.isfinite(sum(entries)):
+            vector("q", q, self.nq, _CONFIGURATION)  # says which entry it is
+        x, y, z, w = entries[3:7]
+        worst = abs(x * x + y * y + z * z + w * w - 1.0)
+        if worst > NORM_TOLERANCE:
+            raise InputError(
+                f"the base quaternion q[3:7] has length {np.linalg.norm(q[3:7]):.9g}, expected 1; "
+                "normalise it (x, y, z, w)"
+            )
+        for index in self.unbounded:
+            c, s = entries[index], entries[index + 1]
+            excess = abs(c * c + s * s - 1.0)
+            if excess > worst:
+                worst = excess
+                if excess > NORM_TOLERANCE:
+                    raise InputError(
+                        f"(cos, sin) of continuous joint '{self.unbounded[index]}', "
+                        f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1; "
+                        "normalise it"
+                    )
+        if worst > ROUND_OFF:
+            q = pin.normalize(self.model, q)
+        return self._followed(q) if self.followers else q
+
+    def checked_velocity(self, v: Array) -> Array:
+        """Return a valid velocity v (nv,), without modification, or raise `InputError`."""
+        v = vector("v", v, self.nv, "a velocity in Pinocchio's order")
+        for joint, leader, multiplier, _ in self.followers:
+            expected = multiplier * v[leader.idx_v]
+            if abs(v[joint.idx_v] - expected) > NORM_TOLERANCE * max(1.0, abs(expected)):
+                raise InputError(
+                    f"v[{joint.idx_v}] of joint '{joint.name}' is {v[joint.idx_v]:.9g}, but it "
+                    f"mimics '{leader.name}', which requires {expected:.9g}"
+                )
+        return v
+
+    def _followed(self, q: Array) -> Array:
+        """Return a copy of q (nq,) with mimic joints corrected if they are within 1e-6."""
+        placed = q.copy()
+        self.follow(placed)
+        for joint, leader, *_ in self.followers:
+            part = slice(joint.idx_q, joint.idx_q + 1 + joint.unbounded)
+            error = np.abs(placed[part] - q[part]).max()
+            if error > NORM_TOLERANCE * max(1.0, np.abs(placed[part]).max()):
+                raise InputError(
+                    f"joint '{joint.name}' is at {joint.value(q):.9g}, but it mimics "
+                    f"'{leader.name}', which puts it at {joint.value(placed):.9g}; "
+                    "fflin.configuration places mimic joints"
+                )
+        return placed
+
+    def require_unchanged(self) -> None:
+        """Raise `ModelError` if the model was changed in place after the robot was made."""
+        assert self._as_made is not None
+        made = self._as_made[1]
+        # Tells in a microsecond that nothing at all was changed.
+        if self.model != made and (change := change_in(self.model, made)):
+            raise ModelError(
+                f"the model of '{self.name}' was changed after the robot was made: {change}; make "
+                "a new robot from it with fflin.from_model(model)"
+            )
+
+    def create_data(self) -> pin.Data:
+        """Return a new pin.Data for this robot, or raise `ModelError` if it exceeds 1 GiB."""
+        self.require_room()
+        return self.model.createData()
+
+    def require_room(self) -> None:
+        """Raise `ModelError` if a pin.Data of this robot would exceed 1 GiB."""
+        size = _DATA_BYTES_PER_NV3 * self.nv**3
+        if size > _DATA_LIMIT:
+            raise ModelError(
+                f"'{self.name}' has {self.n} joints, for which Pinocchio's Data takes about "
+                f"{size / 2**30:.1f} GiB, more than the limit of 1 GiB; lock joints that do not "
+                "matter"
+            )
+
+
+def change_in(model: pin.Model, made: pin.Model) -> str:
+    """Say what A, B and C depend on and was changed; not frames added, nor limits."""
+    for what, key in {"its joints": "names", "the parents of its joints": "parents"}.items():
+        if getattr(model, key).tolist() != getattr(made, key).tolist():
+            return what
+    if model.gravity != made.gravity:
+        return "its gravity"
+    of_joints = {"axis": "joints", "placement": "jointPlacements", "inertia": "inertias"}
+    for what, key in of_joints.items():
+        pairs = zip(made.names, getattr(model, key), getattr(made, key), strict=True)
+        for name in (name for name, now, before in pairs if now != before):
+            return f"the {what} of joint '{name}'"
+    if not np.array_equal(model.armature, made.armature):
+        return "its armature"
+    for frame, before in zip(model.frames, made.frames, strict=False):
+        if frame != before:
+            return f"frame '{before.name}'"
+    return "its frames" if model.nframes < made.nframes else ""

@@ -7,20 +7,27 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, ModelError
 from fflin.base.writing import as_path, remember
 from fflin.robot.catalog import RobotFile, find_mesh, find_robot
-from fflin.robot.frames import ROOT
-from fflin.robot.joints import Follower
-from fflin.robot.link_masses import LinkMass
-from fflin.robot.locking import Lock, locked_model
-from fflin.robot.massless import idle_coordinates, massless_note
-from fflin.robot.model_checks import check_model, check_order, check_root, joint_of
+from fflin.robot.fields import FIELDS
+from fflin.robot.joints import ROOT, Follower
+from fflin.robot.mass_properties import LinkMass
+from fflin.robot.model_checks import (
+    check_model,
+    check_order,
+    check_root,
+    idle_coordinates,
+    joint_of,
+    massless_note,
+)
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.reader import Advice, read_urdf
+from fflin.robot.welding import Lock, locked_model
 
 
 def load(
@@ -88,7 +95,7 @@ def load(
 
         file = RobotToml(found.path, found.name)
         folders = (*_folders(package_dirs), *file.package_dirs)
-        with file.placed("lock"):
+        with file.located_locks():
             loaded, advice = _load(file.found, [file.lock or None, lock], folders)
         loaded = file.applied(loaded)
     loaded = with_fields(loaded, fields)
@@ -116,8 +123,8 @@ def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
     changed = robot.replace(**fields)
     over: dict[str, Any] = {
         name: {**getattr(robot, name), **getattr(changed, name)}
-        for name in ("stiffness", "damping", "rest", "limits")
-        if name in fields and getattr(robot, name)
+        for name, field in FIELDS.items()
+        if field.merged and name in fields and getattr(robot, name)
     }
     return replace(changed, **over)
 
@@ -223,3 +230,24 @@ def _robot(
     robot.require_room()
     check_order(model, name)
     return robot
+
+
+def body_alone(inertia: pin.Inertia, name: str) -> Robot:
+    """Return a body as a robot without joints."""
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    model.appendBodyToJoint(1, inertia, pin.SE3.Identity())
+    model.addJointFrame(1)
+    return from_model(model, name=name)
+
+
+def inertia_of(value: Any) -> pin.Inertia:
+    """Return the inertia of a body that has mass, or raise `InputError`."""
+    second = 0.5 * np.trace(value.inertia) * np.eye(3) - value.inertia
+    least, size = np.linalg.eigvalsh(second)[0], np.trace(value.inertia)
+    if not value.mass > 0.0 or least < -1e-9 * size:
+        raise InputError(
+            f"payload of {value.mass:g} kg has an inertia that is not physically realisable; give "
+            "a mass above 0, and principal moments none of which exceeds the sum of the other two"
+        )
+    return value

@@ -1,4 +1,4 @@
-r"""Models with changed masses, whose bodies stay physically realisable.
+r"""Mass of each link as the URDF gives it, and bodies that stay physically realisable.
 
 A body has mass m, centre of mass c and inertia I about c. With the identity matrix E, the second
 moments of its mass distribution are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The body is
@@ -8,10 +8,10 @@ inequalities for physically-consistent inertial parameter identification, IEEE R
 Automation Letters 3(1), 2018).
 """
 
-from collections.abc import Mapping
-from dataclasses import replace
-from hashlib import sha256
-from typing import Any
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -20,18 +20,17 @@ from fflin.base.errors import InputError, listed, unknown
 from fflin.base.names import by_name
 from fflin.base.validation import Array, as_double, number, vector, whole
 from fflin.base.validation import by_name as mapping
-from fflin.robot.frames import ROOT
-from fflin.robot.urdf.links import TRIANGLE_SLACK, is_impossible
-from fflin.robot.wheels import with_inputs
+from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.urdf.links import TRIANGLE_SLACK, Link, is_impossible
 
 _KEYS = ("mass", "com", "inertia")
 _SYMMETRIC = 1e-9
-_ROUNDING = 1e-12
+# Relative errors of a sum of bodies, and of a second moment, from rounding.
+_ROUNDING, _NO_MOMENT = 1e-9, 1e-12
 
 
-def with_bodies(robot: Any, bodies: Any) -> Any:
-    """Return a robot with other bodies, see `Robot.with_mass_properties`."""
-    model = robot._bare.model
+def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
+    """Return {joint: body} of bodies that `Robot.with_mass_properties` is given."""
     given = mapping("bodies", bodies, "body")
     index_of = {"base": ROOT, **{model.names[i]: i for i in range(ROOT, model.njoints)}}
     links: dict[int, list[str]] = {}
@@ -40,7 +39,7 @@ def with_bodies(robot: Any, bodies: Any) -> Any:
             links.setdefault(frame.parentJoint, []).append(frame.name)
     several = {name: index for index, many in links.items() if many[1:] for name in many}
     index_of |= several | {many[0]: index for index, many in links.items()}
-    names, done, new = list(index_of), dict[int, Any](), model.copy()
+    names, done, new = list(index_of), dict[int, Any](), dict[int, pin.Inertia]()
     for place, value in by_name("body", given, names).items():
         name, index = names[place], index_of[names[place]]
         body = "base" if index == ROOT else model.names[index]
@@ -53,8 +52,8 @@ def with_bodies(robot: Any, bodies: Any) -> Any:
             raise InputError(
                 f"the body '{body}' is given twice, once under the name '{name}'; give it once"
             )
-        new.inertias[index] = _given(name, value, model.inertias[index])
-    return _of_model(robot, new)
+        new[index] = _given(name, value, model.inertias[index])
+    return new
 
 
 def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
@@ -97,14 +96,13 @@ def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
     return pin.Inertia(mass, com, inertia)
 
 
-def perturbed(robot: Any, seed: Any, **spreads: Any) -> Any:
-    """Return a robot with its bodies drawn at random, see `Robot.perturbed`."""
-    model = robot._bare.model
+def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pin.Inertia]:
+    """Return {joint: body} with all bodies drawn at random, see `Robot.perturbed`."""
     checked = {key: number(key, value) for key, value in spreads.items()}
     for key, spread in checked.items():
         if not 0.0 <= spread < 1.0:
             raise InputError(f"{key} is {spread:g}, expected 0 or more and less than 1")
-    draw, new = np.random.default_rng(whole("seed", seed, 0)), model.copy()
+    draw, new = np.random.default_rng(whole("seed", seed, 0)), dict[int, pin.Inertia]()
     for index in range(ROOT, model.njoints):
         drawn = draw.uniform(-1.0, 1.0, (1, 7))
         if any(checked.values()):
@@ -113,32 +111,8 @@ def perturbed(robot: Any, seed: Any, **spreads: Any) -> Any:
             heavier, shift, wider = parts
             body = model.inertias[index]
             mass, com, about = stretched(body, heavier, shift * _radii(body), wider)
-            new.inertias[index] = pin.Inertia(float(mass[0]), com[0], about[0])
-    return _of_model(robot, new)
-
-
-def with_inertias(robot: Any, bodies: Mapping[int, Any]) -> Any:
-    """Return a robot with other masses, centres of mass and inertias of its bare model's bodies."""
-    model = robot._bare.model.copy()
-    for index, (mass, com, inertia) in bodies.items():
-        model.inertias[index] = pin.Inertia(float(mass), com, inertia)
-    return _of_model(robot, model)
-
-
-def _of_model(robot: Any, model: pin.Model) -> Any:
-    """Return a robot with a model that has other masses and no wheels, and a hash of its own."""
-    robot.require_unchanged()
-    bare, told = robot._bare, robot.urdf_sha256
-    masses, before = (
-        b"".join(body.toDynamicParameters().tobytes() for body in each.inertias.tolist())
-        for each in (model, bare.model)
-    )
-    if masses != before:
-        told = sha256(told.encode() + masses).hexdigest()
-    other = replace(bare, model=model, urdf_sha256=told)
-    if bare is robot:
-        return other
-    return with_inputs(replace(robot, urdf_sha256=told, _wheelless=other), robot.inputs)
+            new[index] = pin.Inertia(float(mass[0]), com[0], about[0])
+    return new
 
 
 def _radii(body: pin.Inertia) -> Array:
@@ -160,8 +134,115 @@ def stretched(
     heavier, unit = 1.0 + mass.reshape(-1), np.eye(3)
     second = 0.5 * np.trace(body.inertia) * unit - body.inertia
     # A body that is none, as some files have them, keeps its shape.
-    sound = np.linalg.eigvalsh(second)[0] >= -_ROUNDING * np.trace(second)
+    sound = np.linalg.eigvalsh(second)[0] >= -_NO_MOMENT * np.trace(second)
     stretch = np.sqrt(1.0 + (inertia if sound else inertia[:, :1] * np.ones(3)))
     second = heavier[:, None, None] * second * stretch[:, :, None] * stretch[:, None]
     about = np.trace(second, axis1=1, axis2=2)[:, None, None] * unit - second
     return heavier * body.mass, body.lever + com, about
+
+
+class LinkMass(NamedTuple):
+    """Mass [kg] of a link, and inertia (3, 3) [kg m^2] about the origin of `placement`."""
+
+    mass: float
+    inertia: Array
+    placement: pin.SE3  # of the <inertial> on the link
+
+    @classmethod
+    def of(cls, link: Link) -> LinkMass:
+        """Return the mass properties of a <link>."""
+        xx, xy, xz, yy, yz, zz = link.inertia
+        turn = link.com.quaternion
+        rotation = (
+            pin.rpy.rpyToMatrix(*link.com.rpy)
+            if turn is None
+            else pin.Quaternion(np.array(turn)).matrix()
+        )
+        inertia = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+        return cls(float(link.mass or 0.0), inertia, pin.SE3(rotation, np.array(link.com.xyz)))
+
+
+class Piece(NamedTuple):
+    """A link, or a whole body, on the joint that carries it."""
+
+    joint: int
+    placement: pin.SE3  # of centre of mass and axes, on the joint
+    mass: float
+    inertia: Array
+    frame: pin.SE3  # on the joint, in which its centre of mass is given
+    whole: bool = False  # whether it is a body of several links
+
+
+def pieces_of(
+    model: pin.Model, links: Mapping[str, LinkMass]
+) -> tuple[dict[str, Piece], dict[str, str]]:
+    """Return {name: piece} of links and of bodies of several, and {body: link} of the others."""
+    found, also = dict[str, Piece](), dict[str, str]()
+    of_body: dict[int, dict[str, Piece]] = {}
+    for name, link in links.items():
+        if model.existFrame(name, pin.FrameType.BODY):
+            joint, at = find_frame(model, name)
+            piece = Piece(joint, at * link.placement, link.mass, link.inertia, at)
+            of_body.setdefault(joint, {})[name] = piece
+    for joint in range(ROOT, model.njoints):
+        body, named = model.inertias[joint], of_body.get(joint, {})
+        at, own_axes = pin.SE3(np.eye(3), body.lever), pin.SE3.Identity()
+        whole = Piece(joint, at, body.mass, body.inertia, own_axes, len(named) > 1)
+        total = sum((as_inertia(each) for each in named.values()), pin.Inertia.Zero())
+        difference = np.abs(total.matrix() - body.matrix()).max()
+        if difference <= _ROUNDING * np.abs(body.matrix()).max():
+            found |= named
+        elif len(named) == 1:
+            found |= dict.fromkeys(named, whole)
+        own = "base" if joint == ROOT else model.names[joint]
+        alone = next(iter(named)) if len(named) == 1 else own
+        also |= {own: alone} if alone != own else {}
+        found.setdefault(alone, whole)
+    return found, also
+
+
+def as_inertia(piece: Piece) -> pin.Inertia:
+    """Return a piece as an inertia in its joint's frame."""
+    return piece.placement.act(pin.Inertia(piece.mass, np.zeros(3), piece.inertia))
+
+
+def varied(
+    piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
+) -> tuple[Array, Array, Array]:
+    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of a link, in its joint's frame.
+
+    `mass` (N,), `density` (N,) and `inertia` (N, 3) are relative changes; `com` (N, 3) [m] shifts
+    the centre of mass. Inertia and shift are along the axes of the link.
+    """
+    R = piece.frame.rotation
+    own_axes = R.T @ piece.placement.rotation
+    about = own_axes @ piece.inertia @ own_axes.T
+    own = pin.Inertia(piece.mass, piece.frame.actInv(piece.placement.translation), about)
+    weight, centre, about = stretched(own, density, com, inertia)
+    return weight * (1.0 + mass), piece.frame.translation + centre @ R.T, R @ about @ R.T
+
+
+def with_changed(
+    body: pin.Inertia, changed: Iterable[tuple[Piece, tuple[Array, Array, Array]]]
+) -> tuple[Array, Array, Array]:
+    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of a body with changed links."""
+    total = _moments(np.array([body.mass]), body.lever[None], body.inertia[None])
+    for piece, properties in changed:
+        inertia = as_inertia(piece)
+        before = _moments(np.array([inertia.mass]), inertia.lever[None], inertia.inertia[None])
+        after = _moments(*properties)
+        total = tuple(x + a - b for x, a, b in zip(total, after, before, strict=True))
+    mass, first, second = total
+    com = first / np.where(mass == 0.0, 1.0, mass)[:, None]
+    return mass, com, second - mass[:, None, None] * _squares(com)
+
+
+def _moments(mass: Array, com: Array, inertia: Array) -> tuple[Array, ...]:
+    """Return masses, first moments and inertias about the joint."""
+    return mass, mass[:, None] * com, inertia + mass[:, None, None] * _squares(com)
+
+
+def _squares(com: Array) -> Array:
+    """Return the inertias (N, 3, 3) of unit masses at points (N, 3)."""
+    squares: Array = (com * com).sum(axis=1)[:, None, None] * np.eye(3)
+    return squares - com[:, :, None] * com[:, None]

@@ -1,7 +1,7 @@
 """Outputs y of the linear model: measured quantities of a robot, in any mix and order.
 
 Reference axes are the axes of the reference placement that the state is relative to. The module
-`fflin.dynamics.output_kinds` holds the measured value of each kind and its derivatives.
+`fflin.dynamics.outputs` holds the measured value of each kind and its derivatives.
 """
 
 from dataclasses import dataclass, fields

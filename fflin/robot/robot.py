@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,14 +14,22 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array
-from fflin.robot.coordinates import Coordinates
-from fflin.robot.fields import Range, checked_fields, checked_passive
-from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.appendages import Appendage
+from fflin.robot.equipment import with_appendages, with_inputs
+from fflin.robot.fields import Range, Scope, checked_fields, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
-from fflin.robot.joints import Follower, Joint
+from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
+from fflin.robot.mass_properties import (
+    LinkMass,
+    Piece,
+    given_bodies,
+    pieces_of,
+    random_bodies,
+)
+from fflin.robot.mounting import difference
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.outputs import FullState, Output
-from fflin.robot.wheels import stored_momentum, with_inputs
+from fflin.robot.wheels import stored_momentum
 
 
 class Springs(NamedTuple):
@@ -80,6 +89,10 @@ class Robot(Coordinates):
         Joints without a motor.
     weights : mapping
         Default weights of `lqr`, which replace the weights of its rule: see `replace`.
+    point : mapping
+        Operating point of the commands, see `replace`.
+    target : mapping
+        State to which the commands `simulate` and `montecarlo` bring the robot: see `replace`.
     start : mapping
         Default initial state of `simulate` and `visualize`: see `replace`.
     limits : mapping
@@ -91,6 +104,8 @@ class Robot(Coordinates):
         All joints of the file, including fixed joints.
     attached : tuple of (str, Robot)
         Grasped robots, each with the prefix of its names.
+    appendages : tuple of FlexibleAppendage and Slosh
+        Flexible appendages and slosh, whose modes are among the joints.
 
     Examples
     --------
@@ -120,13 +135,16 @@ class Robot(Coordinates):
     package_dirs: tuple[Path, ...] = ()
     passive: tuple[str, ...] = ()
     weights: Mapping[str, Any] = field(default_factory=dict)
+    point: Mapping[str, Any] = field(default_factory=dict)
+    target: Mapping[str, Any] = field(default_factory=dict)
     start: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, Range] = field(default_factory=dict)
-    links: Mapping[str, Any] = field(default_factory=dict)
+    links: Mapping[str, LinkMass] = field(default_factory=dict)
     file_joints: tuple[str, ...] = ()
     attached: tuple[tuple[str, Robot], ...] = ()
-    # Where some of its joints are wheels: the same robot without them.
-    _wheelless: Robot | None = None
+    appendages: tuple[Appendage, ...] = ()
+    # Where some of its joints are wheels or modes: the same robot without them.
+    _unequipped: Robot | None = None
     # The model, and what it was when the first robot of it was made.
     _as_made: tuple[pin.Model, pin.Model] | None = None
 
@@ -147,6 +165,9 @@ class Robot(Coordinates):
             Inputs of the robot, in the order of u. Wheels with an inertia become joints of the
             robot; previous wheels that are not among the new inputs are removed. The joint of a
             `JointTorque` may be a pattern, ``*``, for all matching joints that have a motor.
+        appendages : sequence of FlexibleAppendage and Slosh
+            Flexible appendages and slosh of the robot, whose modes become passive joints. They
+            replace all previous ones.
         outputs : sequence of Output
             Measured outputs of the robot, in the order of y.
         stiffness : mapping or float
@@ -167,10 +188,17 @@ class Robot(Coordinates):
         weights : mapping
             Default weights of `lqr`: ``rule`` ("urdf" or "identity"), and ``q``, ``r``,
             ``bryson``, each {state, input, group or pattern: weight or largest value}.
+        point : mapping
+            Operating point of the commands `linearize`, `check`, `lqr` and others: ``joints``
+            {joint: position [rad|m]}, ``rpy`` (3,) [deg] about fixed axes, ``position`` (3,) [m]
+            of the base, ``velocity`` {joint or state: rate}, as `fflin.velocity` takes it.
+            Functions take their operating point from their arguments alone.
+        target : mapping
+            State to which the commands `simulate` and `montecarlo` bring the robot, given like
+            `point`, from which omitted parts are taken.
         start : mapping
-            Default initial state of `simulate`: ``joints`` {joint: position [rad|m]}, ``rpy``
-            (3,) [deg] about fixed axes, ``position`` (3,) [m] of the base, ``velocity``
-            {joint or state: rate}, as `fflin.velocity` takes it.
+            Default initial state of `simulate`, given like `point`, from which omitted parts are
+            taken.
         limits : mapping
             {name, group or pattern of inputs or states: largest magnitude, or (least, largest)},
             which replaces the limits of the URDF and of the inputs.
@@ -200,9 +228,17 @@ class Robot(Coordinates):
             robot = robot._without_motors(fields.pop("passive"))
         if "inputs" in fields:
             robot = with_inputs(robot, fields.pop("inputs"))
+        if "appendages" in fields:
+            robot = with_appendages(robot, fields.pop("appendages"))
         joints, own = robot.joint_names, robot._bare.joint_names
-        known = (robot.joint, joints, own, robot.inputs, self.urdf_damping)
-        robot = replace(robot, **checked_fields(fields, *known))
+        scope = Scope(robot.joint, joints, own, robot.inputs, self.urdf_damping)
+        checked = checked_fields(fields, scope)
+        for key in ("stiffness", "damping"):
+            if key in checked:  # modes keep theirs unless they are named
+                old = getattr(robot, key)
+                kept = {joint.name: old[joint.name] for joint in robot.modes if joint.name in old}
+                checked[key] = kept | checked[key]
+        robot = replace(robot, **checked)
         if robot.orbit and any(robot.gravity):
             raise InputError(
                 f"'{self.name}' has both uniform gravity and an orbit, which includes the gravity "
@@ -241,9 +277,7 @@ class Robot(Coordinates):
         UnknownNameError
             If there is no such body or property.
         """
-        from fflin.robot.mass_properties import with_bodies
-
-        return with_bodies(self, bodies)
+        return self.with_bodies(given_bodies(self._bare.model, bodies))
 
     def perturbed(
         self, *, mass: float = 0.1, com: float = 0.1, inertia: float = 0.1, seed: int = 0
@@ -270,9 +304,57 @@ class Robot(Coordinates):
         Robot
             As from `with_mass_properties`.
         """
-        from fflin.robot.mass_properties import perturbed
+        spreads = {"mass": mass, "com": com, "inertia": inertia}
+        return self.with_bodies(random_bodies(self._bare.model, seed, **spreads))
 
-        return perturbed(self, seed, mass=mass, com=com, inertia=inertia)
+    def with_bodies(self, bodies: Mapping[int, pin.Inertia]) -> Robot:
+        """Return the robot with other {joint: body}, wheels included, and a hash of its own."""
+        self.require_unchanged()
+        bare = self._bare
+        model = bare.model.copy()
+        for joint, body in bodies.items():
+            model.inertias[joint] = body
+        masses, before = (
+            b"".join(body.toDynamicParameters().tobytes() for body in each.inertias.tolist())
+            for each in (model, bare.model)
+        )
+        digest = self.urdf_sha256
+        if masses != before:
+            digest = sha256(digest.encode() + masses).hexdigest()
+        other = replace(bare, model=model, urdf_sha256=digest)
+        if bare is self:
+            return other
+        whole = replace(self, urdf_sha256=digest, _unequipped=other)
+        changed: Robot = with_inputs(whole, self.inputs)
+        if not self.modes:
+            return changed
+        # On the same joints, so that a configuration keeps its amplitudes.
+        model, own = self.model.copy(), self.model.inertias
+        for joint in bodies:
+            at = self.model.getJointId(bare.model.names[joint]) if joint > ROOT else ROOT
+            mounted = difference(bare.model.inertias[joint], own[at])
+            model.inertias[at] = difference(other.model.inertias[joint], mounted)
+            if model.inertias[at].mass <= 0.0:
+                return changed
+        return replace(changed, model=model, joints=self.joints, followers=self.followers)
+
+    @cached_property
+    def pieces(self) -> dict[str, Piece]:
+        """{name: piece} of the links, and of bodies of several links, on the model's joints."""
+        # Wheels stand between the joints of the whole robot.
+        names, at = self._bare.model.names, self.model.getJointId
+        now = [at(name) if joint > ROOT else joint for joint, name in enumerate(names)]
+        found = self._links_and_bodies[0]
+        return {name: each._replace(joint=now[each.joint]) for name, each in found.items()}
+
+    @property
+    def link_of(self) -> dict[str, str]:
+        """{body: link} of the bodies of one link, which both names stand for."""
+        return self._links_and_bodies[1]
+
+    @cached_property
+    def _links_and_bodies(self) -> tuple[dict[str, Piece], dict[str, str]]:
+        return pieces_of(self._bare.model, self.links)
 
     @property
     def used_frames(self) -> tuple[str, ...]:
@@ -333,10 +415,15 @@ class Robot(Coordinates):
             raise InputError(f"joint '{name}' is locked; lock it at another value instead")
         raise unknown("joint", name, self.joint_names)
 
+    @cached_property
+    def modes(self) -> tuple[Joint, ...]:
+        """Joints that are modes of flexible appendages or slosh."""
+        return tuple(joint for joint in self.joints if joint.mode)
+
     @property
     def _bare(self) -> Robot:
-        """The robot without the wheels among its joints."""
-        return self._wheelless or self
+        """The robot without the wheels and modes among its joints."""
+        return self._unequipped or self
 
     def _without_motors(self, passive: Any) -> Robot:
         """Return the robot without the torques of joints that have no motor."""

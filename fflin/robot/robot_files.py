@@ -2,29 +2,63 @@
 
 from __future__ import annotations
 
-import re
 import reprlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import MISSING, fields, replace
+from inspect import signature
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FflinError, InputError
+from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
 from fflin.base.names import stands_for_any
-from fflin.base.toml_file import TomlFile, flat
-from fflin.robot.catalog import find_robot
-from fflin.robot.fields import FIELDS
-from fflin.robot.input_files import NAME, NUMBER, check_keys, read_inputs
+from fflin.base.toml_file import NAME, NUMBER, NUMBERS, TRUTH, VECTOR, Kind, TomlFile, flat
+from fflin.robot.appendages import Appendage, FlexibleAppendage, Slosh
+from fflin.robot.catalog import find_inputs, find_robot
+from fflin.robot.fields import FIELDS, Field
+from fflin.robot.inputs import KINDS, Input, Vector3
 from fflin.robot.outputs import parse_output
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from fflin.robot.robot import Robot
 
+# Fields that a file gives as arrays of tables.
+_TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
-# What holds names; all else holds numbers, but for what may be a word.
-_OF_NAMES = ("urdf", "package_dirs", "lock", "passive", "outputs")
-_WORDS = (["damping"], ["weights", "rule"], ["orbit", "body"])
+# The keys of a robot file; a file without `urdf` holds inputs alone.
+KEYS = {
+    "urdf": Field(
+        "path relative to the file, or a name that `fflin robots` lists", kind=NAME, table=None
+    ),
+    "package_dirs": Field(
+        "folders, relative to the file, in which `package://` mesh paths are searched",
+        kind=NAME,
+        table=None,
+    ),
+    "lock": Field("welded joints: names, or `{ joint = value }` [rad, m]", kind=NAME),
+    "input": FIELDS["inputs"],
+    "flexible": Field(
+        "flexible appendages: `frame`, `frequency` [Hz], `translation` (three rows) [kg^0.5], "
+        "`rotation` [kg^0.5 m], `damping`, `name`; or `op4` and `asm`, files of Nastran, with "
+        "`modes`, `length`, `mass`, `origin` and `rigid`",
+        heading="[[flexible]]",
+    ),
+    "slosh": Field(
+        "liquid that sloshes: `frame`, `mass` [kg], `position` [m], `frequency` [Hz] or `length` "
+        "[m], `axis`, `damping`, `name`; or `radius`, `height` [m], `density` [kg/m³] and "
+        "`acceleration` [m/s²] of a cylinder, with `bottom` and `pendulum`",
+        heading="[[slosh]]",
+    ),
+    **{name: field for name, field in FIELDS.items() if name not in _TABLES},
+}
+
+_TYPES = {kind.KEY: kind for kind in KINDS}
+# The kind of value for each annotation of an input's parameters.
+_KINDS: dict[Any, Kind] = {
+    **dict.fromkeys((str, str | None), NAME),
+    **dict.fromkeys((float, float | None), NUMBER),
+    **{bool: TRUTH, Vector3: VECTOR, float | Vector3 | None: NUMBERS},
+}
 
 
 class RobotToml:
@@ -38,101 +72,84 @@ class RobotToml:
                 f'{path}: the file holds inputs only; add urdf = "my.urdf" above them, or pass the '
                 "file to a robot with --inputs or fflin.load_inputs"
             )
-        given = {key: self._checked(key) for key in document.record if key != "input"}
-        self._written = given | {"inputs": document.record.get("input")}
+        tables = {key for keys in _TABLES.values() for key in keys}
+        given = {key: self._checked(key) for key in document.record if key not in tables}
         lock, folders = given.pop("lock", {}), given.pop("package_dirs", [])
         # {joint or pattern: value, or None at neutral}.
         self.lock: dict[str, float | None] = lock if isinstance(lock, dict) else dict.fromkeys(lock)
         self.package_dirs = tuple(path.parent / folder for folder in folders)
-        with self.placed("urdf"):
+        with document.located("urdf"):
             # The URDF, under the name of the TOML file.
             self.found = find_robot(given.pop("urdf"), path.parent)._replace(name=name)
             if self.found.path.suffix.lower() == ".toml":
                 raise InputError(f"urdf is {self.found.path}, expected a URDF or a robot's name")
-        with self.placed("outputs"):
+        with document.located("outputs"):
             if words := given.get("outputs"):
                 given["outputs"] = [output for word in words for output in parse_output(word)]
         if "input" in document.record:
             given["inputs"] = read_inputs(document)
+        if appendages := read_appendages(document):
+            given["appendages"] = appendages
         self._fields = {key: given[key] for key in FIELDS if key in given}
 
     def applied(self, robot: Robot) -> Robot:
-        """Return the robot of the URDF with what the file says, but of joints that others lock."""
+        """Return the robot with the file's fields, except those of joints that a caller locks."""
         locked = [each.rpartition("=")[0] for each in robot.locked]
         gone = [name for name in locked if not any(stands_for_any(x, [name]) for x in self.lock)]
         for key, value in self._fields.items():
-            with self.placed(key):
-                self._check_unlocked(key, value)
+            names = [name for name in _TABLES.get(key, (key,)) if name in self._document.record]
+            with self._document.located(names[0]):
+                self._check_unlocked(value)
                 robot = robot.replace(**{key: _without(gone, robot.joint_names, value)})
         return robot
 
     @contextmanager
-    def placed(self, key: str) -> Iterator[None]:
-        """Put file and line in front of what is wrong about a key, of the lock if it names it."""
+    def located_locks(self) -> Iterator[None]:
+        """Put file and line in front of errors that name a joint that the file locks."""
         try:
             yield
         except FflinError as error:
-            document, message = self._document, str(error)
-            places = _places(self._written.get(key))
-            quoted = [
-                place
-                for name, *place in places
-                if re.search(f"'{re.escape(name)}'| {re.escape(name)} is ", message)
-            ]
-            if key == "lock" and not quoted:
+            if not any(f"'{name}'" in str(error) for name in self.lock):
                 raise
-            table = "input" if key == "inputs" else key
-            line = document.line(table, *(quoted[0] if quoted else ()))
-            raise type(error)(f"{document.path}:{line}: {message}") from None
+            with self._document.located("lock"):
+                raise
 
-    def _check_unlocked(self, key: str, value: Any) -> None:
+    def _check_unlocked(self, value: Any) -> None:
         names = value.get("joints", value) if isinstance(value, Mapping) else value
         for name in names if isinstance(names, list | dict) else ():
             if name in self.lock:
                 line = self._document.line("lock")
                 raise InputError(f"joint '{name}' is also locked in line {line}; remove one")
 
-    def _checked(self, key: str) -> Any:
-        """Return the value of a key, in which names stand for names and numbers for numbers."""
-        value = self._document.record[key]
+    def _checked(self, name: str) -> Any:
+        """Return the value of a key, with flat tables: names in them may have dots."""
+        key, value = KEYS[name], self._document.record[name]
+        kind = key.kind
         if isinstance(value, dict):
-            # The parts of these are tables of names, which may have dots.
-            parts = value if key in ("weights", "start") else {"": value}
+            kind = key.table or kind
+            parts = value if key.parts else {"": value}
             parts = {part: flat(x) if isinstance(x, dict) else x for part, x in parts.items()}
-            value = parts.get("", parts)
-        named = key in _OF_NAMES and not (key == "lock" and isinstance(value, dict))
-        right, expected = NAME if named else NUMBER
-        no_table = named and isinstance(value, dict)
-        for *place, leaf in [(key, value)] if no_table else _leaves(value, key):
-            if not right(leaf) and not (isinstance(leaf, str) and place in _WORDS):
-                shown = f"{'.'.join(place)} is {reprlib.repr(leaf)}, expected {expected}"
-                raise self._document.error(shown, *place)
-        return [value] if key in _OF_NAMES[1:] and isinstance(value, str) else value
+            value = parts if key.parts else parts[""]
+        word = [name, key.word] if key.word else [name]
+        for *place, leaf in _leaves(value, name) if key.table else _entries(value, name):
+            if key.word is None or place != word or not isinstance(leaf, str):
+                self._document.require(kind, leaf, *place)
+        listed = isinstance(value, str) and kind is NAME and name != "urdf"
+        return [value] if listed else value
+
+
+def _entries(value: Any, *place: str) -> Iterator[tuple[Any, ...]]:
+    """Yield (*place, value) of a value, or of the entries of a list."""
+    yield from ((*place, entry) for entry in (value if isinstance(value, list) else [value]))
 
 
 def _leaves(value: Any, *place: str) -> Iterator[tuple[Any, ...]]:
-    """Yield (*place, value) of all that is no table, and of the entries of its lists."""
+    """Yield (*place, value) of all values in nested tables, and of the entries of lists."""
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from _leaves(inner, *place, key)
-    elif isinstance(value, list):
-        yield from ((*place, entry) for entry in value)
     else:
-        yield (*place, value)
-
-
-def _places(value: Any, *place: str | int) -> Iterator[tuple[Any, ...]]:
-    """Yield (name, *place) of each name in a value, the innermost first."""
-    pairs: Any = value.items() if isinstance(value, dict) else ()
-    if isinstance(value, list):
-        pairs = enumerate(value)
-    for key, inner in pairs:
-        if isinstance(inner, dict | list):
-            yield from _places(inner, *place, key)
-        if isinstance(inner, str):
-            yield (inner, *place, key)
-        if isinstance(key, str):
-            yield (key, *place, key)
+        yield from _entries(value, *place)
 
 
 def _without(gone: list[str], left: tuple[str, ...], value: Any) -> Any:
@@ -153,3 +170,176 @@ def _kept(key: Any, gone: list[str], left: tuple[str, ...]) -> bool:
         for joints in (gone, left)
     )
     return stands_for_any(key, of_left) or not stands_for_any(key, of_gone)
+
+
+def load_inputs(path: str | Path) -> tuple[Input, ...]:
+    """Read the inputs of a robot from a TOML file.
+
+    The file is an array of tables ``[[input]]``, in the order of u. Each table has a ``type``
+    and the keys of this type, which are the parameters of the class:
+
+    ==================  =========================================================
+    ``type``            keys
+    ==================  =========================================================
+    ``base_torque``     none: `BaseTorque`
+    ``base_force``      none: `BaseForce`
+    ``joint_torque``    ``joint``: `JointTorque`
+    ``thruster``        ``frame``, ``position`` [m], ``direction``; optional:
+                        ``name``, ``on_off`` (true: pulses of ``max``),
+                        ``least_impulse`` [N s]: `Thruster`
+    ``reaction_wheel``  ``axis``; optional: ``frame``, ``name``, and either
+                        ``inertia`` [kg m^2] with ``max_speed`` [rad/s] or
+                        ``momentum`` [N m s]: `ReactionWheel`
+    every type          optional: ``max`` and ``min`` [N m | N], the largest and
+                        the least value. The default of ``min`` is -max, for a
+                        thruster 0. Base inputs take one number or three
+    ==================  =========================================================
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of the file, or the name of a bundled one: ``"cubesat"``, ``"servicer_7dof"``.
+
+    Returns
+    -------
+    tuple of Input
+
+    Raises
+    ------
+    FileError
+        If the path is not a regular file, or the file cannot be read or is too large.
+    UnknownNameError
+        If there is no such type or key; the message names file and line.
+    InputError
+        If the file is not TOML, a key is missing, a value is wrong or an input is given twice;
+        the message names file and line.
+
+    Examples
+    --------
+    A file with this content ::
+
+        [[input]]
+        type = "joint_torque"
+        joint = "joint_1"
+
+        [[input]]
+        type = "thruster"
+        name = "nozzle"
+        frame = "base"
+        position = [-0.9, 0.0, 0.65]
+        direction = [1, 0, 0]
+
+    gives ``(JointTorque("joint_1"), Thruster("base", (-0.9, 0, 0.65), (1, 0, 0), "nozzle"))``.
+
+    >>> inputs = fflin.load_inputs("cubesat")  # bundled
+    >>> len(inputs), inputs[-1].name
+    (15, 'wheel_z')
+    """
+    document = TomlFile(find_inputs(path))
+    check_keys(document)
+    return read_inputs(document)
+
+
+def check_keys(document: TomlFile) -> None:
+    """Raise `UnknownNameError` if a file of inputs or a robot file has an unknown key."""
+    whole = "urdf" in document.record
+    known, hint = (tuple(KEYS), "") if whole else (("input",), "; write [[input]]")
+    for key in document.record:
+        if key not in known:
+            if not whole and key in KEYS:
+                missing = 'has no key `urdf`; a robot file needs it: add urdf = "my.urdf"'
+                raise InputError(f"{document.path}: {missing}")
+            problem = unknown("key of a robot file" if whole else "table", key, known)
+            raise document.error(UnknownNameError(f"{problem}{hint}"), key)
+
+
+def read_inputs(document: TomlFile) -> tuple[Input, ...]:
+    """Return the inputs of a file, as `load_inputs` does."""
+    tables = document.record.get("input", [])
+    if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
+        raise document.error("input is not an array of tables; write [[input]]", "input")
+    if not tables:
+        message = "the file holds no inputs; write [[input]] and its type below"
+        raise InputError(f"{document.path}: {message}")
+    inputs: list[Input] = []
+    seen: dict[Input | str | None, int] = {}
+    for index, table in enumerate(tables):
+        item = _input(document, index, table)
+        what = item.name if hasattr(item, "name") else replace(item, min=None, max=None)
+        if what is not None and what in seen:
+            shown = f"the name '{what}'" if isinstance(what, str) else what
+            first = document.line("input", seen[what])
+            message = f"input {index + 1}: {shown} is already given in line {first}; remove one"
+            raise document.error(message, "input", index, "name")
+        seen[what] = index
+        inputs.append(item)
+    return tuple(inputs)
+
+
+def read_appendages(document: TomlFile) -> list[Appendage]:
+    """Return the flexible appendages and slosh of a robot file."""
+    found: list[Appendage] = []
+    for key, make, special in (
+        ("flexible", FlexibleAppendage, FlexibleAppendage.from_nastran),
+        ("slosh", Slosh, Slosh.cylinder),
+    ):
+        # Keys that only files of Nastran, or cylinders, have.
+        alone = set(signature(special).parameters) - set(signature(make).parameters)
+        tables = document.record.get(key, [])
+        if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
+            raise document.error(f"{key} is not an array of tables; write [[{key}]]", key)
+        for index, table in enumerate(tables):
+            build: Any = special if alone & set(table) else make
+            of, place = f"{key} {index + 1}: ", (key, index)
+            hidden = {"inertia"} if build is special else {"inertia", "rigid"}
+            known = {k: x for k, x in signature(build).parameters.items() if k not in hidden}
+            for name in table:
+                if name not in known:
+                    problem = unknown(
+                        f"key of {key}", name, dict.fromkeys((*known, *sorted(alone)))
+                    )
+                    raise document.error(problem, *place, name)
+            for name, parameter in known.items():
+                if parameter.default is parameter.empty and name not in table:
+                    raise document.error(f"{of}needs the key '{name}'; add it", *place)
+            values = dict(table)
+            for name in {"op4", "asm"} & set(values):
+                document.require(NAME, values[name], *place, name, of=f"{of}{name}")
+                values[name] = document.path.parent / values[name]
+            try:
+                found.append(build(**values))
+            except FflinError as error:
+                with document.located(*place):
+                    raise type(error)(f"{of}{error}") from None
+    return found
+
+
+def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
+    kind, of, place = table.get("type"), f"input {index + 1}: ", ("input", index)
+    if kind is None:
+        near = [key for key in table if key.lower() == "type"]
+        hint = f", but has '{near[0]}'" if near else ""
+        message = f"{of}has no key 'type'{hint}; set it to one of {', '.join(_TYPES)}"
+        raise document.error(message, *place)
+    if not isinstance(kind, str) or kind not in _TYPES:
+        shown = kind if isinstance(kind, str) else reprlib.repr(kind)
+        raise document.error(unknown("type of input", shown, _TYPES), *place, "type")
+    by_keyword_last = sorted(fields(_TYPES[kind]), key=lambda field: field.kw_only is True)
+    known = {field.name: field for field in by_keyword_last}
+    values = {key: value for key, value in table.items() if key != "type"}
+    for key, value in values.items():
+        if key not in known:
+            problem = unknown(f"key of a {kind}", key, ("type", *known))
+            raise document.error(problem, *place, key)
+        expected = _KINDS[known[key].type]
+        if expected is NUMBERS and len(_TYPES[kind].ENTRIES) == 1:
+            expected = NUMBER
+        document.require(expected, value, *place, key, of=f"{of}{key}")
+    for key, field in known.items():
+        if field.default is MISSING and key not in values:
+            raise document.error(f"{of}a {kind} needs the key '{key}'; add it", *place)
+    try:
+        return _TYPES[kind](**values)
+    except InputError as error:
+        with document.located(*place):
+            raise InputError(f"{of}{error}") from None

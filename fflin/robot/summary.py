@@ -1,16 +1,33 @@
-"""Summary of a robot in text and tables."""
+"""Text about a robot: the list of robots, a summary, and the draft of a robot file."""
 
+import json
 import math
+import re
 import textwrap
 from collections.abc import Iterable, Mapping
+from string import Template
+from textwrap import fill
 from typing import Any
+
+import numpy as np
+import pinocchio as pin
 
 from fflin.base.tables import counted, folded, grid, width
 from fflin.robot.inputs import BaseForce, BaseTorque
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.joints import ROOT
+from fflin.robot.limits import limits_of
+from fflin.robot.robot import Robot
 
 _LIMITS = "limits in rad, N m and rad/s; for prismatic joints in m, N and m/s"
-_START = {"rpy": "[deg]", "position": "[m]", "joints": "[rad | m]", "velocity": "[rad/s | m/s]"}
+_STATE = {"rpy": "[deg]", "position": "[m]", "joints": "[rad | m]", "velocity": "[rad/s | m/s]"}
+
+_LOOKS = {
+    "reaction_wheel": re.compile(r"(?<![a-z])(rw|(fly|reaction_?)?wheel)(?![a-z])", re.IGNORECASE),
+    "thruster": re.compile(r"(?<![a-z])(thr|thruster|nozzle|rcs)(?![a-z])", re.IGNORECASE),
+}
+
+# How joints without a motor swing with all else held [rad/s], and their damping ratio.
+_SWING, _DAMPED = math.pi, 0.01
 
 
 def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
@@ -26,8 +43,8 @@ def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
     return "\n\n".join((head, grid(rows, "lrrl"), *notes))
 
 
-def robot_info(robot: Robot) -> str:
-    """Show a robot's tree, masses and limits."""
+def robot_info(robot: Robot, at_point: str = "") -> str:
+    """Show a robot's tree, masses and limits, below a report of the robot at a point."""
     model = robot.model
     inputs = sum(3 if isinstance(item, BaseTorque | BaseForce) else 1 for item in robot.inputs)
     source = str(robot.urdf) if robot.urdf else "a Pinocchio model"
@@ -45,6 +62,7 @@ def robot_info(robot: Robot) -> str:
         for joint in robot.joints
     }
     kinds |= {joint: "wheel" for joint in robot.joints if joint.name in robot.wheels}
+    kinds |= {joint: "slosh" if joint.kind == "slosh" else "mode" for joint in robot.modes}
     for joint, leader, multiplier, offset in robot.followers:
         kinds[joint] = f"mimics {leader.name} * {multiplier:g}"
         kinds[joint] += f" {'-' if offset < 0 else '+'} {abs(offset):g}" if offset else ""
@@ -58,11 +76,33 @@ def robot_info(robot: Robot) -> str:
         rows.append(["  " * depth[index] + joint.name, kinds[joint], mass, *map(_limit, limits)])
     frames = [frame.name for frame in model.frames.tolist() if frame.parentJoint >= ROOT]
     limited = any(cell != "." for row in rows[1:] for cell in row[3:])
-    parts = [head, grid(rows, "ll"), *[_LIMITS] * limited, *_settings(robot)]
+    parts = [
+        head,
+        *[at_point] * bool(at_point),
+        grid(rows, "ll"),
+        *[_LIMITS] * limited,
+        *_appendages(robot),
+        *_settings(robot),
+    ]
     parts.append(f"frames\n{_indented(', '.join(dict.fromkeys(frames)), '  ')}")
     if robot.notes:
         parts.append("\n".join(("warnings", *(_indented(note, "    ") for note in robot.notes))))
     return "\n\n".join(parts)
+
+
+def _appendages(robot: Robot) -> list[str]:
+    """Show flexible appendages and slosh, with their modes if the link is clamped."""
+    rows = [["appendage", "on frame", "mode", "Hz", "damping"]]
+    for item in robot.appendages:
+        for name in item.modes:
+            index = robot.joint_names.index(name)
+            stiffness, damping, _ = (each[index].item() for each in robot.springs)
+            cells = [".", "."]
+            if stiffness:
+                omega, ratio = robot.joints[index].oscillation(stiffness, damping)
+                cells = [f"{0.5 * omega / math.pi:.6g}", f"{ratio:.4g}"]
+            rows.append([item.title, item.frame, name, *cells])
+    return [grid(rows, "lll")] * bool(robot.appendages)
 
 
 def _settings(robot: Robot) -> list[str]:
@@ -78,7 +118,11 @@ def _settings(robot: Robot) -> list[str]:
         "outputs": outputs if outputs != ["state"] else (),
         "limits": {key: f"{low:g} to {high:g}" for key, (low, high) in robot.limits.items()},
         **{f"weights, {part}": value for part, value in robot.weights.items()},
-        **{f"start, {part} {_START[part]}": value for part, value in robot.start.items()},
+        **{
+            f"{name}, {part} {_STATE[part]}": value
+            for name in ("point", "target", "start")
+            for part, value in getattr(robot, name).items()
+        },
     }
     lines = [f"{title}: {_said(value)}" for title, value in shown.items() if value]
     return [folded(lines)] * bool(lines)
@@ -99,3 +143,83 @@ def _indented(text: str, below: str) -> str:
 def _limit(value: float) -> str:
     # Pinocchio marks what the URDF does not limit by the largest double or by infinity.
     return "." if not math.isfinite(value) or abs(value) > 1e300 else f"{value:.5g}"
+
+
+def draft(robot: Robot, urdf: str) -> str:
+    """Return the text of a robot file for a robot whose URDF, named `urdf`, says all."""
+    from importlib.resources import files
+
+    model = robot.model
+    idle = [joint for joint in robot.joints if model.effortLimit[joint.idx_v] == 0.0]
+    names = ", ".join(_text(joint.name) for joint in idle)
+    passive = f"\n# Joints without a motor: their effort is 0 in the URDF.\npassive = [{names}]\n"
+    if len(idle) == robot.n:
+        passive = (
+            "\n# The URDF gives every joint an effort of 0, as some exporters do.\n"
+            f"# passive = [{names}]\n"
+        )
+        idle = []
+    M = pin.crba(model, model.createData(), robot.neutral())
+    inertia = {joint.name: float(M[joint.idx_v, joint.idx_v]) for joint in idle}
+    damping = {name: 2.0 * _DAMPED * _SWING * size for name, size in inertia.items()}
+    damping |= {name: value for name, value in robot.urdf_damping.items() if value}
+    limits = {
+        name: f"{high:.6g}" if low == -high else f"[{low:.6g}, {high:.6g}]"
+        for name, (low, high) in limits_of(robot).items()
+    }
+    template = Template(files("fflin.robot").joinpath("assets", "robot.toml").read_text("utf-8"))
+    return template.substitute(
+        name=_text(robot.name)[1:-1],
+        joints=counted(robot.n, "joint"),
+        mass=f"{robot.mass:.6g}",
+        urdf=_text(urdf),
+        joint=_text(robot.joint_names[0] if robot.n else "joint_1"),
+        passive=passive if names else "",
+        candidates="".join(_candidate(robot, index) for index in range(model.nframes)),
+        damping=_lines("", {name: f"{value:.6g}" for name, value in damping.items()}),
+        stiffness=_lines("", {name: f"{size * _SWING**2:.6g}" for name, size in inertia.items()}),
+        limits=_lines("# ", limits),
+    )
+
+
+def _lines(mark: str, values: Mapping[str, str]) -> str:
+    return "".join(f"{mark}{_text(name)} = {value}\n" for name, value in values.items())
+
+
+def _candidate(robot: Robot, index: int) -> str:
+    """Return the input that a link's name suggests, in comments; empty if it suggests none."""
+    model, frame = robot.model, robot.model.frames[index]
+    kind = next((kind for kind, look in _LOOKS.items() if look.search(frame.name)), "")
+    if not kind or frame.type != pin.FrameType.BODY or frame.parentJoint < ROOT:
+        return ""
+    data = robot.create_data()
+    pin.forwardKinematics(model, data, robot.neutral())
+    placement = pin.updateFramePlacement(model, data, index)
+    axis, name, inertia = np.array([0.0, 0.0, 1.0]), frame.name, ""
+    if kind == "reaction_wheel":
+        name += "_rotor"  # which may be a joint's, whose name no frame has
+        joint = model.joints[frame.parentJoint]
+        if joint.nv == 1 and model.frames[frame.parentFrame].type == pin.FrameType.JOINT:
+            data = joint.createData()
+            joint.calc(data, robot.neutral())
+            axis = np.asarray(data.S).reshape(6)[3:]
+            size = axis @ model.inertias[frame.parentJoint].inertia @ axis
+            inertia = f"# inertia = {size:.6g}  # [kg m^2], if its joint is locked\n"
+    key = "axis" if kind == "reaction_wheel" else "direction"
+    at, along = _vector(placement.translation), _vector(placement.rotation @ axis)
+    position = "" if inertia or key == "axis" else "# position = [0, 0, 0]  # [m], in that frame\n"
+    said = f"# Link {_text(frame.name)} at {at} [m], {key} {along}, both in base axes:"
+    return (
+        f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n"
+        f'# [[input]]\n# type = "{kind}"\n# name = {_text(name)}\n# frame = {_text(frame.name)}\n'
+        f"{position}# {key} = {_vector(axis)}\n{inertia}"
+    )
+
+
+def _vector(values: np.ndarray) -> str:
+    return f"[{', '.join(f'{x:.6g}' for x in np.round(values, 9) + 0.0)}]"
+
+
+def _text(name: str) -> str:
+    """Write a name as TOML does."""
+    return json.dumps(name, ensure_ascii=False).replace("\x7f", "\\u007f")

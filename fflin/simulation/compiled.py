@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from typing import Any
 
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.progress import Progress
-from fflin.control.linear_controller import LinearController, measured_at
-from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
+from fflin.base.process import Progress
+from fflin.control.linear_controller import LinearController, OutputFeedback, measured_at
 from fflin.control.policies import Allocation, Gridded, StateFeedback
-from fflin.control.tracking import TrajectoryFeedback
+from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.kernel.compiled import checked_engine, is_kept, numba_is_there
 from fflin.kernel.tree import LANES, batch_tree
-from fflin.robot.frames import ROOT
+from fflin.robot.joints import ROOT
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
@@ -26,6 +26,11 @@ _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 _SLICE, _FIRST_SLICE = 0.05, 16  # [s] and steps between looks at the clock and at Ctrl-C
 # Steps beyond which a single run goes by the compiled loop, if its machine code is there.
 LONG = 20_000
+# A run in Python of more than so many seconds is followed by a line on the compiled loop, which
+# takes about this fraction of the time and must be compiled once.
+_LONG_RUN, _FRACTION, _COMPILING = 20.0, 0.1, 30.0
+
+_log = logging.getLogger("fflin")
 
 
 def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> str:
@@ -85,7 +90,21 @@ def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
 
 def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> Recording:
     """Run a plan to its end by an engine; `plant` and `conserved` are of the robot that moves."""
-    return go(plan, plant, conserved) if engine == "python" else _fly(plan, plant, conserved)
+    if engine == "compiled":
+        return _fly(plan, plant, conserved)
+    began = time.perf_counter()
+    run = go(plan, plant, conserved)
+    spent = time.perf_counter() - began
+    if spent > _LONG_RUN and not _reason(plan, plant):
+        once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
+        _log.warning(
+            "fflin: the simulation took %.0f s in Python; engine='compiled' (--engine compiled) "
+            "would take about %.1g s%s",
+            spent,
+            _FRACTION * spent,
+            once,
+        )
+    return run
 
 
 def _fly(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:

@@ -15,7 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, instance
 from fflin.base.writing import as_path, check_ending
-from fflin.dynamics.state_rows import attitude_errors, moving_errors
+from fflin.dynamics.state import attitude_errors, moving_errors
 from fflin.linear.trajectory_files import write_table
 from fflin.robot.orbit import CircularOrbit
 from fflin.simulation.report import Passed, Saturated, limited, motion_report, passed, saturated
@@ -84,6 +84,15 @@ class Motion(Design):
         Joints that are reaction wheels. Their angles are not included in the errors.
     wheel_inertias : ndarray (k,)
         Inertias of the wheels about their axes [kg m^2]; empty if the file lacks them.
+    modes : tuple of str
+        Joints that are modes of flexible appendages or slosh. The report lists them apart from the
+        joints.
+    mode_rotations : ndarray (k,)
+        Rotation [rad] that a unit of each mode's amplitude stands for; 0 if it stands for none. A
+        mode of a flexible appendage moves like a ball, which turns by w per unit of the amplitude,
+        and is displaced by v at the distance c from the appendage's frame: the rotation is
+        :math:`|w| + |v| / |c|`. The second term is left out if c is below 5 % of the radius of
+        gyration of the carrying body.
     steered : tuple of str
         States that the policy feeds back; empty if they are not known.
     notes : tuple of str
@@ -111,6 +120,7 @@ class Motion(Design):
     OPEN: ClassVar = ("limits",)
     VECTORS: ClassVar = (
         *("t", "energy", "momentum_drift", "com_drift", "placement", "wheel_inertias", "starts"),
+        "mode_rotations",
     )
 
     t: Array
@@ -145,6 +155,8 @@ class Motion(Design):
     starts: Array = field(default_factory=lambda: np.zeros(0))
     _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; as _robot
     circles: str = field(default_factory=str)  # the orbit, as text
+    modes: tuple[str, ...] = field(default_factory=tuple)
+    mode_rotations: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)

@@ -10,7 +10,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.names import chosen, input_keys
-from fflin.dynamics.state_rows import moving_errors
+from fflin.dynamics.state import moving_errors
 from fflin.simulation.plots import Signals, draw
 
 if TYPE_CHECKING:

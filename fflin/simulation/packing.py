@@ -10,21 +10,19 @@ import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, vector
+from fflin.control.channel import channel_of
 from fflin.control.linear_controller import LinearController, measured_at
-from fflin.control.output_feedback import TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback
-from fflin.control.saturation import Pulses, Wheels
-from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
+from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.dynamics.state import StateMap
-from fflin.kernel import channel, course, forward, laws, loop, sharing, tracking
-from fflin.kernel.accelerations import layout_of, loads_of, work_space
+from fflin.kernel import allocation, conservation, forward, loop, policies
 from fflin.kernel.arguments import empty, laid_out, words_of
 from fflin.kernel.compiled import kernel
-from fflin.kernel.tree import LANES, Tree, batch_tree
-from fflin.robot.frames import ROOT, find_frame
+from fflin.kernel.tree import LANES, Tree, batch_tree, layout_of, loads_of, work_space
+from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.limits import limits_of
-from fflin.simulation.conservation import Conserved, Course
+from fflin.simulation.conservation import Conserved, MomentumReference
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant, triads
 from fflin.simulation.times import LARGEST_TURN, Times
@@ -37,7 +35,7 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.A
     """Return what `kernel.loop.advance` reads of a plan whose policy and method it knows."""
     h, state, method = plan.times.dt, plant.state, plan.method
     size, (way, speed) = 6 + state.robot.n, method.shares(h)
-    start = Course(conserved, method, h, plan.q, plan.v)
+    start = MomentumReference(conserved, method, h, plan.q, plan.v)
     squares = np.full(state.robot.nv, LARGEST_SPEED**2)
     squares[plan.turning] = (LARGEST_TURN / h) ** 2
     mechanics = mechanics_of(plant, tree)
@@ -54,16 +52,19 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.A
             tangent=method.tangent,
         ),
         law=_law(plan, plant, mechanics),
-        channel=_channel(plan, plant),
-        course=course.Course(
+        # What would act after the end needs no place to wait in.
+        channel=channel_of(
+            plan.limits, plan.initial, plan.times.sample, min(plan.times.delay, plan.times.steps)
+        )._replace(delay=[float(plan.times.delay)]),
+        reference=conservation.MomentumReference(
             start=np.concatenate((start.momentum, start.center(0.0), plan.q[:3])),
             weight=conserved.mass * np.array(state.robot.gravity),
             per_mass=[1.0 / conserved.mass],
-            sums=np.zeros(course.SUMS),
+            sums=np.zeros(conservation.SUMS),
         ),
         project=plan.project,
         pushed=not plant.isolated(driven=plan.law is not None),
-        watch=loop.Watch(
+        stop=loop.StopConditions(
             squares=state.velocities(squares),
             sign=np.array([np.sign(plan.chart.scalar(plan.q)) if plan.chart else 0.0]),
         ),
@@ -119,9 +120,9 @@ class CompiledLoop:
 
 def kept_at(parts: loop.Arguments, t: float) -> list[Array]:
     """Return the momentum (6,) and the centre of mass (3,) that the first run is to have."""
-    start, sums = parts.course.start[:, 0], parts.course.sums[:, 0]
+    start, sums = parts.reference.start[:, 0], parts.reference.sums[:, 0]
     momentum, center = np.split(start[:9] + sums[:9], [6])
-    return [momentum, center + t * parts.course.per_mass[0, 0] * start[:3]]
+    return [momentum, center + t * parts.reference.per_mass[0, 0] * start[:3]]
 
 
 def mechanics_of(plant: Plant, tree: Tree) -> forward.Mechanics:
@@ -136,17 +137,18 @@ def mechanics_of(plant: Plant, tree: Tree) -> forward.Mechanics:
         gravity=np.array(robot.gravity),
         index=_places([joint.idx_q for joint in robot.joints]),
         circling=np.array([joint.unbounded for joint in robot.joints], dtype=bool),
+        scale=np.array([joint.scale for joint in robot.joints]),
         springy=np.array((springs.stiffness != 0.0) | (springs.damping != 0.0), dtype=bool),
         rest=np.array(springs.rest),
         row=_places(np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1)),
-        held=_places([held.columns.start for held in actuation.held]),
+        held=_places([held.start for held in actuation.held]),
         triads=_places(triads(actuation)),
         origin=pin.SE3ToXYZQUAT(plant.state.origin),
-        drives=forward.Drives(*plant.drives),
+        faults=plant.faults,
     )
 
 
-def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
+def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> policies.Law:
     state, policy, asking = plant.state, plan.policy, plant
     shared = isinstance(policy, Allocation)
     if shared:
@@ -155,7 +157,7 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
     law = no_law(state, np.zeros(len(asking.actuation.names)))
     law = law._replace(path=_path(law.path, plan, policy, asking))
     if shared:
-        law = law._replace(sharing=_sharing(plant, asking, mechanics))
+        law = law._replace(allocation=_allocation(plant, asking, mechanics))
     if isinstance(policy, StateFeedback):
         K, offset, near = policy.terms(state)
         direct = law.filter._replace(D=-K.ravel(), u0=offset, y0=np.zeros(state.nx))
@@ -165,20 +167,20 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
     elif isinstance(policy, LinearController | TrajectoryOutputFeedback):
         law = _filtered(law, plan, policy, asking, mechanics.tree)
     elif isinstance(policy, TrajectoryFeedback):
-        law = law._replace(kind=laws.TRACK)
+        law = law._replace(kind=policies.TRACK)
     if isinstance(policy, StateFeedback | Gridded):
-        law = law._replace(kind=laws.LINEAR, measured=np.arange(state.nx))
+        law = law._replace(kind=policies.LINEAR, measured=np.arange(state.nx))
     size, slots = len(law.measured), SLOTS if noise_of(plan) else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 
-def no_law(state: StateMap, u: Array) -> laws.Law:
+def no_law(state: StateMap, u: Array) -> policies.Law:
     """Return the law that asks for nothing, and reads states and errors."""
-    law = empty(laws.LAW)
+    law = empty(policies.LAW)
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
     return law._replace(
-        kind=laws.NOTHING,
+        kind=policies.NOTHING,
         turned=np.array(state.axes),
         origin=pin.SE3ToXYZQUAT(state.origin),
         near=np.zeros(state.robot.n),
@@ -205,44 +207,51 @@ def noises(noise: Any, times: Times, size: int, step: int, last: int) -> tuple[A
     return at, rows
 
 
-def _between(law: laws.Law, policy: Gridded, state: StateMap) -> laws.Law:
+def _between(law: policies.Law, policy: Gridded, state: StateMap) -> policies.Law:
     axes, gains = policy.table()
     x0, joints = policy.lin.x0, state.robot.joint_names
     sizes = [len(values) for values in axes.values()]
-    grid = laws.Grid(
-        _places([joints.index(name) for name in axes]),
-        _places(np.cumsum([0, *sizes])),
-        np.concatenate(list(axes.values())),
-        _places([np.prod(sizes[axis + 1 :]) for axis in range(len(sizes))]),
-        gains.ravel(),
-        (policy.lin.u0 + gains @ x0).ravel(),
-        np.zeros(len(sizes)),
+    grid = policies.Grid(
+        joint=_places([joints.index(name) for name in axes]),
+        first=_places(np.cumsum([0, *sizes])),
+        values=np.concatenate(list(axes.values())),
+        stride=_places([np.prod(sizes[axis + 1 :]) for axis in range(len(sizes))]),
+        K=gains.ravel(),
+        offset=(policy.lin.u0 + gains @ x0).ravel(),
+        at=np.zeros(len(sizes)),
     )
     return law._replace(near=x0[state.groups.q_m].copy(), grid=grid)
 
 
-def _filtered(law: laws.Law, plan: Plan, policy: Any, asking: Plant, tree: Tree) -> laws.Law:
+def _filtered(
+    law: policies.Law, plan: Plan, policy: Any, asking: Plant, tree: Tree
+) -> policies.Law:
     state, joints, times = asking.state, asking.state.groups.q_m, plan.times
     loop, rows = policy.bind(asking.robot), 1
     if isinstance(policy, TrajectoryOutputFeedback):
         rows = min(len(policy.filter.A) + 2, -(-times.steps // times.sample))
     samples = [loop.sample(k * times.sample * times.dt) for k in range(rows)]
     nz, stages = len(samples[0][0].A), 1 if times.sample else 1 + len(plan.method.nodes)
-    compensator = (
-        np.concatenate([np.broadcast_to(getattr(by, key), shape).ravel() for by, *_ in samples])
+    first = samples[0][0]
+    compensator = {
+        key: np.concatenate(
+            [
+                np.broadcast_to(getattr(by, key), np.shape(getattr(first, key)) or nz).ravel()
+                for by, *_ in samples
+            ]
+        )
         for key in ("A", "B", "C", "D", "u0", "y0", "jump")
-        for shape in [np.shape(getattr(samples[0][0], key)) or nz]
-    )
+    }
     measured, gyros = measured_at(state)
     frames = [find_frame(asking.robot.model, gyro.frame) for gyro in gyros]
     turns = [tree.axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
-        kind=laws.LINEAR,
+        kind=policies.LINEAR,
         origin=np.concatenate([pin.SE3ToXYZQUAT(chart.origin) for _, chart, _ in samples]),
         near=np.concatenate([x[joints] for *_, x in samples]),
-        filter=laws.Filter._make((*compensator, np.zeros(nz), np.zeros(stages * nz))),
+        filter=policies.Filter(**compensator, z=np.zeros(nz), rates=np.zeros(stages * nz)),
         measured=_places(measured),
-        gyros=laws.Gyros(
+        gyros=policies.Gyros(
             _places([frame.joint - ROOT for frame in frames]),
             np.array([turn.ravel("F") for turn in turns]).ravel(),
         ),
@@ -250,35 +259,26 @@ def _filtered(law: laws.Law, plan: Plan, policy: Any, asking: Plant, tree: Tree)
     )
 
 
-def _sharing(plant: Plant, asking: Plant, giving: forward.Mechanics) -> sharing.Sharing:
+def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
     """Return how the commands of one robot's inputs are allocated to the other robot's inputs."""
     names, tree = plant.actuation.names, batch_tree(asking.robot)
     assert tree is not None
-    k, size, asks = len(names), plant.state.nx // 2, mechanics_of(asking, tree)
+    size, asks = plant.state.nx // 2, mechanics_of(asking, tree)
     limits = [limits_of(plant.robot).get(key, (-np.inf, np.inf)) for key in names]
     least, most = (np.array(each) for each in zip(*limits, strict=True))
-    given = empty(sharing.SHARING)
-    point = given.point._replace(
+    point = empty(forward.POINT)._replace(
         q=np.zeros(plant.robot.nq), pushing=np.zeros(len(asking.actuation.names))
     )
-    return given._replace(
+    return allocation.Allocation(
         asking=asks,
         giving=giving,
         point=point,
-        least=least,
-        most=most,
         work=np.zeros(max(asks.layout.size, giving.layout.size)),
-        columns=np.zeros((k + 1) * size),
-        Q=np.zeros(k * (size + k)),
-        R=np.zeros(k * k),
-        b=np.zeros(size + k),
-        wanted=np.zeros(size),
-        **{name: np.zeros(k) for name in ("x", "s", "low", "high")},
-        state=np.zeros(k, dtype=np.intp),
+        problem=allocation.least_squares(least, most, size),
     )
 
 
-def _path(path: tracking.Path, plan: Plan, policy: Any, asking: Plant) -> tracking.Path:
+def _path(path: policies.Path, plan: Plan, policy: Any, asking: Plant) -> policies.Path:
     state, count = asking.state, len(asking.actuation.names)
     if type(policy) is not TrajectoryFeedback:
         return path
@@ -286,8 +286,8 @@ def _path(path: tracking.Path, plan: Plan, policy: Any, asking: Plant) -> tracki
     way, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
     q, u = list(motion.q), list(motion.u)
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
-    held = _places([each.columns.start for each in motion.flow.held])
-    nx, gains = state.nx, schedule.passed
+    held = _places([each.start for each in motion.flow.held])
+    nx, gains = state.nx, schedule.interpolant
     pieces = (schedule.K if schedule.dt else gains.pieces).reshape(
         len(gains.starts), -1, count * nx
     )
@@ -320,49 +320,3 @@ def _path(path: tracking.Path, plan: Plan, policy: Any, asking: Plant) -> tracki
 
 def _places(indices: Any) -> Any:
     return np.array(indices, dtype=np.intp)
-
-
-def _channel(plan: Plan, plant: Plant) -> channel.Channel:
-    limits, times, names = plan.limits, plan.times, list(plant.state.names)
-    bounds, none = np.zeros((2, 0)), np.zeros(0)
-    w = limits.wheels or Wheels([], [], bounds, bounds, none, lambda *_: none)
-    first = plant.state.groups.omega_b.start
-    rows = [names.index(f"qdot_m.{name}") - first for name in w.names]
-    wheels = channel.Wheels(
-        at=w.at,
-        row=rows,
-        least_torque=w.torques[0],
-        most_torque=w.torques[1],
-        least_speed=w.limits[0],
-        most_speed=w.limits[1],
-        stiffness=w.stiffness,
-    )
-    fired = limits.pulses() if limits.pulses else Pulses([], limits.high, times.sample, times.dt)
-    nothing = np.zeros(len(fired.places))
-    pulses = channel.Pulses(
-        at=fired.places,
-        on_off=fired.on_off,
-        most=fired.most,
-        least=fired.least,
-        quantum=fired.quantum,
-        left=nothing,
-        level=nothing,
-        end=nothing,
-        time=fired.time,
-    )
-    held: Array = np.minimum(np.maximum(plan.initial, limits.low), limits.high)
-    # What would act after the end needs no place to wait in.
-    waiting = min(times.delay, times.steps)
-    slots = waiting // times.sample + 1 if times.sample else 1
-    return channel.Channel(
-        low=limits.low,
-        high=limits.high,
-        held=held,
-        pending=np.zeros(slots * len(held)),
-        slots=slots,
-        sample=times.sample,
-        delay=[float(times.delay)],
-        fresh=np.zeros(1),
-        wheels=wheels,
-        pulses=pulses,
-    )

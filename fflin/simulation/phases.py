@@ -12,8 +12,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.impact import Impact, joint_called
-from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import state_history
+from fflin.dynamics.state import StateMap, state_history
 from fflin.robot.robot import ROOT, Robot
 
 # Phases meet where no rate and no displacement differs by more.
@@ -121,5 +120,5 @@ def _inputs(whole: Any, state: StateMap, motion: Any, there: StateMap) -> Array:
     u[:, [whole.input_names.index(name) for name in motion.input_names]] = motion.u
     turn = there.reference.rotation.T @ state.reference.rotation
     for held in Actuation(state).held:  # in reference axes
-        u[:, held.columns] = u[:, held.columns] @ turn
+        u[:, held] = u[:, held] @ turn
     return u

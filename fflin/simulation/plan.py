@@ -13,21 +13,20 @@ from fflin.base.validation import Array, instance, truth, vector
 from fflin.control.channel import Channel, Law
 from fflin.control.linear_controller import growing
 from fflin.control.plants import notes_of
-from fflin.control.policies import axes_of, bound, feedback_of
+from fflin.control.policies import axes_of, bound, fed_back, feedback_of
 from fflin.control.saturation import Saturation, saturation, warn_beyond
 from fflin.control.tracking import (
     Reference,
     TrajectoryFeedback,
     followed,
     reference_of,
-    steered_by,
     tracking_of,
 )
 from fflin.dynamics import points
+from fflin.dynamics.inertia import rotor_names
 from fflin.dynamics.integrators import Integrator, integrator
 from fflin.dynamics.names import ORBITAL, refuse_orbit
 from fflin.dynamics.state import Frame, StateMap
-from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
 from fflin.robot.limits import chosen_limits
@@ -54,6 +53,7 @@ class Plan:
     law: Law | None  # nothing but `initial` acts where there is none
     initial: Array  # (nu,), what acts until the first command arrives
     limits: Saturation  # what acts of a command
+    wheels: list[int]  # where v has the speeds of the wheels whose speed is limited
     known: dict[str, Range]  # limits of states and inputs, whether they cut or not
     method: type[Integrator]
     project: bool  # whether momentum and centre of mass are kept, which they are in no orbit
@@ -84,7 +84,14 @@ class Plan:
         """Return the way of the law's commands to the inputs, with nothing on it yet."""
         if self.law is None:
             return None
-        return Channel(self.law, self.initial, self.limits, self.times.sample, self.times.delay)
+        return Channel(
+            self.law,
+            self.initial,
+            self.limits,
+            self.times.sample,
+            self.times.delay,
+            lambda t, q, v: v[self.wheels],
+        )
 
 
 def start_of(
@@ -160,32 +167,13 @@ def planned(
     every: int | None = None,
     progress: bool | None = None,
 ) -> tuple[Plan, Plant]:
-    """Return what `simulate` does of its arguments, checked, and the robot that moves."""
+    """Return the checked plan of `simulate` with these arguments, and the robot that moves."""
     policy = followed(policy, robot)
     times = times_of(policy, duration, dt, every, sample, delay)
     policy = followed(policy, robot, held=times.sample * times.dt)
     lin, _ = feedback_of(policy)
-    follows, along = reference_of(policy), tracking_of(policy)
-    own_frame, own_reference = axes_of(policy)
-    if lin is not None and (frame is not None or reference is not None):
-        raise InputError(
-            "frame or reference is given, but the policy's model fixes both; leave them out"
-        )
-    if along and frame not in (None, own_frame):
-        raise InputError(
-            f"frame is {frame!r}, expected '{own_frame}' along a trajectory, whose inputs are in "
-            "base axes; leave frame= out"
-        )
-    if along:
-        refuse_orbit(robot, "trajectories to follow")
-    if own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
-        made, flown = ("in orbit", "not ") if own_frame in ORBITAL else ("without an orbit", "")
-        raise InputError(
-            f"the policy was designed {made}, frame '{own_frame}', but '{robot.name}' is {flown}in "
-            "orbit; design it for the robot that is simulated"
-        )
-    axes = {"reference": own_reference if reference is None else reference}
-    state = StateMap(robot, **axes, frame=own_frame if frame is None else frame)
+    follows = reference_of(policy)
+    state = _state_of(robot, policy, frame, reference)
     plant = Plant(state, disturbance)
     foresees = predictor(plant, policy, linear)
     q, v = start_of(state, x0, q0, v0, follows)
@@ -193,38 +181,12 @@ def planned(
         plant.field.require_near(q)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
     acting, known = chosen_limits(robot, limits)
-    within = saturation(robot, acting, q, times.dt, times.sample)
+    within = saturation(robot, acting, q, times.dt, times.sample, pulsed=policy is not None)
     law = law_of(policy, plant, within, times)
-    signals, cut = (plant.actuation.names, plant.actuation.units), (within.low, within.high)
     follows = follows if target is None else None
     goal = target_of(state, lin if target is None else target)
-    initial = np.zeros(len(within.low))
-    # The model's inputs are others where they are allocated to the robot's.
-    if lin is not None and lin.input_names == plant.actuation.names:
-        initial = np.asarray(lin.u0)
-        warn_beyond(robot.name, "at its target", *signals, lin.u0[None], *cut)
-    elif along is policy is not None:
-        initial = along.reference(0.0)[2]
-        warn_beyond(robot.name, "on its trajectory", *signals, along.trajectory.u_base, *cut)
+    initial = _initial_inputs(policy, plant, within)
     near = state.read(*follows(0.0)[:2]) if follows else goal
-    if x0 is not None:
-        near = np.asarray(x0, dtype=float)
-    integrates = integrator(method)
-    if times.fastest * times.dt > integrates.reach:
-        raise InputError(
-            f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
-            f"{times.fastest:.4g} 1/s; take at most {integrates.reach / times.fastest:.2g} s, or "
-            "give `sample`"
-        )
-    called = tuple(instance("events", events, Sequence, "a list of functions event(t, q, v)"))
-    for each in called if callback is None else (*called, callback):
-        if not callable(each):
-            raise InputError(
-                f"{each!r} is not a function; events take (t, q, v), callbacks (t, q, v, u)"
-            )
-    # A rotor may spin as fast as it will: nothing depends on its angle.
-    rotors = rotor_names(robot)
-    joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]
     plan = Plan(
         q=q,
         v=v,
@@ -233,19 +195,98 @@ def planned(
         law=law,
         initial=initial,
         limits=within,
+        wheels=[robot.joint(name).idx_v for name in within.wheel_names],
         known=known,
-        method=integrates,
+        method=_integrator_of(method, times),
         project=truth("project", project) and robot.orbit is None,
-        turning=np.array([3, 4, 5, *(joint.idx_v for joint in joints)]),
+        turning=_turning(robot),
         chart=None if lin is None else state,
-        events=called,
+        events=_checked_functions(events, callback),
         callback=callback,
         progress=progress,
-        near=near,
+        near=near if x0 is None else np.asarray(x0, dtype=float),
         target=goal,
         reference=follows,
-        steered=steered_by(policy),
+        steered=fed_back(policy),
         notes=(*growing(policy), *notes_of(policy, robot), *times.notes),
         predictor=foresees,
     )
     return plan, plant
+
+
+def _state_of(
+    robot: Robot, policy: Any, frame: Frame | None, reference: pin.SE3 | None
+) -> StateMap:
+    """Return the state of a motion, in the frame and reference of its policy if these are known."""
+    lin, _ = feedback_of(policy)
+    own_frame, own_reference = axes_of(policy)
+    if lin is not None and (frame is not None or reference is not None):
+        raise InputError(
+            "frame or reference is given, but the policy's model fixes both; leave them out"
+        )
+    if tracking_of(policy):
+        if frame not in (None, own_frame):
+            raise InputError(
+                f"frame is {frame!r}, expected '{own_frame}' along a trajectory, whose inputs are "
+                "in base axes; leave frame= out"
+            )
+        refuse_orbit(robot, "trajectories to follow")
+    if own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
+        made, flown = ("in orbit", "not ") if own_frame in ORBITAL else ("without an orbit", "")
+        raise InputError(
+            f"the policy was designed {made}, frame '{own_frame}', but '{robot.name}' is {flown}in "
+            "orbit; design it for the robot that is simulated"
+        )
+    return StateMap(
+        robot,
+        reference=own_reference if reference is None else reference,
+        frame=own_frame if frame is None else frame,
+    )
+
+
+def _initial_inputs(policy: Any, plant: Plant, limits: Saturation) -> Array:
+    """Return the inputs (nu,) until the first command; warn if the policy's exceed the limits."""
+    robot, actuation, (lin, _) = plant.robot, plant.actuation, feedback_of(policy)
+    along = tracking_of(policy)
+    # The model's inputs are others where they are allocated to the robot's.
+    if lin is not None and lin.input_names == actuation.names:
+        where, inputs, initial = "at its target", lin.u0[None], np.asarray(lin.u0)
+    elif along is policy is not None:
+        where, inputs = "on its trajectory", along.trajectory.u_base
+        initial = along.reference(0.0)[2]
+    else:
+        return np.zeros(len(limits.low))
+    names, units = actuation.names, actuation.units
+    warn_beyond(robot.name, where, names, units, inputs, limits.low, limits.high)
+    return initial
+
+
+def _integrator_of(method: str, times: Times) -> type[Integrator]:
+    """Return a method, or raise `InputError` if the loop needs smaller steps than it has."""
+    integrates = integrator(method)
+    if times.fastest * times.dt > integrates.reach:
+        raise InputError(
+            f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
+            f"{times.fastest:.4g} 1/s; take at most {integrates.reach / times.fastest:.2g} s, or "
+            "give `sample`"
+        )
+    return integrates
+
+
+def _checked_functions(events: Sequence[Event], callback: Callback | None) -> tuple[Event, ...]:
+    """Return the events, or raise `InputError` if one of them or the callback is no function."""
+    called = tuple(instance("events", events, Sequence, "a list of functions event(t, q, v)"))
+    for each in called if callback is None else (*called, callback):
+        if not callable(each):
+            raise InputError(
+                f"{each!r} is not a function; events take (t, q, v), callbacks (t, q, v, u)"
+            )
+    return called
+
+
+def _turning(robot: Robot) -> Array:
+    """Return the velocities whose rotation within a step is bounded: all but those of rotors."""
+    # A rotor may spin as fast as it will: nothing depends on its angle.
+    rotors = rotor_names(robot)
+    joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]
+    return np.array([3, 4, 5, *(joint.idx_v for joint in joints)])

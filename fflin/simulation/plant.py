@@ -1,7 +1,7 @@
 """Accelerations of a simulated robot under its inputs and external forces."""
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +12,8 @@ from fflin.base.validation import Array, as_double
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.robot.massless import require_inertia
+from fflin.kernel.forward import ActuatorFaults, apply_faults
+from fflin.robot.model_checks import require_inertia
 
 # Returns of (t, q, v) a generalised force (nv,) in Pinocchio's order: on the base linear, then
 # angular, in base axes; then on the joints.
@@ -22,15 +23,6 @@ _aba = pin.aba
 # Velocity from which on a disturbance need not be finite: the motion is not.
 _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
-
-
-class Drives(NamedTuple):
-    """Actuator faults: a command u gives the input gain u + bias, and zero from `until` [s] on."""
-
-    gain: Array
-    bias: Array
-    until: Array
-    turn: Array  # (k, 9), the columns along which the three of each of `triads` act
 
 
 def triads(actuation: Actuation) -> list[int]:
@@ -43,7 +35,10 @@ class Plant:
     """The nonlinear robot under inputs in the axes of a state's frame, and a disturbance."""
 
     def __init__(
-        self, state: StateMap, disturbance: Disturbance | None = None, drives: Drives | None = None
+        self,
+        state: StateMap,
+        disturbance: Disturbance | None = None,
+        faults: ActuatorFaults | None = None,
     ) -> None:
         robot = state.robot
         require_inertia(robot)
@@ -57,9 +52,14 @@ class Plant:
         self.disturbance = disturbance
         self._model, self._data = robot.model, robot.create_data()
         nu = len(self.actuation.names)
-        straight = np.tile(np.eye(3).ravel(), len(triads(self.actuation)))
-        self.drives = drives or Drives(np.ones(nu), np.zeros(nu), np.full(nu, np.inf), straight)
-        self._faulty = drives is not None
+        self._triads = triads(self.actuation)
+        self.faults = faults or ActuatorFaults(
+            gain=np.ones(nu),
+            bias=np.zeros(nu),
+            until=np.full(nu, np.inf),
+            turn=np.tile(np.eye(3).ravel(), len(self._triads)),
+        )
+        self._faulty = faults is not None
         self._columns = np.column_stack(
             [state.lift(self.actuation.torques(unit)) for unit in np.eye(nu)]
         )
@@ -80,14 +80,13 @@ class Plant:
         In orbit the power [W] of all but the orbit and springs, and zeros, instead of the wrench.
         """
         if self._faulty:
-            gain, bias, until, turn = self.drives
-            u = np.where(t < until, gain * u + bias, 0.0)
-            for at, columns in zip(triads(self.actuation), turn.reshape(-1, 3, 3), strict=True):
-                u[at : at + 3] = u[at : at + 3] @ columns
+            given = np.empty(len(u))
+            apply_faults(self.faults, self._triads, t, u, given)
+            u = given
         if self.actuation.held:  # in reference axes: in base axes at any turn
             R, u = self.state.rotation(q), u.copy()
             for held in self.actuation.held:
-                u[held.columns] = u[held.columns].dot(R)
+                u[held] = u[held].dot(R)
         if self._plain and self.disturbance is None:
             tau = self._columns.dot(u)
             return _aba(self._model, self._data, q, v, tau), tau[:6]
@@ -105,7 +104,7 @@ class Plant:
 
     def isolated(self, *, driven: bool) -> bool:
         """Whether nothing pushes from outside, whatever the inputs are or where none acts."""
-        driven = driven or bool(self.drives.bias.any())
+        driven = driven or bool(self.faults.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         outside = self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
         return not (base or outside)

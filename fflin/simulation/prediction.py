@@ -12,8 +12,7 @@ from fflin.control.channel import Channel
 from fflin.control.linear_controller import Compensation, LinearController
 from fflin.control.policies import Allocation
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
-from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import moved_by, moving_errors
+from fflin.dynamics.state import StateMap, moved_by, moving_errors
 from fflin.linear.model import LinearModel
 from fflin.simulation.plant import Plant
 
@@ -124,13 +123,13 @@ def _states(predictor: Predictor, plan: Any, x: Array, steps: int) -> Array:
     dt, _, every, sample, delay, *_ = plan.times
     lin, limits = predictor.lin, plan.limits
     x0, u0 = lin.x0, lin.u0
-    finer = bool(limits.wheels or limits.pulses)  # than a sample
+    finer = len(limits.wheels.at) + len(limits.pulses.at) > 0  # than a sample
     if finer:
         lin = lin.generator or lin
-    if limits.wheels:
-        of = [lin.state_names.index(f"qdot_m.{name}") for name in limits.wheels.names]
-        limits = limits._replace(wheels=limits.wheels._replace(speeds=lambda e: (x0 + e)[of]))
-    channel = Channel(predictor.law(), plan.initial, limits, sample, delay)
+    of = [lin.state_names.index(f"qdot_m.{name}") for name in limits.wheel_names]
+    channel = Channel(
+        predictor.law(), plan.initial, limits, sample, delay, speeds=lambda e: (x0 + e)[of]
+    )
     rows = []
     e: Array = np.concatenate((x, np.zeros(len(x0) - len(x)))) - x0
     if lin.dt:
@@ -189,16 +188,12 @@ def _errors(policy: TrajectoryFeedback, plan: Any, e: Array, steps: int) -> Arra
             return policy.end.A, policy.end.B, policy.end.u0
         return (*models.matrices(min(start + t, end)), policy.reference(t)[2])
 
-    if limits.wheels:
-        names = limits.wheels.names
-        of = [models.state_names.index(f"qdot_m.{name}") for name in names]
-        of_v = [models.robot.joint(name).idx_v for name in names]
+    of = [models.state_names.index(f"qdot_m.{name}") for name in limits.wheel_names]
 
-        def speeds(t: float, e: Array) -> Array:
-            return policy.reference(t)[1][of_v] + e[of]
+    def speeds(t: float, e: Array) -> Array:
+        return policy.reference(t)[1][plan.wheels] + e[of]
 
-        limits = limits._replace(wheels=limits.wheels._replace(speeds=speeds))
-    channel = Channel(policy.law(), plan.initial, limits, sample, delay)
+    channel = Channel(policy.law(), plan.initial, limits, sample, delay, speeds)
     rows, after, ended, held = [], at(0.0), False, models.hold == "previous"
     for step in range(steps):
         t = step * dt

@@ -37,6 +37,13 @@ _OF_PHASES = (
 
 _TITLES = {"r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
 _PLACES = ("attitude", "position", "joints")
+# Errors of flexible appendages and liquids, which do not count as settling.
+_OF_MODES = {"q_m": ("modes", "slosh"), "qdot_m": ("mode rates", "slosh rates")}
+_ALL_OF_MODES = {title for titles in _OF_MODES.values() for title in titles}
+_MODAL = "kg^0.5 m"  # unit of the amplitudes of flexible appendages
+
+# The model is linear in a modal amplitude: beyond this rotation [deg] it is not accurate.
+_LINEAR = 5.0
 
 
 class Passed(NamedTuple):
@@ -167,12 +174,16 @@ def motion_report(motion: Any) -> str:
     if not (kinds or motion.target.size):
         rows = [["change from the start", "unit", "largest", "final"]]
         gone = [each.row(motion.t) for each in courses(replace(motion, target=motion.x[0]))]
-        rows += [[*each[:2], *each[3:5]] for each in gone if each[0] in _PLACES]
+        rows += [
+            [*each[:2], *each[3:5]] for each in gone if each[0] in (*_PLACES, *_OF_MODES["q_m"])
+        ]
         parts.append(f"\n{grid(rows, 'll')}\n")
     if kinds:
         settled = f"settles to {100.0 * SETTLED:g} % at [s]"
         rows = [["error", "unit", "initial", "largest", "final", settled]]
         parts.append(f"\n{grid([*rows, *(kind.row(motion.t) for kind in kinds)], 'll')}\n")
+    if motion.modes:
+        parts.append(_largest_modes(motion))
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
     said = [*(f"limit exceeded: {each}" for each in motion.passed), *map(str, motion.saturated)]
@@ -225,7 +236,7 @@ def _phases(motion: Any) -> list[list[str]]:
 
 
 def courses(motion: Any) -> list[Course]:
-    """Return the errors of each kind, none where there is no target; wheels are no joints."""
+    """Return the errors of each kind, none without a target; wheels and modes are no joints."""
     if motion.error is None or motion.attitude_error is None:
         return []
     steered = set(motion.steered or motion.state_names)
@@ -236,6 +247,8 @@ def courses(motion: Any) -> list[Course]:
         title = _TITLES.get(group, group)
         if group == "qdot_m" and entry in motion.wheels:
             title = "wheel speeds"
+        if group in _OF_MODES and entry in motion.modes:
+            title = _OF_MODES[group][not unit.startswith(_MODAL)]
         if group != "q_b" and not (group == "q_m" and entry in motion.wheels):
             columns.setdefault((title, unit), []).append(i)
     attitude = any(name.startswith("q_b.") for name in steered)
@@ -257,7 +270,9 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
-    judged = [kind for kind in places if kind.steered] or [k for k in kinds if k.steered]
+    judged = [kind for kind in places if kind.steered] or [
+        kind for kind in kinds if kind.steered and kind.title not in _ALL_OF_MODES
+    ]
     moved = [kind for kind in judged if kind.size.max() > THERE]
     if motion.tracked and not motion.phases:
         said = f"tracking error at the end: {_and([kind.last for kind in judged])}"
@@ -289,6 +304,29 @@ def _full(motion: Any) -> str:
 
 def _and(words: list[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+
+
+def _largest_modes(motion: Any) -> str:
+    """Return the largest amplitude of each mode, and the rotation that it stands for."""
+    rows = [["mode", "unit", "largest", "rotation [deg]", "at [s]"]]
+    far = []
+    for name, rotation in zip(motion.modes, motion.mode_rotations.tolist(), strict=True):
+        at = motion.state_names.index(f"q_m.{name}")
+        size, unit = np.abs(motion.x[:, at]), motion.state_units[at]
+        largest = float(size.max())
+        degrees = float(np.degrees(rotation * largest))
+        cells = ["." if value < _NOTHING else f"{value:.3g}" for value in (largest, degrees)]
+        rows.append([name, unit, *cells, f"{motion.t[size.argmax()]:.3g}"])
+        if degrees > _LINEAR and unit == _MODAL:
+            far.append(f"{name}\u00a0{degrees:.3g}\u00a0deg")
+    table = f"{grid(rows, 'll')}\n"
+    if not far:
+        return table
+    said = (
+        "warning: the model is linear in modal amplitudes, which here stand for more than "
+        f"{_LINEAR:g} deg: {_and(far)}; the motion is not accurate"
+    )
+    return f"{table}\n{folded([said])}"
 
 
 def _largest_inputs(motion: Any) -> str:

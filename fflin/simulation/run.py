@@ -7,11 +7,11 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.progress import Progress
+from fflin.base.process import Progress
 from fflin.base.validation import Array
 from fflin.control.channel import Channel
 from fflin.dynamics.points import LARGEST_SPEED
-from fflin.simulation.conservation import Conserved, Course
+from fflin.simulation.conservation import Conserved, MomentumReference
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import LARGEST_TURN
@@ -42,8 +42,8 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
     """Run a plan to its end; `plant` and `conserved` are of the robot that moves."""
     times, q, v = plan.times, plan.q, plan.v
     dt, slow, channel = times.dt, times.slow, plan.channel()
-    course = Course(conserved, plan.method, dt, q, v)
-    advance = _advance(plan, plant, conserved, course, channel)
+    reference = MomentumReference(conserved, plan.method, dt, q, v)
+    advance = _advance(plan, plant, conserved, reference, channel)
     t_of = np.empty(times.rows)
     rows = tuple(np.empty((times.rows, size)) for size in (len(q), len(v), len(plan.initial), 6, 3))
     count = 0
@@ -51,8 +51,9 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
     def record(t: float, u: Array) -> None:
         nonlocal count
         t_of[count] = t
-        for row, values in zip(rows, (q, v, u, course.momentum, course.center(t)), strict=True):
-            row[count] = values
+        values = q, v, u, reference.momentum, reference.center(t)
+        for row, value in zip(rows, values, strict=True):
+            row[count] = value
         count += 1
         if plan.callback is not None:
             plan.callback(t, q.copy(), v.copy(), u.copy())
@@ -68,7 +69,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
             q, v = advance(t, q, v, u)
             t = (step + 1) * dt
             if project:
-                conserved.impose(q, v, course.momentum, course.center(t))
+                conserved.impose(q, v, reference.momentum, reference.center(t))
             # The square is above that of any turn, and not finite where an entry is not.
             if watched or not float(v.dot(v)) < slow:
                 stopped = ending(t, q, v)
@@ -89,13 +90,17 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
 
 
 def _advance(
-    plan: Plan, plant: Plant, conserved: Conserved, course: Course, channel: Channel | None
+    plan: Plan,
+    plant: Plant,
+    conserved: Conserved,
+    reference: MomentumReference,
+    channel: Channel | None,
 ) -> Advance:
     """Return what takes one step."""
     take = plan.method(plant.robot.model, plan.times.dt).step
     ask = channel.ask if channel is not None and channel.continuous else None
     pushed = not plant.isolated(driven=channel is not None)
-    stage, wrench, wrenches = plant.stage, conserved.wrench, course.wrenches
+    stage, wrench, wrenches = plant.stage, conserved.wrench, reference.wrenches
     latest = plan.last_node * plan.times.dt
     follow, shares = plan.law and plan.law.advance, plan.method.shares(plan.times.dt)[1]
 
@@ -115,7 +120,7 @@ def _advance(
 
         end = take(f, t, q, v)
         if pushed:
-            course.advance()
+            reference.advance()
         return end
 
     return asked

@@ -12,12 +12,11 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.control.policies import Policy, StateFeedback
-from fflin.dynamics.state import Frame
-from fflin.dynamics.state_rows import state_history
+from fflin.dynamics.state import Frame, state_history
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.compiled import carried_out, engine_of
-from fflin.simulation.jacobi import conserved_by
+from fflin.simulation.conservation import conserved_by
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Event, Plan, planned
 from fflin.simulation.plant import Disturbance, Plant
@@ -135,8 +134,8 @@ def simulate(
         trajectory's state at each time. A policy without either has no target.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
     reference : pin.SE3, optional
-        Chart of x and axes of u. By default the chart and axes of the policy; without a policy,
-        frame "hybrid" ("lvlh" in orbit) and the identity.
+        Frame and reference placement of x and u. By default those of the policy. Without a policy,
+        the frame is "hybrid" ("lvlh" in orbit), and the reference is the identity.
     every : int, optional
         Number of steps from one recorded row to the next; by default 1. If this would give more
         than 100,000 rows, the default is increased to record about 10,000 rows, and the motion's
@@ -153,8 +152,8 @@ def simulate(
     -------
     Motion
         Simulated motion. If it ended early, ``stopped`` gives the reason: an event, an interrupt
-        (Ctrl-C), or a loop that left the chart or diverged. For such a loop, the step size is
-        given.
+        (Ctrl-C), or a loop that left the chart or diverged. If it diverged, the reason states the
+        step size.
 
     Raises
     ------
@@ -190,8 +189,25 @@ def simulate(
         return planned(
             robot,
             policy,
-            *(x0, q0, v0, duration, dt, method, project, sample, delay, limits, disturbance),
-            *(events, callback, linear, target, frame, reference, every, progress),
+            x0=x0,
+            q0=q0,
+            v0=v0,
+            duration=duration,
+            dt=dt,
+            method=method,
+            project=project,
+            sample=sample,
+            delay=delay,
+            limits=limits,
+            disturbance=disturbance,
+            events=events,
+            callback=callback,
+            linear=linear,
+            target=target,
+            frame=frame,
+            reference=reference,
+            every=every,
+            progress=progress,
         )
 
     plan, plant = prepared(dt, every)
@@ -259,6 +275,8 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         _robot=robot,
         wheels=tuple(robot.wheels),
         wheel_inertias=np.array(list(robot.wheels.values())),
+        modes=tuple(joint.name for joint in robot.modes),
+        mode_rotations=np.array([joint.rotation for joint in robot.modes]),
         steered=plan.steered,
         notes=(*plan.notes, *getattr(plan.law and plan.law.policy, "notes", ())),
         limit_names=tuple(plan.known),

@@ -102,7 +102,7 @@ def times_of(
         sample = _positive("sample", sample)
     else:
         by = decider(policy)
-        made = by if isinstance(by, LinearController) else getattr(policy, "lin", None)
+        made = by if hasattr(by, "dt") else getattr(policy, "lin", None)
         sample = getattr(follows.schedule if follows else made, "dt", None) or None
     fastest, mode = (0.0, "") if sample else _fastest_pole(policy, follows)
     if duration is None and follows is None:

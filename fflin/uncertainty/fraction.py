@@ -22,8 +22,8 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.robot.link_masses import Piece
-from fflin.uncertainty.parameters import AXES, ENTRIES, Parameter
+from fflin.robot.mass_properties import Piece
+from fflin.uncertainty.parameters import AXES, ENTRIES, OF_PIECES, Parameter
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 
@@ -73,7 +73,8 @@ class Block(NamedTuple):
 
 
 # An inertia's entry beside the diagonal, or a wheel's inertia, which its carrier loses.
-_REPEATS = {"mass": 3, "density": 6, "com": 4, "inertia": 2}
+# A mode's frequency is squared.
+_REPEATS = {"mass": 3, "density": 6, "com": 4, "inertia": 2, "frequency": 2}
 
 
 class Fraction(NamedTuple):
@@ -93,22 +94,22 @@ def fraction(
     """Return the form about a point at rest where nothing pulls."""
     form = _Form(state, actuation, q, ranges)
     of_pieces: dict[str, dict[str, int]] = {}
+    of_modes: dict[str, dict[str, int]] = {}
+    robot = state.robot
+    modes = {joint.name for joint in robot.modes if robot.stiffness.get(joint.name)}
     for at, each in enumerate(ranges):
         one = each.parameter
         if one.of in pieces and one.part in OF_PIECES:
             of_pieces.setdefault(one.of, {})[one.part] = at
+        elif one.of in modes and one.damper >= 0:
+            of_modes.setdefault(one.of, {})[one.part] = at
         else:
             form.add_alone(at)
     for name, parts in of_pieces.items():
         form.add_piece(pieces[name], parts)
+    for name, parts in of_modes.items():
+        form.add_mode(robot.joint_names.index(name), parts)
     return form.solved()
-
-
-OF_PIECES = {
-    *("mass", "density"),
-    *(f"com.{axis}" for axis in AXES),
-    *(f"inertia.{entry}" for entry in ENTRIES),
-}
 
 
 class _Form:
@@ -118,11 +119,11 @@ class _Form:
         self, state: StateMap, actuation: Actuation, q: Array, ranges: Sequence[Range]
     ) -> None:
         self.state, self.ranges, model = state, ranges, state.robot.model
-        still = q.copy()
-        still[:3] = 0.0
+        centred = q.copy()  # with the base at the origin
+        centred[:3] = 0.0
         self.data = state.robot.create_data()
-        columns = np.array(actuation.columns(self.data, still))
-        pin.computeJointJacobians(model, self.data, still)
+        columns = np.array(actuation.columns(self.data, centred))
+        pin.computeJointJacobians(model, self.data, centred)
         self.jacobians = {
             joint: state.columns(pin.getJointJacobian(model, self.data, joint, _LOCAL))
             for joint in range(1, model.njoints)
@@ -208,6 +209,27 @@ class _Form:
             L = vectors[:, most]
             a = self.unit[: self.sizes[0]]
             self.force += L @ self.times(at, (values[most, None] * L.T) @ a)
+
+    def add_mode(self, index: int, parts: Mapping[str, int]) -> None:
+        """Put omega I (omega x + 2 zeta x') in place of the force of a mode."""
+        joint, springs = self.state.robot.joints[index], self.state.robot.springs
+        K, D = springs.stiffness[index], springs.damping[index]
+        omega, ratio = joint.oscillation(K, D)
+        x = np.split(self.unit, self.ends[:-1])[1]
+        position, rate = x[[6 + index]], x[[self.state.groups.qdot_m.start + index]]
+        turns = 2.0 * np.pi
+
+        def by_frequency(signal: Array) -> Array:
+            found = omega * signal
+            if "frequency" in parts:
+                found = found + turns * self.times(parts["frequency"], signal)
+            return found
+
+        damped = ratio * rate
+        if "damping" in parts:
+            damped = damped + self.times(parts["damping"], rate)
+        force = joint.inertia * by_frequency(by_frequency(position) + 2.0 * damped)
+        self.force[6 + index] += (force - K * position - D * rate)[0]
 
     def solved(self) -> Fraction:
         """Solve the equation of motion for a, and put it into z."""

@@ -88,7 +88,7 @@ class LFT(Design):
     def __str__(self) -> str:
         rows = [("parameter", "unit", "least", "largest", "repeated")]
         for name, unit, middle, half, repeats in zip(
-            *(self.parameters, self.units, self.middle, self.half, self.repeats), strict=True
+            self.parameters, self.units, self.middle, self.half, self.repeats, strict=True
         ):
             ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
             rows.append((name, "." if unit == "1" else unit, *ends, f"{repeats:g}"))

@@ -1,25 +1,35 @@
-"""Named parameters of a robot, and the change of the robot per unit of each."""
+"""Named parameters of a robot, what a unit of each changes, and robots with other values."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.names import matching
+from fflin.base.errors import InputError
+from fflin.base.names import matching, stands_for_any
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.robot.frames import find_frame
 from fflin.robot.inputs import ReactionWheel, Thruster, named_inputs
-from fflin.robot.link_masses import Piece, pieces_of
+from fflin.robot.joints import ROOT, Joint, find_frame
+from fflin.robot.mass_properties import Piece, as_inertia
 from fflin.robot.robot import Robot
 from fflin.robot.wheels import carrier
 
 AXES = "xyz"
 # (row, column) of the six entries of an inertia.
 ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", "xy", "xz", "yz")}
+# The parameters of a link or body.
+OF_PIECES = {
+    *("mass", "density"),
+    *(f"com.{axis}" for axis in AXES),
+    *(f"inertia.{entry}" for entry in ENTRIES),
+}
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -32,8 +42,10 @@ class Parameter:
     value: float
     # {Pinocchio joint: change (10,)} of bodies: m, m c, and I xx, xy, yy, xz, yz, zz at the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
-    spring: int = -1  # the joint whose stiffness or damping it is, in state order
+    spring: int = -1  # the joint whose stiffness or damping it changes, in state order
     damper: int = -1
+    by_stiffness: float = 1.0  # change of this stiffness, and of this damping, by a unit of it
+    by_damping: float = 1.0
     # (Pinocchio joint, input, change (6,) of the wrench of a unit of it in the joint's frame)
     wrench: tuple[int, int, Array] | None = None
 
@@ -47,20 +59,20 @@ class Parameters(dict[str, Parameter]):
     """Parameters of a robot by name; a body of one link can also be named by its joint."""
 
     def __init__(self, robot: Robot) -> None:
-        pieces, self._also = pieces_of(robot)
-        linked = {each.joint for each in pieces.values() if not each.whole}
-        self._sums = {of for of, each in pieces.items() if each.whole and each.joint in linked}
+        pieces, self._link_of = robot.pieces, robot.link_of
+        self._sums = _sums(pieces)
         of_pieces = (each for name, piece in pieces.items() for each in _of_piece(name, piece))
         found = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
         super().__init__((each.name, each) for each in found)
 
     def find(self, key: str) -> list[str]:
-        """Return the names that a name or pattern stands for."""
-        bodies = [body for body in self._also if str(key).startswith(f"{body}.")]
+        """Return the names that a name or pattern stands for; a pattern, of links before bodies."""
+        bodies = [body for body in self._link_of if str(key).startswith(f"{body}.")]
         if key not in self and bodies:
             body = max(bodies, key=len)
-            key = self._also[body] + key[len(body) :]
-        names = list(self)
+            key = self._link_of[body] + key[len(body) :]
+        names = [name for name in self if key == name or self[name].of not in self._sums]
+        names = names if stands_for_any(key, names) else list(self)
         return [names[i] for i in matching("parameter", key, names)]
 
     def ranked(self, only: str | None) -> list[str]:
@@ -68,6 +80,23 @@ class Parameters(dict[str, Parameter]):
         found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
         found = found or self.find(str(only))
         return [name for name in found if self[name].of not in self._sums] or found
+
+
+def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
+    """Return the links and bodies that a name or pattern stands for, by their names in `pieces`."""
+    pieces, link_of = robot.pieces, robot.link_of
+    if key in pieces or key in link_of:
+        return [key if key in pieces else link_of[key]]
+    sums = _sums(pieces)
+    names = [*(name for name in pieces if name not in sums), *link_of]
+    found = [names[i] for i in matching(kind, key, names)]
+    return list(dict.fromkeys(link_of.get(name, name) for name in found))
+
+
+def _sums(pieces: Mapping[str, Piece]) -> set[str]:
+    """Return the bodies that consist of several links, which are pieces themselves."""
+    linked = {each.joint for each in pieces.values() if not each.whole}
+    return {name for name, each in pieces.items() if each.whole and each.joint in linked}
 
 
 def moments(mass: float, first: Array, inertia: Array) -> Array:
@@ -100,11 +129,35 @@ def _of_piece(name: str, piece: Piece) -> Iterator[Parameter]:
 
 def _of_joints(robot: Robot) -> Iterator[Parameter]:
     for index, joint in enumerate(robot.joints):
-        per = "m" if joint.prismatic else "rad"
-        force = "N" if joint.prismatic else "N m"
         stiffness, damping, _ = (each[index].item() for each in robot.springs)
-        yield Parameter(joint.name, "stiffness", f"{force}/{per}", stiffness, spring=index)
-        yield Parameter(joint.name, "damping", f"{force} s/{per}", damping, damper=index)
+        if joint.mode and stiffness:
+            yield from _of_mode(joint, index, stiffness, damping)
+            continue
+        per = f"/({joint.unit})" if " " in joint.unit else f"/{joint.unit}"
+        force = joint.force_unit
+        yield Parameter(joint.name, "stiffness", f"{force}{per}", stiffness, spring=index)
+        yield Parameter(joint.name, "damping", f"{force} s{per}", damping, damper=index)
+
+
+def _of_mode(joint: Joint, index: int, stiffness: float, damping: float) -> Iterator[Parameter]:
+    r"""Give frequency and damping ratio of a mode with the inertia I, whose link stands still.
+
+    The stiffness is :math:`I \omega^2` and the damping :math:`2 \zeta I \omega`.
+    """
+    omega, ratio = joint.oscillation(stiffness, damping)
+    turns = 2.0 * math.pi
+    yield Parameter(
+        joint.name,
+        "frequency",
+        "Hz",
+        omega / turns,
+        spring=index,
+        damper=index,
+        by_stiffness=2.0 * joint.inertia * omega * turns,
+        by_damping=2.0 * ratio * joint.inertia * turns,
+    )
+    by_damping = 2.0 * joint.inertia * omega
+    yield Parameter(joint.name, "damping", "1", ratio, damper=index, by_damping=by_damping)
 
 
 def _of_inputs(robot: Robot) -> Iterator[Parameter]:
@@ -137,3 +190,127 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
                 joint: moments(0.0, np.zeros(3), -np.outer(axis, axis)),
             }
             yield Parameter(names[0], "inertia", "kg m^2", float(item.inertia), bodies)
+
+
+class Variants:
+    """Variants of a robot with changed parameters."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot, self.parameters = robot, Parameters(robot)
+        self.pieces = robot.pieces
+
+    def refusal(self, values: Mapping[str, float]) -> str:
+        """Return why {parameter: value} are not physically realisable, or an empty string."""
+        try:
+            changed = self._changed(values)
+            if self._robot.wheels or self._robot.modes:  # for which a carrier may be too light
+                self._with(changed, values)
+        except InputError as error:
+            return str(error)
+        return ""
+
+    def robot(self, values: Mapping[str, float]) -> Robot:
+        """Return the robot of {parameter: value}, or raise `InputError`."""
+        return self._with(self._changed(values), values)
+
+    def _parts(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        found: dict[str, dict[str, float]] = {}
+        for name, value in values.items():
+            one = self.parameters[name]
+            found.setdefault(one.of, {})[one.part] = value
+        return found
+
+    def _changed(self, values: Mapping[str, float]) -> dict[str, tuple[Piece, float]]:
+        """Return the links that are others, each with its density."""
+        found = {}
+        for name, parts in self._parts(values).items():
+            own = {part: value for part, value in parts.items() if part in OF_PIECES}
+            if name in self.pieces and own:
+                changed, density = found[name] = _piece(self.pieces[name], own)
+                why = _no_body(self.pieces[name], changed, name)
+                if not density > 0.0:
+                    why = f"the density of '{name}' has the factor {density:.4g}, expected above 0"
+                if why:
+                    raise InputError(why)
+        return found
+
+    def _with(
+        self, changed: Mapping[str, tuple[Piece, float]], values: Mapping[str, float]
+    ) -> Robot:
+        robot, bodies, parts = self._robot, dict[int, Array](), self._parts(values)
+        bare = robot._bare.model
+        for name, (piece, density) in changed.items():
+            at = ROOT
+            if piece.joint > ROOT:
+                at = bare.getJointId(robot.model.names[piece.joint])
+            now = as_inertia(self.pieces[name]).toDynamicParameters()
+            change = density * as_inertia(piece).toDynamicParameters() - now
+            bodies[at] = bodies.get(at, bare.inertias[at].toDynamicParameters()) + change
+        if bodies:
+            changed_bodies = pin.Inertia.FromDynamicParameters
+            robot = robot.with_bodies({at: changed_bodies(x) for at, x in bodies.items()})
+        fields: dict[str, Any] = {}
+        springs = {
+            joint.name: _spring(joint, parts[joint.name], self._robot)
+            for joint in robot.joints
+            if joint.name in parts
+        }
+        for part in ("stiffness", "damping"):
+            given = {name: own[part] for name, own in springs.items() if part in own}
+            if given:
+                fields[part] = {**getattr(robot, part), **given}
+        named = named_inputs(robot.inputs)
+        inputs = [_input(item, parts.get(names[0], {})) for item, names in named]
+        if any(one is not two for one, two in zip(inputs, robot.inputs, strict=True)):
+            fields["inputs"] = inputs
+        return robot.replace(**fields) if fields else robot
+
+
+def _spring(joint: Joint, parts: Mapping[str, float], robot: Robot) -> dict[str, float]:
+    """Return the stiffness and damping of a joint that are changed by {part: value}."""
+    stiffness = robot.stiffness.get(joint.name, 0.0)
+    if not (joint.mode and stiffness):
+        return {part: x for part, x in parts.items() if part in ("stiffness", "damping")}
+    omega, ratio = joint.oscillation(stiffness, robot.damping.get(joint.name, 0.0))
+    omega = 2.0 * math.pi * parts["frequency"] if "frequency" in parts else omega
+    inertia, ratio = joint.inertia, parts.get("damping", ratio)
+    return {"stiffness": inertia * omega**2, "damping": 2.0 * ratio * inertia * omega}
+
+
+def _piece(piece: Piece, parts: Mapping[str, float]) -> tuple[Piece, float]:
+    """Return a link with other parameters, and its density."""
+    own, inertia = np.array(piece.frame.actInv(piece.placement.translation)), piece.inertia.copy()
+    for at, axis in enumerate(AXES):
+        own[at] = parts.get(f"com.{axis}", own[at])
+    for entry, (i, j) in ENTRIES.items():
+        inertia[i, j] = inertia[j, i] = parts.get(f"inertia.{entry}", inertia[i, j])
+    placement = pin.SE3(piece.placement.rotation, piece.frame.act(own))
+    changed = piece._replace(
+        placement=placement, mass=parts.get("mass", piece.mass), inertia=inertia
+    )
+    return changed, parts.get("density", 1.0)
+
+
+def _no_body(before: Piece, piece: Piece, name: str) -> str:
+    """Return why a link is not a rigid body; nothing if it is, or is no less than it was."""
+    if not piece.mass > 0.0:
+        return f"the mass of '{name}' is {piece.mass:.4g} kg, expected above 0"
+    if (piece.inertia == before.inertia).all():  # a point mass has none
+        return ""
+    was, least = (
+        float(np.linalg.eigvalsh(0.5 * np.trace(J) * np.eye(3) - J)[0] / (np.trace(J) or 1.0))
+        for J in (before.inertia, piece.inertia)
+    )
+    if np.trace(piece.inertia) > 0.0 and least >= min(-_ROUNDING, was - _ROUNDING):
+        return ""
+    return f"the inertia of '{name}' is not physically realisable"
+
+
+def _input(item: Any, parts: Mapping[str, float]) -> Any:
+    """Return a thruster that sits elsewhere or a wheel of another inertia, or the same."""
+    if "inertia" in parts:
+        return replace(item, inertia=parts["inertia"])
+    if not isinstance(item, Thruster):
+        return item
+    position = [parts.get(f"position.{a}", x) for a, x in zip(AXES, item.position, strict=True)]
+    return replace(item, position=position)

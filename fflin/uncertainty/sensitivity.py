@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.frozen import FrozenArrays
 from fflin.base.record import write_record
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array, as_double, numbers, whole
+from fflin.base.validation import Array, FrozenArrays, as_double, numbers, whole
 from fflin.base.writing import as_path
 from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel
-from fflin.uncertainty.model_slopes import ModelSlopes, difference
+from fflin.uncertainty.derivatives import ModelSlopes, difference
 from fflin.uncertainty.parameters import Parameter, Parameters
 
 # Poles closer than this, relative to the largest, have no derivative of their own.
@@ -69,8 +68,12 @@ class Sensitivity:
       mass;
     - ``LINK.inertia.xx`` .. ``.yz`` [kg m^2] about the centre of mass, in the axes of the URDF's
       <inertial>; for a body, in the axes of its joint;
-    - ``LINK.density``, a relative factor on mass and inertia. In `monte_carlo`, ``BODY.mass`` has
-      this meaning.
+    - ``LINK.density``, a relative factor on mass and inertia.
+
+    A pattern stands for links, and for bodies only where it matches no link.
+
+    Modes of flexible appendages and slosh have ``MODE.frequency`` [Hz] and ``MODE.damping``, the
+    damping ratio, both with the link clamped; the damping ratio stays when the frequency changes.
 
     Other parameters are ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
     ``THRUSTER.direction.x`` (a change of its length has no effect) and ``WHEEL.inertia``. The

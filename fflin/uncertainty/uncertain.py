@@ -14,15 +14,13 @@ from fflin.base.tables import grid
 from fflin.base.validation import Array, number, numbers, untied, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
-from fflin.linear.linearization import linearize
-from fflin.linear.prepared import prepare
-from fflin.robot.link_masses import Piece
+from fflin.linear.linearization import linearize, prepare
+from fflin.robot.mass_properties import Piece
 from fflin.robot.robot import Robot
+from fflin.uncertainty.derivatives import WEIGH
 from fflin.uncertainty.fraction import Block, Range, fraction
 from fflin.uncertainty.lft import LFT
-from fflin.uncertainty.model_slopes import WEIGH
-from fflin.uncertainty.parameters import Parameter
-from fflin.uncertainty.variants import Variants
+from fflin.uncertainty.parameters import Parameter, Variants
 from fflin.uncertainty.worst import Worst, searched
 
 # Draws for one that makes a robot, before it is said that hardly any does.
@@ -102,9 +100,9 @@ class Uncertain:
             pulls = "gravity" if any(robot.gravity) else "a spring that is not at its rest position"
             pulls = "an orbit" if robot.orbit else pulls
             raise InputError(
-                "the point is not a fixed point for all values of the parameters: there is "
-                f"{'stored momentum' if robot.stored_momentum else pulls}; give a robot at rest "
-                "without it, or linearise each robot of samples(n)"
+                f"there is {'stored momentum' if robot.stored_momentum else pulls}, with which the "
+                "point is an equilibrium only for some values of the parameters; give a robot "
+                "without it that is at rest, or linearise each robot of samples(n)"
             )
         return _lft(self, lin)
 
@@ -230,8 +228,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     ----------
     robot : Robot
     ranges : mapping
-        {parameter or pattern: range}, with the parameters of `sensitivity`. The ``BODY.mass`` of
-        `monte_carlo` is called ``BODY.density`` here. A range is one of
+        {parameter or pattern: range}, with the parameters of `sensitivity`. A range is one of
 
         - a number: the relative half width, such as 0.2 for 20 %;
         - a pair: the least and the largest value;
@@ -255,7 +252,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
 
         - a range is empty, or relative to a nominal value of 0;
         - the robot at the middle of the ranges is not physically realisable;
-        - a mass, density or wheel inertia may become 0 or less;
+        - a mass, density, wheel inertia or frequency may become 0 or less;
         - a stiffness or damping may become negative;
         - a tied parameter is given a second range.
 
@@ -330,7 +327,8 @@ def _range(one: Parameter, value: Any) -> Range:
     expected = "" if least < largest else "least < largest"
     if least < 0.0 and one.part in ("stiffness", "damping"):
         expected = "values of 0 or more"
-    if least <= 0.0 and one.part in ("mass", "density", "inertia"):  # the last is a wheel's
+    # The inertia is a wheel's.
+    if least <= 0.0 and one.part in ("mass", "density", "inertia", "frequency"):
         expected = "values above 0"
     if expected:
         raise InputError(

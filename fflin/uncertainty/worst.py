@@ -11,9 +11,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.progress import Progress
+from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
-from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array, as_double
 from fflin.control.margins import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT

@@ -15,10 +15,16 @@ from fflin.control.tracking import Reference, followed, reference_of
 from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.view.motion_page import corner_points, rounded, stage_info, subtitle, triads
-from fflin.view.page import build_page
+from fflin.view.page import (
+    Recorder,
+    build_page,
+    corner_points,
+    rounded,
+    stage_info,
+    subtitle,
+    triads,
+)
 from fflin.view.playback import body_poses
-from fflin.view.recorder import Recorder
 from fflin.view.scene import Drawing, Visualizer, body_paths
 from fflin.view.server import Server
 

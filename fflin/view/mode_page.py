@@ -7,16 +7,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.analysis.modal_energy import energy_by_body
+from fflin.analysis.modes import energy_by_body
 from fflin.base.errors import InputError
 from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.view.motion_page import corner_points, rounded, stage_info, subtitle, triads
-from fflin.view.page import build_page, packed
+from fflin.view.page import (
+    Recorder,
+    build_page,
+    corner_points,
+    packed,
+    rounded,
+    stage_info,
+    subtitle,
+    triads,
+)
 from fflin.view.playback import body_poses
-from fflin.view.recorder import Recorder
 from fflin.view.scene import Drawing, Visualizer, body_paths
 
 if TYPE_CHECKING:

@@ -2,37 +2,47 @@
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.impact import Impact
-from fflin.dynamics.names import frame_of
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
-from fflin.robot.frames import find_frame
+from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
-from fflin.view.page import build_page, packed
+from fflin.view.overlays import cloud_of, tubes
+from fflin.view.page import (
+    Recorder,
+    build_page,
+    corner_points,
+    packed,
+    rounded,
+    stage_info,
+    subtitle,
+    triads,
+)
 from fflin.view.panel import panel
-from fflin.view.phases import payloads
-from fflin.view.playback import Playback, body_poses, frame_indices, play_back, thrusters
-from fflin.view.recorder import Recorder
+from fflin.view.playback import (
+    Playback,
+    body_poses,
+    frame_indices,
+    payloads,
+    play_back,
+    thrusters,
+)
 from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
-from fflin.view.tube import tubes
 
 if TYPE_CHECKING:
     from fflin.campaign.campaign import Campaign
-    from fflin.campaign.reach import Funnel
+    from fflin.campaign.funnel import Funnel
     from fflin.dynamics.state import Frame
     from fflin.simulation.motion import Motion
 
-# Where one looks from, and where the sun stands, in world axes.
-VIEWS = {"space": (1.0, -0.62, 0.50), "lab": (1.0, -0.62, 0.36)}
-SUN = (0.62, -0.78, 0.62)
+# A drawn robot with its poses (N, njoints - 1, 7).
+Moving: TypeAlias = "tuple[Drawing, Array]"
 
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
@@ -57,38 +67,29 @@ def motion_page(
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and what could not be drawn; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
-    t, q, u = motion.t[shown], motion.q[shown], motion.u[shown]
-    state = chart_of(robot, motion)
-    film = play_back(robot, state, t, q, u, tool)
+    t, state = motion.t[shown], chart_of(robot, motion)
+    film = play_back(robot, state, t, motion.q[shown], motion.u[shown], tool)
+    goal = _target(motion, state, shown) if target is None else target[None]
+    data = robot.model.createData()
+    # One pose if the target is fixed, or one for each frame.
+    goals = np.array([body_poses(robot, data, each) for each in goal])
 
     window, sent = Recorder(), set[str]()
     scenery = Visualizer(window=window)
     drawing = Drawing(robot, scenery["robot"], sent=sent)
-    moving = [(drawing, film.poses)]
-    data = robot.model.createData()
-    goal = _target(motion, state, shown) if target is None else target[None]
-    # One pose where it stands still, or one a frame.
-    goals = np.array([body_poses(robot, data, each) for each in goal])
-    if len(goal):
-        ghost = Drawing(robot, scenery["target"], "ghost", sent)
-        ghost.place(goals[0])
-        moving += [(ghost, goals)] if len(goal) > 1 else []
-    if motion.linear is not None:
-        predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
-        poses = np.array([body_poses(robot, data, each) for each in predicted])
-        moving.append((Drawing(robot, scenery["linear"], "linear", sent), poses))
-    held = list(payloads(motion, shown))
-    for caught, poses in held:
-        moving.append(
-            (Drawing(caught.payload, scenery["held"][caught.prefix], "held", sent), poses)
-        )
+    ghosts = _ghosts(scenery, motion, state, shown, goals, sent)
+    held = {
+        caught.prefix: (Drawing(caught.payload, scenery["held"][caught.prefix], "held", sent), at)
+        for caught, at in payloads(motion, shown)
+    }
+    moving = [(drawing, film.poses), *ghosts, *held.values()]
     clips = []
     for each, poses in moving:
         each.place(poses[0])
         clips += each.tracks(t - t[0], poses)
     window.send(Animation(clips))
 
-    # Of each phase, as far as it is known, the robot that then flies.
+    # The robot of each phase, if it is known: a captured payload is a part of it.
     flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
     flown = flown or [robot] * max(1, len(motion.phases))
     names = [each.name.replace("+", " + ") for each in flown]
@@ -96,43 +97,78 @@ def motion_page(
     info = stage_info(
         robot, drawing, film.poses[0], scene=scene, subtitle=about[0], frame=motion.frame
     )
-    shown_points = frame_points(drawing, film, info["size"])
-    for each, rows in ((drawing, goals), *moving[len(moving) - len(held) :]):
-        for poses in rows[:: max(1, len(rows) // 24)]:
-            shown_points = np.concatenate((shown_points, corner_points(each, poses)))
-    # How far the ghost is beside the robot at most: what coincides with it is not seen.
-    step, beside = max(1, len(t) // 24), 0.0
-    for pose, at in zip(film.poses[::step], [*goals[::step]] * len(t), strict=False):
-        apart = corner_points(drawing, pose) - corner_points(drawing, at)
-        beside = max(beside, float(np.abs(apart).max()))
-    info["floor"][2] = float(shown_points[:, 2].min())
+    size = info["size"]
+    points = _points(film, size, (drawing, goals), held.values())
+    info["floor"][2] = float(points[:, 2].min())
     if follow is None:
-        # All of a long way at once, and nothing is to be seen of the robot.
-        follow = bool(np.ptp(shown_points, axis=0).max() > _FAR * info["size"])
+        # With all of a long path in view, the robot would be a dot.
+        follow = bool(np.ptp(points, axis=0).max() > _FAR * size)
     if follow:
-        shown_points = frame_points(drawing, film, info["size"], follow=True)
+        points = frame_points(drawing, film, size, follow=True)
     info |= panel(robot, motion, shown, goal)
-    info |= marks(robot, film, tool, info["size"], goals[:1] if motion.phases else goals)
+    info |= marks(robot, film, tool, size, goals[:1] if motion.phases else goals)
     if cloud is not None:
-        from fflin.view.cloud import cloud_of
-
         info["cloud"] = cloud_of(robot, cloud, tool)
     colors = (TOOL_COLOR, COM_COLOR)
     info |= {
-        "tubes": tubes(robot, funnel, tool, info["size"], colors) if funnel is not None else [],
+        "tubes": tubes(robot, funnel, tool, size, colors) if funnel is not None else [],
         "mode": "motion",
         "t": packed(t),
         "speed": speed,
         "follow": follow,
-        "points": rounded(shown_points, info["size"]),
-        "target": beside > 0.02 * info["size"],
+        "points": rounded(points, size),
+        "target": _distance(drawing, film.poses, goals) > 0.02 * size,
         "linear": motion.linear is not None,
         "phases": [*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
-        "held": [caught.prefix for caught, _ in held],
+        "held": list(held),
     }
-    told = (each.notes for each, _ in moving if each is drawing or each.robot.urdf)
-    notes = dict.fromkeys(note for notes in told for note in notes)
+    drawn = [drawing, *(each for each, _ in moving[1:] if each.robot.urdf)]
+    notes = dict.fromkeys(note for each in drawn for note in each.notes)
     return build_page(info, window.commands()), tuple(notes)
+
+
+def _ghosts(
+    scenery: Visualizer,
+    motion: Motion,
+    state: StateMap,
+    shown: Array,
+    goals: Array,
+    sent: set[str],
+) -> list[Moving]:
+    """Draw the robot at the target and at the linear prediction; return those that move."""
+    robot, moving = state.robot, list[Moving]()
+    if len(goals):
+        ghost = Drawing(robot, scenery["target"], "ghost", sent)
+        ghost.place(goals[0])
+        moving += [(ghost, goals)] if len(goals) > 1 else []
+    if motion.linear is not None:
+        data = robot.model.createData()
+        predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
+        poses = np.array([body_poses(robot, data, each) for each in predicted])
+        moving.append((Drawing(robot, scenery["linear"], "linear", sent), poses))
+    return moving
+
+
+def _points(film: Playback, size: float, goal: Moving, held: Iterable[Moving]) -> Array:
+    """Return corners (M, 3) of the robot, its target and its payloads at some frames."""
+    points = [frame_points(goal[0], film, size)]
+    for drawing, rows in (goal, *held):
+        points += [corner_points(drawing, poses) for poses in rows[:: _step(rows)]]
+    return np.concatenate(points)
+
+
+def _distance(drawing: Drawing, poses: Array, goals: Array) -> float:
+    """Return how far the target is from the robot at most [m], along any axis and at any time."""
+    step, largest = _step(poses), 0.0
+    for pose, goal in zip(poses[::step], [*goals[::step]] * len(poses), strict=False):
+        apart = corner_points(drawing, pose) - corner_points(drawing, goal)
+        largest = max(largest, float(np.abs(apart).max()))
+    return largest
+
+
+def _step(rows: Array) -> int:
+    """Return the step with which about 24 of the rows are chosen."""
+    return max(1, len(rows) // 24)
 
 
 def chart_of(robot: Robot, motion: Motion) -> StateMap:
@@ -147,14 +183,6 @@ def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
     return np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, state.robot.nq)
 
 
-def subtitle(robot: Robot) -> str:
-    """Return what the page says of a robot below its name."""
-    wheels = len(robot.wheels)
-    parts = [counted(robot.n - wheels, "joint"), *[counted(wheels, "wheel")] * bool(wheels)]
-    orbit = [f"{robot.orbit.altitude / 1e3:.6g} km over {robot.orbit.body}"] if robot.orbit else []
-    return ", ".join([*parts, f"{robot.mass:.4g} kg", *orbit])
-
-
 def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool = False) -> Array:
     """Return corners of all that moves and tips of forces (M, 3) at some frames, for a camera."""
     chosen = np.unique(np.linspace(0, len(film.t) - 1, 24).astype(int))
@@ -166,80 +194,6 @@ def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool 
         shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)
         points.append(np.vstack((corner_points(drawing, film.poses[index]), tip)) - shift)
     return np.concatenate(points)
-
-
-def rounded(points: Array, size: float) -> list[list[float]]:
-    """Return points (M, 3) as they are sent: as exact as a robot of that size needs."""
-    digits = max(4, 4 - math.floor(math.log10(size)))
-    found: list[list[float]] = points.round(digits).tolist()
-    return found
-
-
-def corner_points(drawing: Drawing, poses: Array) -> Array:
-    """Return the corners (M, 3) of all bodies' bounding boxes in the world."""
-    return np.concatenate(
-        [
-            np.array([placement.act(corner) for corner in corners])
-            for joint, corners in zip(drawing.bodies, drawing.corners, strict=True)
-            for placement in [pin.XYZQUATToSE3(poses[joint - ROOT])]
-        ]
-    )
-
-
-def stage_info(
-    robot: Robot,
-    drawing: Drawing,
-    poses: Array,
-    *,
-    scene: str,
-    subtitle: str,
-    frame: str | None = None,
-) -> dict[str, Any]:
-    """Return what the page's stage needs, of the first frame's poses (njoints - 1, 7)."""
-    points = corner_points(drawing, poses)
-    low, high = points.min(axis=0), points.max(axis=0)
-    centre = (low + high) / 2.0
-    size = max(float(np.linalg.norm(points - centre, axis=1).max()), 1e-3)
-    sun, direction, orbit = np.array(SUN), np.array(VIEWS[scene]), dict[str, Any]()
-    field = field_of(robot, frame_of(robot, frame)) if scene == "space" else None
-    if field and robot.orbit:
-        # Up is away from the body, and x along the orbit.
-        radial, along, normal = field.axes.T
-        sun, direction = (along * x + normal * y + radial * z for x, y, z in (sun, direction))
-        far = robot.orbit.radius / robot.orbit.body_radius
-        orbit = {
-            "up": [along.tolist(), radial.tolist(), (-normal).tolist()],
-            "orbit": {"body": robot.orbit.body, "distance": far, "rate": robot.orbit.mean_motion},
-        }
-    return orbit | {
-        "title": robot.name,
-        "subtitle": subtitle,
-        "scene": scene,
-        "size": size,
-        "centre": centre.tolist(),
-        "floor": [*centre[:2].tolist(), float(low[2])],
-        "sun": sun.tolist(),
-        "direction": direction.tolist(),
-        "base": ["meshcat", "robot", body_paths(robot)[0]],
-    }
-
-
-def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
-    """Return the axes drawn at the base and the tool."""
-    paths = body_paths(robot)
-    found = [(paths[0], pin.SE3.Identity(), 0.3)]
-    if tool:
-        joint, placement = find_frame(robot.model, tool)
-        found.append((paths[joint - ROOT], placement, 0.12))
-    return [
-        {
-            "path": ["meshcat", "robot", path],
-            "position": placement.translation.tolist(),
-            "quaternion": pin.SE3ToXYZQUAT(placement)[3:].tolist(),
-            "length": share * size,
-        }
-        for path, placement, share in found
-    ]
 
 
 def marks(

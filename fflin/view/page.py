@@ -1,18 +1,33 @@
-"""The page that shows a scene: one self-contained HTML file."""
+"""The page that shows a scene in one self-contained HTML file, with its stage and its commands."""
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from html import escape
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
+import umsgpack
 
+from fflin.base.tables import counted
 from fflin.base.validation import Array
+from fflin.dynamics.names import frame_of
+from fflin.dynamics.orbital import field_of
+from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.robot import Robot
+from fflin.view.scene import Drawing, body_paths
+
+Lowered = dict[str, Any]
+
+# Where one looks from, and where the sun stands, in world axes.
+VIEWS = {"space": (1.0, -0.62, 0.50), "lab": (1.0, -0.62, 0.36)}
+SUN = (0.62, -0.78, 0.62)
 
 _SCRIPTS = ("sky", "orbit", "look", "stage", "marks", "plots", "player", "live", "modes", "main")
 
@@ -64,3 +79,134 @@ def _meshcat() -> str:
     bundle = files("meshcat").joinpath("viewer", "dist", "main.min.js")
     script = bundle.read_text(encoding="utf-8")
     return script.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+
+
+class Recorder:
+    """Window of a meshcat.Visualizer that remembers the scene, and forwards each command."""
+
+    def __init__(self, forward: Callable[[bytes], None] | None = None) -> None:
+        self.web_url = ""
+        self._forward = forward
+        # {path: {"set_object": ..., "set_transform": ..., "set_property visible": ...}}
+        self._nodes: dict[str, dict[str, Lowered]] = {}
+        self._animation: Lowered | None = None
+
+    def send(self, command: Any) -> None:
+        """Keep a meshcat command."""
+        lowered = command.lower()
+        kind, path = lowered["type"], lowered.get("path", "")
+        # The browser makes nothing of empty parts of a path.
+        path = "/" + "/".join(part for part in path.split("/") if part)
+        if kind == "delete":
+            below = path.rstrip("/") + "/"
+            for other in [p for p in self._nodes if p == path or p.startswith(below)]:
+                del self._nodes[other]
+        elif kind == "set_animation":
+            self._animation = lowered
+        elif kind != "capture_image":
+            key = f"{kind} {lowered.get('property', '')}"
+            self._nodes.setdefault(path, {})[key] = lowered
+        if self._forward:
+            self._forward(_message(lowered))
+
+    def commands(self) -> Iterator[bytes]:
+        """Yield the messages that build the scene anew, as meshcat's page takes them."""
+        for node in list(self._nodes.values()):
+            # An object replaces the one before it, so it comes ahead of what changes it.
+            for key in sorted(node, key=lambda key: key != "set_object "):
+                yield _message(node[key])
+        if self._animation:
+            yield _message(self._animation)
+
+    def wait(self) -> None:
+        """Do nothing: nobody has to connect."""
+
+    def close(self) -> None:
+        """Do nothing: there is nothing open."""
+
+
+def _message(lowered: Lowered) -> bytes:
+    packed: bytes = umsgpack.packb(lowered)
+    return packed
+
+
+def subtitle(robot: Robot) -> str:
+    """Return what the page says of a robot below its name."""
+    wheels = len(robot.wheels)
+    parts = [counted(robot.n - wheels, "joint"), *[counted(wheels, "wheel")] * bool(wheels)]
+    orbit = [f"{robot.orbit.altitude / 1e3:.6g} km over {robot.orbit.body}"] if robot.orbit else []
+    return ", ".join([*parts, f"{robot.mass:.4g} kg", *orbit])
+
+
+def rounded(points: Array, size: float) -> list[list[float]]:
+    """Return points (M, 3) as they are sent: as exact as a robot of that size needs."""
+    digits = max(4, 4 - math.floor(math.log10(size)))
+    found: list[list[float]] = points.round(digits).tolist()
+    return found
+
+
+def corner_points(drawing: Drawing, poses: Array) -> Array:
+    """Return the corners (M, 3) of all bodies' bounding boxes in the world."""
+    return np.concatenate(
+        [
+            np.array([placement.act(corner) for corner in corners])
+            for joint, corners in zip(drawing.bodies, drawing.corners, strict=True)
+            for placement in [pin.XYZQUATToSE3(poses[joint - ROOT])]
+        ]
+    )
+
+
+def stage_info(
+    robot: Robot,
+    drawing: Drawing,
+    poses: Array,
+    *,
+    scene: str,
+    subtitle: str,
+    frame: str | None = None,
+) -> dict[str, Any]:
+    """Return what the page's stage needs, of the first frame's poses (njoints - 1, 7)."""
+    points = corner_points(drawing, poses)
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre = (low + high) / 2.0
+    size = max(float(np.linalg.norm(points - centre, axis=1).max()), 1e-3)
+    sun, direction, orbit = np.array(SUN), np.array(VIEWS[scene]), dict[str, Any]()
+    field = field_of(robot, frame_of(robot, frame)) if scene == "space" else None
+    if field and robot.orbit:
+        # Up is away from the body, and x along the orbit.
+        radial, along, normal = field.axes.T
+        sun, direction = (along * x + normal * y + radial * z for x, y, z in (sun, direction))
+        far = robot.orbit.radius / robot.orbit.body_radius
+        orbit = {
+            "up": [along.tolist(), radial.tolist(), (-normal).tolist()],
+            "orbit": {"body": robot.orbit.body, "distance": far, "rate": robot.orbit.mean_motion},
+        }
+    return orbit | {
+        "title": robot.name,
+        "subtitle": subtitle,
+        "scene": scene,
+        "size": size,
+        "centre": centre.tolist(),
+        "floor": [*centre[:2].tolist(), float(low[2])],
+        "sun": sun.tolist(),
+        "direction": direction.tolist(),
+        "base": ["meshcat", "robot", body_paths(robot)[0]],
+    }
+
+
+def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
+    """Return the axes drawn at the base and the tool."""
+    paths = body_paths(robot)
+    found = [(paths[0], pin.SE3.Identity(), 0.3)]
+    if tool:
+        joint, placement = find_frame(robot.model, tool)
+        found.append((paths[joint - ROOT], placement, 0.12))
+    return [
+        {
+            "path": ["meshcat", "robot", path],
+            "position": placement.translation.tolist(),
+            "quaternion": pin.SE3ToXYZQUAT(placement)[3:].tolist(),
+            "length": share * size,
+        }
+        for path, placement, share in found
+    ]

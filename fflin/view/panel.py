@@ -66,7 +66,10 @@ class _Line(NamedTuple):
 
 
 def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
-    """Return {what: (unit, values (N,))}, how far q (N, nq) is from targets, wheels left out."""
+    """Return {what: (unit, values (N,))}, how far q (N, nq) is from targets.
+
+    Wheels and modes are left out.
+    """
     state = StateMap(robot)
     goals = map(pin.XYZQUATToSE3, np.broadcast_to(target, q.shape)[:, :7])
     relative = [
@@ -77,8 +80,8 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
         if joint.unbounded:
             joints[:, index] = np.angle(np.exp(1j * joints[:, index]))
     wheels = robot.wheels
-    turns = [not j.prismatic and j.name not in wheels for j in robot.joints]
-    slides = [j.prismatic for j in robot.joints]
+    turns = [not (j.prismatic or j.mode or j.name in wheels) for j in robot.joints]
+    slides = [j.prismatic and not j.mode for j in robot.joints]
     found = {
         "attitude": ("°", np.degrees([np.linalg.norm(pin.log3(x.rotation)) for x in relative])),
         "position": ("m", np.array([np.linalg.norm(x.translation) for x in relative])),

@@ -1,18 +1,28 @@
-"""Data of an animation: poses, trails, forces and errors of a motion at its frames."""
+"""Data of an animation: poses, trails and forces of a motion, and the payloads that it captures."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.impact import Capture, inertia_at
+from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import StateMap
-from fflin.robot.frames import find_frame, frame_index
 from fflin.robot.inputs import Thruster
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.joints import ROOT, find_frame, find_joint, frame_index
+from fflin.robot.robot import Robot
+from fflin.simulation.motion import Motion
+from fflin.simulation.plant import Plant
+
+# Steps of the way on which a payload came: at most so long [s], and so much of its swing [rad].
+_STEP, _SWING = 0.05, 0.3
 
 # More frames than this and a file grows for nothing that an eye could see.
 _MOST_FRAMES = 3000
@@ -104,3 +114,48 @@ def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
             direction = placement.rotation @ np.array(item.direction)
             found.append((names[len(found)], joint, position, direction))
     return found
+
+
+def payloads(motion: Motion, shown: Array) -> Iterator[tuple[Capture, Array]]:
+    """Yield what is caught and its poses (N, njoints - 1, 7) at the rows that are shown."""
+    parts = motion._phases
+    first = np.cumsum([0, *(len(part.t) if isinstance(part, Motion) else 0 for part in parts)])
+    for k, caught in enumerate(parts):
+        if not isinstance(caught, Capture):
+            continue
+        before = motion.t[shown[shown < first[k]]] - motion.t[first[k]]
+        poses = _flight(caught, motion.frame, before)
+        for part, start, end in zip(parts[k:], first[k:], first[k + 1 :], strict=False):
+            rows = shown[(shown >= start) & (shown < end)] - start
+            poses += _held(caught, part._robot, part.q[rows]) if len(rows) else []
+        yield caught, np.array(poses)
+
+
+def _flight(caught: Capture, frame: Any, t: Array) -> list[Array]:
+    """Return the poses of a payload at times before it is caught [s], as it flies undamped."""
+    payload = caught.payload.replace(damping=0.0)
+    data, state = payload.create_data(), StateMap(payload, frame=frame)
+    q, v, plant, now, poses = caught.payload_q, caught.payload_v, Plant(state), 0.0, list[Array]()
+    none = np.zeros(len(plant.actuation.names))
+    softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
+    rate = np.sqrt(softness @ payload.springs.stiffness)  # no swing is faster
+    for time in t[::-1].tolist():
+        steps = math.ceil((now - time) * max(1.0 / _STEP, rate / _SWING))
+        for _ in range(steps):
+            take = CommutatorFree4(payload.model, (time - now) / steps).step
+            q, v = take(lambda _, q, v: plant.stage(0.0, q, v, none)[0], 0.0, q, v)
+        now = time
+        poses.insert(0, body_poses(payload, data, q))
+    return poses
+
+
+def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
+    """Return the poses of a payload on the robot that carries it, at rows of q (N, nq)."""
+    model, data = robot.model, robot.model.createData()
+    names = [f"{caught.prefix}.{name}" for name in list(caught.payload.model.names)[ROOT + 1 :]]
+    places = [find_frame(model, caught.prefix), *(find_joint(model, name) for name in names)]
+    poses = []
+    for q in rows:
+        pin.forwardKinematics(model, data, q)
+        poses.append(np.array([pin.SE3ToXYZQUAT(data.oMi[joint] * at) for joint, at in places]))
+    return poses

@@ -12,11 +12,10 @@ import pinocchio as pin
 from fflin.base.errors import FflinError
 from fflin.base.writing import shown
 from fflin.robot.catalog import find_mesh
-from fflin.robot.frames import ROOT, find_frame, find_joint
+from fflin.robot.joints import ROOT, find_frame, find_joint
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.links import read_pose
-from fflin.robot.urdf.reader import read_document
-from fflin.robot.urdf.xacro import expand, first_xacro
+from fflin.robot.urdf.reader import expand, first_xacro, read_document
 from fflin.robot.urdf.xml import Element, named, parse
 from fflin.view.meshes import Color, load_mesh
 

@@ -15,7 +15,7 @@ from fflin.base.writing import as_path, check_distinct, check_place, write_whole
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.points import start_of
 from fflin.dynamics.state import StateMap
-from fflin.robot.frames import find_frame
+from fflin.robot.joints import find_frame
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from fflin.analysis.modes import Modes
     from fflin.campaign.campaign import Campaign
-    from fflin.campaign.reach import Funnel
+    from fflin.campaign.funnel import Funnel
     from fflin.simulation.motion import Motion
     from fflin.view.live import Live
 
@@ -92,8 +92,8 @@ def visualize(
         Whether to open a browser. By default a browser is opened if no file is given.
     scene : {"space", "lab"}, optional
         "space" shows sky and planet; "lab" shows a floor with a grid, the default under gravity. In
-        orbit the planet is the central body, below and in its true size. Planet and stars rotate
-        with the orbital motion; the sun is fixed.
+        orbit the planet is the central body, below and in its true size. The planet and
+        the stars rotate with the orbital motion; the sunlight keeps its direction in the view.
     fps : float
         Frames per second of playback.
     speed : float, optional
@@ -261,7 +261,7 @@ def _check_motion(robot: Robot, motion: Motion, cloud: Any) -> Robot:
 
     require_motion(motion)
     if cloud is not None:
-        from fflin.view.cloud import drawn_robot
+        from fflin.view.overlays import drawn_robot
 
         robot = drawn_robot(robot, cloud, motion)
     sizes = motion.q.shape[1], motion.u.shape[1]

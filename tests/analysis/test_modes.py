@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 from scipy.optimize import linear_sum_assignment
 
 import fflin
-from fflin.analysis.modal_energy import energy_by_body
+from fflin.analysis.modes import energy_by_body
 from fflin.commands import cli
 from fflin.commands.model_text import model_report
 from tests.support.messages import hear_lines, says

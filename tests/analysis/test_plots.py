@@ -213,7 +213,7 @@ def test_validity_says_the_slope_that_is_drawn(reach):
     ("name", "unit"), [("ets_vii", "rad"), ("cubesat", "rad|m"), ("tiago_no_hand", "rad|m")]
 )
 def test_joints_that_all_turn_are_displaced_by_radians(reach, name, unit):
-    from fflin.analysis.displacement import joint_unit
+    from fflin.campaign.validity import joint_unit
 
     assert joint_unit(fflin.linearize(fflin.load(name))) == unit
     assert reach.joint_unit == "rad"

@@ -12,7 +12,7 @@ import pytest
 
 import fflin
 from fflin.batch import chunks as batch_chunks
-from fflin.batch import dispatch as dispatching
+from fflin.batch import run as dispatching
 from fflin.batch.workers import OwnWorkers, WorkerDied
 from fflin.kernel import compiled
 from tests.support.messages import any_wording
@@ -292,7 +292,7 @@ def test_a_pool_whose_worker_is_killed_in_the_middle_of_its_result_is_one_line(
 ):
     """Left alone it waits for the rest for ever, and so do those who use it."""
     monkeypatch.setattr("fflin.batch.sweep.ChunkJob", HalfSendingJob)
-    monkeypatch.setattr(dispatching, "_GLANCE", 0.2)
+    monkeypatch.setattr(dispatching, "_POLL_PERIOD", 0.2)
     q, _, _ = points(robot, 80)
     with (
         ProcessPoolExecutor(2, mp_context=get_context(method)) as doomed,

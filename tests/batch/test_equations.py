@@ -7,10 +7,10 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.batch.equations import BatchEquations
+from fflin.batch.chunks import BatchEquations
 from fflin.batch.rows import Points
 from fflin.kernel.compiled import kernel
-from fflin.linear import prepared
+from fflin.linear import linearization
 from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 pytest.importorskip("numba")
@@ -201,7 +201,7 @@ def test_an_engine_may_be_chosen(robots, monkeypatch):
     assert compiled.A == pytest.approx(by_python.A, rel=1e-9, abs=1e-9)
     with pytest.raises(fflin.UnknownNameError, match="'fast'"):
         fflin.sweep(robot, q, engine="fast")
-    monkeypatch.setattr(prepared, "numba_is_there", lambda: False)
+    monkeypatch.setattr(linearization, "numba_is_there", lambda: False)
     assert (fflin.sweep(robot, q, v, u).A == by_python.A).all()
     with pytest.raises(fflin.InputError, match=r"'compiled'.*fflin\[fast"):
         fflin.sweep(robot, q, engine="compiled")

@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.batch.equations import BatchEquations
+from fflin.batch.chunks import BatchEquations
 from fflin.batch.rows import Points
 from fflin.dynamics.inertia import Inertia
 from fflin.linear.certificate import inertia_matrix

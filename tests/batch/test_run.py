@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.batch.dispatch import ChunkResult
 from fflin.batch.files import read_rows
-from fflin.batch.run import failure, run_chunks
+from fflin.batch.run import ChunkResult, failure, run_chunks
 from fflin.batch.store import FileStore, MemoryStore
 from fflin.batch.workers import OwnWorkers
 

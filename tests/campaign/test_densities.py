@@ -1,10 +1,11 @@
-"""A density and a centre of mass are the same in campaigns as in `uncertain`; tied draws."""
+"""Masses, densities and centres of mass are the same in campaigns as in `uncertain`; tied draws."""
 
 import numpy as np
 import pytest
 
 import fflin
 from fflin.campaign.runs import CampaignJob
+from fflin.robot.catalog import bundled_directory
 from tests.support.campaigns import both
 
 pytestmark = pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
@@ -102,9 +103,68 @@ def test_a_tied_density_is_of_all_its_links():
         drawn(robot, {"link_*.density": {"range": 0.3, "tied": True}, "joint_1.mass": 0.1})
 
 
-def test_of_a_body_of_one_link_it_is_the_mass_of_the_body():
+def test_a_body_of_one_link_has_the_name_of_its_joint_too():
     robot = fflin.load("servicer_7dof")
-    same_bodies(drawn(robot, {"link_3.density": [0.3]}), drawn(robot, {"joint_3.mass": [0.3]}))
+    for part in ("density", "mass"):
+        by_link, by_joint = ({f"{of}_3.{part}": [0.3]} for of in ("link", "joint"))
+        same_bodies(drawn(robot, by_link), drawn(robot, by_joint))
+        with pytest.raises(fflin.InputError, match=r"'link_3'.*'joint_3'.*only once"):
+            drawn(robot, by_link | by_joint)
+
+
+@pytest.mark.parametrize("name", ["servicer_7dof", "planar_detumble", "robots/inspector.toml"])
+def test_a_mass_leaves_the_inertia_about_the_centre_as_in_uncertain_robots(name):
+    robot = fflin.load(name)
+    links = [name for name, piece in robot.pieces.items() if not piece.whole][:4]
+    of = fflin.uncertain(robot, {f"{link}.mass": 0.5 for link in links})
+    values = {each.parameter.name: 1.3 * each.parameter.value for each in of.ranges}
+    found = drawn(robot, {f"{link}.mass": [0.3] for link in links})
+    same_bodies(found, of.at(values))
+    assert found.mass > robot.mass
+    one = next(x for n, x in robot.pieces.items() if n == links[0])
+    alone = drawn(robot, {f"{links[0]}.mass": [0.3]}).model.inertias[one.joint]
+    if len([x for x in robot.pieces.values() if x.joint == one.joint]) == 1:
+        assert np.allclose(alone.inertia, robot.model.inertias[one.joint].inertia, rtol=1e-12)
+        if robot.wheels:  # the carrier counts them, and they stay as they are
+            return
+        denser = drawn(robot, {f"{links[0]}.density": [0.3]}).model.inertias[one.joint]
+        assert np.allclose(denser.inertia, 1.3 * alone.inertia, rtol=1e-12)
+
+
+def test_the_root_link_has_two_names_everywhere(tmp_path):
+    (tmp_path / "bus.urdf").write_text(
+        bundled_directory().joinpath("ets_vii.urdf").read_text().replace('"base"', '"bus"')
+    )
+    robot = fflin.load(tmp_path / "bus.urdf")
+    assert robot.link_of["base"] == "bus"
+    S = fflin.sensitivity(fflin.linearize(robot))
+    for part in ("mass", "com.x", "inertia.xx", "density"):
+        assert S[f"bus.{part}"].name == S[f"base.{part}"].name == f"bus.{part}"
+    for part, value in {"mass": 0.3, "density": 0.3, "com": 0.02, "inertia": 0.1}.items():
+        changed = (drawn(robot, {f"{name}.{part}": [value]}) for name in ("bus", "base"))
+        same_bodies(*changed)
+    ranges = ({f"{name}.mass": 0.2} for name in ("bus", "base"))
+    one, two = (fflin.uncertain(robot, each).at({"bus.mass": 3000.0}) for each in ranges)
+    same_bodies(one, two)
+
+
+def test_a_pattern_means_the_links_and_not_the_bodies_that_they_form_too():
+    robot = fflin.load("planar_detumble")
+    links = {f"{link}.mass" for link in robot.links}
+    assert {each.parameter.name for each in fflin.uncertain(robot, {"*.mass": 0.1}).ranges} == links
+    job = CampaignJob(robot, None, {"*.mass": 0.1}, 0, "python", {"duration": 1.0})
+    assert set(job.dispersions.names) == links
+    S = fflin.sensitivity(fflin.linearize(robot))
+    total = sum(S[name].dB for name in links)
+    assert np.allclose(S.along({"*.mass": 1.0}).dB, total, rtol=1e-12)
+    body = next(name for name, piece in robot.pieces.items() if piece.whole)
+    both_of = {"*.mass": 0.1, f"{body}.mass": 0.2}
+    names = CampaignJob(robot, None, both_of, 0, "python", {"duration": 1.0}).dispersions.names
+    on = {f"{n}.mass" for n, x in robot.pieces.items() if x.joint == robot.pieces[body].joint}
+    assert set(names) == links - on | {f"{body}.mass"}
+    link = next(name for name in robot.links if f"{name}.mass" in on)
+    with pytest.raises(fflin.InputError, match="disperse the same mass"):
+        drawn(robot, {f"{body}.mass": 0.1, f"{link}.density": 0.1})
 
 
 @pytest.mark.compiled

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import fflin
-from fflin.base.progress import Progress
+from fflin.base.process import Progress
 from fflin.campaign.runs import CampaignJob
 
 

@@ -6,12 +6,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.campaign.funnel import FunnelJob
-from fflin.campaign.reach import spread
-from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import moved_by, moving_error
+from fflin.campaign.funnel import ellipsoid_axes, runs_from
+from fflin.dynamics.state import StateMap, moved_by, moving_error
+from fflin.view.overlays import tubes
 from fflin.view.playback import default_tool
-from fflin.view.tube import tubes
 from tests.support.commands import refused, run
 
 OUTCOME, DURATION = {"within": 0, "lost": 1, "beyond": 2, "missed": 3}, 12.0
@@ -67,7 +65,7 @@ def ends(still, schedule, t):
     """M (12, 12) such that a start of root level s, direction z, ends at level s^2 |M z|^2."""
     root = np.linalg.cholesky(schedule.P[-1])
     k = int(np.abs(schedule.t - t).argmin())
-    return root.T @ passage(still, schedule, t) @ spread(schedule.P[k])
+    return root.T @ passage(still, schedule, t) @ ellipsoid_axes(schedule.P[k])
 
 
 def successes(M, goal, size, rng, count=4000):
@@ -159,8 +157,7 @@ def test_a_run_from_a_knot_is_one_of_simulate(arm):
     robot, schedule = arm
     motion = schedule.trajectory(robot)
     policy = fflin.TrajectoryFeedback(motion, schedule)
-    job = FunnelJob(robot, policy, {}, {}, [(5, 10)], 1, 0, {"dt": 0.05}, "python")
-    campaign = job.campaign(0)
+    campaign = runs_from(robot, policy, 5, 10, {"dt": 0.05})
     e = 0.01 * np.random.default_rng(0).normal(size=campaign.x0.size)
     x = moved_by("local", campaign.x0[None], e[None])[0]
     end = campaign.replay(x - campaign.x0)

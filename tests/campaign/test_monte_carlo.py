@@ -687,6 +687,39 @@ def test_a_file_of_anything_else_is_replaced_only_on_request(ending, robots, tmp
 
 
 @pytest.mark.compiled
+def test_a_file_of_another_policy_or_robot_is_refused_before_compiling(
+    robots, tmp_path, monkeypatch
+):
+    pytest.importorskip("numba")
+    pytest.importorskip("h5py")
+    robot = robots["planar_detumble"]
+    lin = fflin.linearize(robot)
+    K, path = fflin.lqr(lin).K, tmp_path / "c.h5"
+
+    def fly(gain=1.0, robot=robot, **changes):
+        options = {"runs": 8, "duration": 0.2, "dt": 0.02, "engine": "compiled", "out": path}
+        policy = fflin.StateFeedback(lin, gain * K)
+        return fflin.monte_carlo(robot, policy, {"q_b": 0.05}, **options | changes)
+
+    first, before = fly(), path.read_bytes()
+    monkeypatch.setattr("fflin.simulation.packing.kernel", None)  # which compiles
+    heavier = robot.perturbed(mass=1e-6, com=0.0, inertia=0.0)
+    for changes in (
+        {"gain": 1.0 + 1e-9},
+        {"robot": heavier},
+        {"limits": 1e3},
+        {"x0": lin.x0 + 1e-9},
+        {"delay": 0.02, "sample": 0.02},
+        {"seed": 1},
+        {"histories": 3},
+    ):
+        with pytest.raises(fflin.FileError, match="another campaign"):
+            fly(**changes)
+        assert path.read_bytes() == before
+    assert np.array_equal(fly().x, first.x)
+
+
+@pytest.mark.compiled
 def test_what_no_input_pushes_is_judged_in_no_campaign_either():
     robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
     lin = fflin.linearize(robot)

@@ -8,9 +8,10 @@ import pytest
 
 import fflin
 from fflin.campaign.runs import CampaignJob
-from fflin.campaign.tally import Tally
-from fflin.dynamics.state_rows import states_of
+from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, kinds_of
+from fflin.dynamics.state import attitude_errors, moving_errors, states_of, unwound
 from fflin.kernel.tree import LANES
+from fflin.simulation.report import DWELL, SETTLED, THERE
 from tests.support.robots import LINKS, MIMIC, free_body
 
 STEPS = 90
@@ -46,14 +47,56 @@ def rows_of(state, rng, inputs):
     return q.reshape(STEPS, LANES, -1), nu, rng.normal(size=(STEPS, LANES, inputs))
 
 
+def defined(job, target, q, nu, u, stop):
+    """The outcome of a run by the definitions, from all its rows at once."""
+    state, dt = job.plant.state, job.plan.times.dt
+    x = unwound(state, states_of(state, q, nu), target if target.ndim == 1 else target[0])
+    e = x - target
+    if target.ndim == 2:
+        e = unwound(state, moving_errors(state.frame, x, target))
+    kind = kinds_of(state)
+    e[:, kind < 0] = 0.0
+    sizes = [np.abs(e[:, kind == k]).max(axis=1, initial=0.0) for k in range(len(KINDS))]
+    sizes = np.column_stack([attitude_errors(x, target), *sizes[1:]])
+    largest = sizes.max(axis=0)
+    outside = sizes > np.maximum(SETTLED * largest, THERE)
+    settled = np.where(outside.any(axis=0), len(x) - outside[::-1].argmax(axis=0), 0)
+    late = (settled > (1.0 - DWELL) * len(x)) | (stop > 0)
+    return {
+        **{"q": q[-1], "v": state.spread(nu[-1:])[0], "x": x[-1], "u": u[-1]},
+        **{"largest_x": np.abs(e).max(axis=0), "largest_u": np.abs(u).max(axis=0)},
+        **{"errors": sizes[-1], "largest": largest},
+        "settle": np.where(late, np.inf, settled * dt),
+        **{"error_history": sizes[job.steps], "input_history": u[job.steps]},
+        **{"stop": stop, "end": (len(x) - 1) * dt},
+    }
+
+
+def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
+    for made, frame, follows in itertools.product((turning, wheeled), FRAMES, (False, True)):
+        robot, rng = made(tmp_path), np.random.default_rng(3)
+        options = {"duration": 0.01 * (STEPS - 1), "dt": 0.01, "frame": frame, "histories": 11}
+        job = CampaignJob(robot, None, {"q_b.x": 0.01}, 0, "python", options)
+        state, target, path = job.plant.state, job.target, []
+        q, nu, u = (each[:, 0] for each in rows_of(state, rng, len(job.plan.initial)))
+        if follows:
+            star = [each[:, 0] for each in rows_of(state, rng, 0)[:2]]
+            target, path = states_of(state, *star), [each.ravel() for each in star]
+        found = RunStatistics(job.plan, state, target, job.steps, path, 1)
+        rows = np.hstack((q, nu, u, np.zeros((STEPS, 9)))).ravel().tolist()
+        found.add(0, [each[:, None] for each in (q, nu, u)], rows)
+        outcome = found.outcome(STEPS - 1, np.zeros(1))
+        for name, expected in defined(job, target, q, nu, u, 0.0).items():
+            value = getattr(outcome, name)[0]
+            np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-10, err_msg=name)
+
+
 @pytest.mark.compiled
 @pytest.mark.parametrize("follows", [False, True])
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("made", [turning, wheeled, arm])
 def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follows):
     pytest.importorskip("numba")
-    from fflin.campaign.lane_tally import LaneTally
-
     robot, rng = made(tmp_path), np.random.default_rng(7)
     turn = pin.Quaternion(0.5, -0.1, 0.7, 0.3).normalized()
     options = {"duration": 0.01 * (STEPS - 1), "dt": 0.01, "frame": frame, "histories": 11}
@@ -62,7 +105,7 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
     robot.follow(q0)
     options["q0"] = q0
     job = CampaignJob(robot, None, {"q_b.x": 0.01}, 0, "compiled", options)
-    state, home, way = job.plant.state, job.home, []
+    state, home, way = job.plant.state, job.target, []
     q, nu, u = rows_of(state, rng, len(job.plan.initial))
     if follows:
         star = [each[:, 0] for each in rows_of(state, rng, 0)[:2]]
@@ -70,14 +113,19 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
     rows = np.concatenate((q, nu, u, np.zeros((STEPS, LANES, 9))), axis=2).transpose(0, 2, 1)
     stop, ends = np.arange(LANES) % 3.0, []
     for cuts in ([0, STEPS], [0, 1, 33, STEPS]):
-        plain = Tally(job.plan, state, home, LANES, job.steps)
-        lanes = LaneTally(job.plan, job.plant, home, job.steps, way)
+        lanes = RunStatistics(job.plan, state, home, job.steps, way, LANES)
+        lanes.reset()
         for first, last in itertools.pairwise(cuts):
             some = [each[first:last] for each in (q, nu, u)]
-            plain.add(first, some)
-            lanes = lanes.copy().add(first, some, rows[first:last].copy().reshape(-1, LANES))
+            for _ in range(2):  # adding rows again changes nothing
+                lanes.add(first, some, rows[first:last].copy().reshape(-1, LANES))
         ends.append(lanes.outcome(STEPS - 1, stop))
-        for name, expected in plain.outcome(STEPS - 1, stop)._asdict().items():
+        plain = [
+            defined(job, home, *(each[:, lane] for each in (q, nu, u)), stop[lane])
+            for lane in range(LANES)
+        ]
+        for name in Outcome._fields:
+            expected = np.array([each[name] for each in plain])
             found = getattr(ends[-1], name)
             assert found.shape == expected.shape
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-10, err_msg=name)

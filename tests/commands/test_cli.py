@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -13,6 +14,8 @@ import pytest
 
 import fflin
 from fflin.base.tables import matrix
+from fflin.commands import cli
+from fflin.commands.arguments import ROBOT
 from fflin.robot.catalog import bundled_directory
 from tests.support.commands import refused, run, without_warnings
 from tests.support.messages import says
@@ -588,6 +591,31 @@ def test_help_has_an_example_in_every_command():
         code, text, _ = run(command, "--help")
         assert code == 0 and f"example: fflin {command}" in " ".join(text.split())
     assert run("--version")[1] == f"fflin {fflin.__version__}\n"
+
+
+def test_short_help_fits_a_screen_and_full_help_has_every_option():
+    (parsers,) = cli._parser("")._subparsers._group_actions
+    for name, parser in parsers.choices.items():
+        options = [each.option_strings[-1] for each in parser._actions if each.option_strings]
+        _, short, _ = run(name, "--help")
+        _, full, _ = run(name, "--help", "all")
+        listed = [line for line in short.splitlines() if line.startswith("  -")]
+        assert len(listed) <= 20 and len(short.splitlines()) <= 55, name
+        assert max(map(len, (*short.splitlines(), *full.splitlines()))) <= 80
+        assert f"example: fflin {name}" in " ".join(short.split())
+        assert all(re.search(rf"^  .*{option}\b", full, re.MULTILINE) for option in options), name
+        if options[1:]:
+            assert short.endswith(
+                f"all {len(options) - 1} options in full: fflin {name} --help all\n"
+            )
+
+
+def test_options_that_repeat_a_robot_file_are_in_one_group():
+    repeated = {"lock", "orbit", "stiffness", "damping", "gravity", "passive", "inputs", "output"}
+    (parsers,) = cli._parser("")._subparsers._group_actions
+    for name in ("linearize", "check", "lqr", "simulate", "sweep", "montecarlo", "funnel"):
+        (group,) = (x for x in parsers.choices[name]._action_groups if x.title == ROBOT)
+        assert {each.dest for each in group._group_actions} == repeated, name
 
 
 @pytest.mark.sample

@@ -117,6 +117,15 @@ def test_a_command_replaces_files_of_its_own_kind_alone(name, tmp_path, monkeypa
         assert code == 2 and "is not a result of fflin" in error and "--force" in error
         assert error.count("\n") == 1 and foreign.read_text() == "somebody's own\n"
         assert run(*command, foreign, "--force")[0] == 0
+    if name == "linearize":
+        for _ in range(2):
+            assert run(*command, tmp_path / "own.csv")[0] == 0
+        table = tmp_path / "foreign.A.csv"
+        table.write_text("somebody's own\n")
+        with any_wording():
+            code, _, error = run(*command, tmp_path / "foreign.csv")
+        assert code == 2 and str(table) in error and table.read_text() == "somebody's own\n"
+        assert run(*command, tmp_path / "foreign.csv", "--force")[0] == 0
     other = ("lqr", "cubesat", "-o") if name != "lqr" else ("linearize", "cubesat", "-o")
     path = tmp_path / "other.npz"
     assert run(*other, path)[0] == 0

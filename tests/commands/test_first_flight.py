@@ -9,6 +9,18 @@ import fflin
 from tests.support.commands import run
 
 TOML = Path(__file__).parents[2] / "robots" / "inspector.toml"
+TANK = """
+[[slosh]]
+name = "tank"
+frame = "base"
+radius = 0.3
+height = 0.4
+bottom = [0, 0, -0.4]
+density = 1000
+acceleration = 0.04
+damping = 0.05 # of a tank with baffles
+pendulum = false
+"""
 
 
 @pytest.mark.exhaustive
@@ -36,4 +48,22 @@ def test_the_inspector_flies_within_its_limits_at_the_first_try(tmp_path):
     for name, effort in efforts.items():
         assert u[f"tau_m.{name}"] <= effort and x[f"qdot_m.{name}"] <= speeds[name]
     assert not any(name.startswith("tau_m.hinge") for name in motion.input_names)
+    assert motion.momentum_drift.max() < 1e-12
+
+
+@pytest.mark.exhaustive
+def test_the_inspector_with_flexible_arrays_and_a_tank_settles_within_its_limits(tmp_path):
+    text = TOML.with_name("inspector_flexible.toml").read_text(encoding="utf-8")
+    (tmp_path / "flexible.toml").write_text(
+        text.replace("inspector.urdf", TOML.with_suffix(".urdf").as_posix()) + TANK,
+        encoding="utf-8",
+    )
+    given = ("simulate", "flexible.toml", "--duration", "400", "-o", "a.npz")
+    code, out, err = run(*given, cwd=tmp_path)
+    assert (code, err) == (0, "")
+    assert out.startswith("simulate: settled after ")
+    motion = fflin.Motion.load(tmp_path / "a.npz")
+    assert motion.attitude_error[0] > 19.9 and motion.attitude_error[-1] < 0.05
+    assert {"q_m.left_mode_3", "q_m.right_mode_1", "q_m.tank_y"} <= set(motion.state_names)
+    assert not motion.passed and not motion.saturated
     assert motion.momentum_drift.max() < 1e-12

@@ -8,7 +8,7 @@ from contextlib import suppress
 
 import pytest
 
-from tests.support.patience import finished, finishing
+from tests.support.patience import finished, in_own_session
 
 pytestmark = pytest.mark.process
 
@@ -37,17 +37,7 @@ def interrupted(command, instant, folder):
     """
     arguments = [sys.executable, "-X", "importtime", "-m", "fflin", *command.split()]
     said, seen = [], -(10**6)
-    with (
-        subprocess.Popen(
-            arguments,
-            cwd=folder,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        ) as process,
-        finishing(process),
-    ):
+    with in_own_session(arguments, folder, stdout=subprocess.DEVNULL) as process:
         try:
             # It ends with the last process that has it.
             for line in process.stderr:

@@ -108,12 +108,12 @@ def test_a_bad_file_is_one_line(file, said, tmp_path):
 
 INTERRUPTED = """
 import os, signal, sys
-from fflin.base import progress
+from fflin.base import process
 from fflin.__main__ import main
 def update(bar, done, total):
     if done >= 32:
         os.kill(os.getpid(), signal.SIG_HOW)
-progress.Progress.update = update
+process.Progress.update = update
 if __name__ == "__main__":
     sys.exit(main())
 """

@@ -1,7 +1,6 @@
 """fflin sweep as a user runs it."""
 
 import re
-import subprocess
 import sys
 
 import numpy as np
@@ -10,8 +9,8 @@ import pytest
 
 import fflin
 from tests.support.commands import refused, run
-from tests.support.messages import says
-from tests.support.patience import finishing
+from tests.support.messages import any_wording, says
+from tests.support.patience import in_own_session
 
 pytest.importorskip("h5py")
 
@@ -44,6 +43,22 @@ def test_grid_random_and_file_say_the_same(tmp_path, robots):
     assert code == 0 and np.array_equal(drawn.q, expected.rows(0, 7))
     lin = fflin.linearize(robot, drawn.q[4], fflin.velocity(robot, {"joint_1": 0.3}), frame="world")
     assert drawn[4].A == pytest.approx(lin.A, abs=1e-12)
+
+
+@pytest.mark.compiled
+def test_the_engine_can_be_chosen(tmp_path):
+    points = ("sweep", "canadarm2", "--random", 5, "--engine")
+    for engine in ("compiled", "python"):
+        assert run(*points, engine, "-o", tmp_path / f"{engine}.npz")[0] == 0
+    one, other = (
+        fflin.LinearBatch.load(tmp_path / f"{engine}.npz") for engine in ("compiled", "python")
+    )
+    assert one.A == pytest.approx(other.A, abs=1e-12)
+    with any_wording():
+        outputs = ("--output", "com", "-o", tmp_path / "a.npz")
+        code, _, error = run(*points, "compiled", *outputs)
+        assert code == 2 and "engine='compiled'" in error
+        assert "--engine" in refused(*points, "fast", *outputs)
 
 
 @pytest.mark.parametrize(
@@ -108,11 +123,11 @@ def test_the_reference_may_be_the_world(tmp_path, robots):
 
 INTERRUPTED = """
 import os, signal, sys
-from fflin.base import progress
+from fflin.base import process
 from fflin.__main__ import main
 def update(bar, done, total):
     os.killpg(0, signal.SIGINT)
-progress.Progress.update = update
+process.Progress.update = update
 sys.exit(main())
 """
 
@@ -124,17 +139,7 @@ def test_ctrl_c_leaves_what_is_finished_and_no_process(workers, tmp_path):
     pytest.importorskip("h5py")
     command = [sys.executable, "-c", INTERRUPTED, "sweep", "ets_vii", "--random", "100000"]
     options = ["--velocity", "joint_1=0.3", "-o", "x.h5", *workers]
-    with (
-        subprocess.Popen(
-            [*command, *options],
-            cwd=tmp_path,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        ) as process,
-        finishing(process),
-    ):
+    with in_own_session([*command, *options], tmp_path) as process:
         # These end with the last process that has them.
         _, error = process.communicate()
     assert process.returncode == 130

@@ -10,9 +10,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.control.default_weights import BANDWIDTH, _damping
+from fflin.control.default_weights import BANDWIDTH, _damping, rule_weights
 from fflin.control.gain import one_sided
-from fflin.control.weight_rules import rule_weights
 from fflin.dynamics.state import StateMap
 from fflin.robot.catalog import find_robot
 from tests.support.messages import says

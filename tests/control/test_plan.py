@@ -187,9 +187,10 @@ def test_speeds_keep_within_limits_between_knots(one_joint, knots, spin):
 
 
 def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monkeypatch):
-    """Of the motion before any limit is tightened: with a warning, unless that much is allowed."""
+    """Of a motion whose limits hold at knots alone: with a warning, unless that much is allowed."""
     robot, goal = one_joint
     options = {"knots": 6, "hold": "linear", "limits": SPEEDS}
+    monkeypatch.setattr("fflin.control.plan_search._LIMITED", np.inf)
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.1)
     motion = fflin.plan(robot, (goal, None), 10.0, **options)
     found = re.search(
@@ -203,10 +204,19 @@ def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monke
     assert found and float(found[1]) > 3.0
     assert max(fine) / 0.13 - 1.0 == pytest.approx(0.01 * float(found[1]), rel=0.02)
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.01)
-    monkeypatch.setattr("fflin.control.plan._MOST_PLANS", 1)
     with pytest.warns(fflin.FflinWarning, match=r"qdot_m\.joint_1 by \S+ % at t = \S+ s"):
         left = fflin.plan(robot, (goal, None), 10.0, **options)
     assert str(left) == str(motion)
+
+
+def test_limits_that_cannot_hold_between_knots_hold_at_knots(one_joint):
+    """Torques linear over 3.3 s cannot move the joint within 1.15 of its mean speed."""
+    robot, goal = one_joint
+    limits = SPEEDS | {"qdot_m": 0.115}
+    with any_wording(), pytest.warns(fflin.FflinWarning, match=r"qdot_m\.joint_1 by \S+ % at"):
+        motion = fflin.plan(robot, (goal, None), 10.0, knots=4, hold="linear", limits=limits)
+    assert np.abs(motion.v[:, 6]).max() <= 0.115 + 1e-6 < largest_speeds(motion).max()
+    assert missed(robot, motion, goal) < 1e-6
 
 
 def largest_speeds(motion, parts=64):
@@ -220,18 +230,25 @@ def largest_speeds(motion, parts=64):
     return largest
 
 
-@pytest.mark.parametrize("knots", [4, 5])
-def test_knots_are_added_where_tighter_limits_do_not_help(one_joint, knots):
+@pytest.mark.parametrize("knots", [4, 5, 31])
+def test_few_knots_keep_limits_between_them(one_joint, knots):
     robot, goal = one_joint
     options = {"knots": knots, "hold": "linear", "limits": SPEEDS}
     motion = fflin.plan(robot, (goal, None), 10.0, **options)
-    h = np.diff(motion.t)
-    assert len(h) > knots - 1
-    assert motion.t[[0, -1]].tolist() == [0.0, 10.0]
-    # Each interval is one of those that were asked for, halved some times.
-    halvings = np.log2(10.0 / (knots - 1) / h)
-    assert halvings == pytest.approx(np.round(halvings), abs=1e-9)
+    assert motion.t == pytest.approx(np.linspace(0.0, 10.0, knots), abs=1e-12)
     assert largest_speeds(motion).max() <= 1.01 * SPEEDS["qdot_m"]
+    assert missed(robot, motion, goal) < 1e-6 and motion.residual.max() < 1e-6
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("knots", [31, 41])
+def test_a_light_arm_keeps_its_speeds_between_knots(knots):
+    """Held for 1.5 s or 2 s, its torques take light joints far beyond their speeds and back."""
+    robot = fflin.load("servicer_7dof", lock=["panel_*"], limits={"tau_b": 60.0, "F_b": 40.0})
+    goal = turned(robot, 1.2, joints={"joint_2": 0.6, "joint_4": -1.1})
+    motion = fflin.plan(robot, (goal, None), 60.0, knots=knots)
+    assert len(motion.t) == knots
+    assert (largest_speeds(motion) <= 1.01 * robot.model.velocityLimit[6:]).all()
     assert missed(robot, motion, goal) < 1e-6 and motion.residual.max() < 1e-6
 
 
@@ -250,7 +267,7 @@ def test_a_start_or_goal_outside_a_limit_is_refused_before_planning(
     x = np.zeros(state.nx)
     for name, value in end.items():
         x[state.names.index(name)] = value
-    monkeypatch.setattr("fflin.control.plan._kept_between", None)  # the work
+    monkeypatch.setattr("fflin.control.plan.Search", None)  # the work
     limits = {"q_m": 1.0, "qdot_m": 0.2}
     with pytest.raises(fflin.InputError, match="limit") as told:
         fflin.plan(robot, x, 10.0, limits=limits)
@@ -294,17 +311,23 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     shooting.steps = 64
     q, v, u = shooting.guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
     q, v = shooting.flown((q[0], v[0]), u)
-    A, B, D = shooting.slopes(q, v, u)
+    A, B, D, inside = shooting.slopes(q, v, u, 4)
     h, nx = 1e-5, A.shape[1]
 
     def ends(z, du):
         return shooting.missed(*shooting.moved(q, v, z), u + du)
+
+    def third(z):
+        """Return the third quarter's end of the second interval."""
+        return tuple(each[1, 2] for each in shooting.parts(*shooting.moved(q, v, z), u, 4))
 
     for i in range(nx):
         z = np.zeros((41, nx))
         z[1, i] = h
         slope = (ends(z, 0.0) - ends(-z, 0.0))[1] / (2 * h)
         assert slope == pytest.approx(A[1][:, i], abs=1e-8)
+        slope = shooting.between(third(-z), third(z)) / (2 * h)
+        assert slope == pytest.approx(inside[1, 2, :, i], abs=1e-8)
     for i in range(u.shape[1]):
         for row, maps in ((1, B), (2, D)):
             du = np.zeros_like(u)
@@ -321,7 +344,7 @@ def test_a_plan_meets_the_conditions_of_optimality(cube):
     motion = fflin.plan(robot, (goal, None), 6.0, knots=21)
     shooting = Shooting(robot, motion.t, True)
     shooting.steps = 16
-    A, B, _ = shooting.slopes(motion.q, motion.v, motion.u)
+    A, B, *_ = shooting.slopes(motion.q, motion.v, motion.u)
     size, reach, maps = np.repeat([1e-3, 1.0], 3), np.eye(A.shape[1]), []
     for k in range(19, -1, -1):
         maps.append((reach @ B[k] * size).T)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog, lsq_linear
 
-from fflin.control.policies import nearest, pushes_every_way
+from fflin.control.policies import gives_every_wrench, nearest
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -39,14 +39,14 @@ def test_thrusters_that_push_every_way():
     d = np.column_stack((y * z, -x * y, x * z))
     W = np.vstack((d.T, np.cross(corners * (0.6, 0.55, 0.65), d).T))
     pushing = np.ones(8, dtype=bool)
-    assert pushes_every_way(W, pushing)
+    assert gives_every_wrench(W, pushing)
     # Every wrench and its opposite can be had, by an independent solver.
     for wrench in np.vstack((np.eye(6), -np.eye(6))):
         assert linprog(np.ones(8), A_eq=W, b_eq=wrench, bounds=(0, None)).status == 0
-    assert not pushes_every_way(W[:, :7], pushing[:7])
-    assert not pushes_every_way(np.eye(6), np.arange(6) < 3)
-    assert pushes_every_way(np.eye(6), np.zeros(6, dtype=bool))
-    assert pushes_every_way(np.hstack((np.eye(6), -np.eye(6))), np.ones(12, dtype=bool))
+    assert not gives_every_wrench(W[:, :7], pushing[:7])
+    assert not gives_every_wrench(np.eye(6), np.arange(6) < 3)
+    assert gives_every_wrench(np.eye(6), np.zeros(6, dtype=bool))
+    assert gives_every_wrench(np.hstack((np.eye(6), -np.eye(6))), np.ones(12, dtype=bool))
 
 
 def test_what_is_limited_to_nothing_gives_nothing():

@@ -7,8 +7,16 @@ import pytest
 import scipy.linalg as sl
 
 import fflin
-from fflin.control.half_size import ModalMatrix, second_order_loop
-from fflin.control.riccati import Riccati, _bilinear, _finished, _general, half_size, solve
+from fflin.control.riccati import (
+    ModalMatrix,
+    Riccati,
+    _bilinear,
+    _finished,
+    _general,
+    half_size,
+    second_order_loop,
+    solve,
+)
 from tests.support.robots import BUNDLED, random_point, random_tree
 
 

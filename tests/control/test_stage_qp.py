@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fflin import MissingPackageError
-from fflin.control.stage_qp import StageQP
+from fflin.control.stage_qp import StageQP, StageRows
 
 N, NX, NU = 6, 3, 2
 
@@ -29,6 +29,7 @@ def problem(**given):
         "low": low,
         "high": -low,
         "soft": np.tile(np.where(np.arange(NX + NU) < NX, 5.0, np.inf), (N + 1, 1)),
+        "rows": StageRows(np.zeros(0, int), np.zeros((0, NX + 2 * NU)), *np.zeros((2, 0)), 1.0),
         "scale": np.array([1.0, 2.0, 0.3, 5.0, 1.0]),
     }
     return StageQP(**values | given)
@@ -55,6 +56,28 @@ def test_the_solution_meets_the_conditions_of_optimality():
     assert out[beyond] == pytest.approx(5.0, abs=1e-5) and not np.isinf(soft[beyond]).any()
     assert (out[~inside] > -1e-5).all() and (out <= soft + 1e-5).all()
     assert (np.abs(u) <= 0.2).all()
+
+
+def test_combined_variables_keep_their_limits_where_these_cost_more_than_to_exceed_them():
+    """The multiplier of a soft limit is at most its price."""
+    free = problem()
+    x, u, _ = free.solve()
+    rng = np.random.default_rng(1)
+    k, G = np.array([1, 1, 3, N - 1]), rng.normal(size=(4, NX + 2 * NU))
+    none = StageRows(k, G, np.full(4, -np.inf), np.full(4, np.inf), 1e3)
+    before = none.values(x, u)
+    assert before[3] == pytest.approx(G[3] @ np.concatenate((x[N - 1], u[N - 1], u[N])), abs=1e-12)
+    high = before - 0.01 * np.abs(before)
+    hard, soft = (
+        none._replace(high=high, soft=price).values(
+            *problem(rows=none._replace(high=high, soft=price)).solve()[:2]
+        )
+        for price in (1e3, 1e-6)
+    )
+    assert (hard <= high + 1e-7).all() and np.abs(hard - high).min() < 1e-7
+    assert soft == pytest.approx(before, abs=1e-4)
+    scaled = problem(rows=none._replace(high=high), scale=np.ones(NX + NU)).solve()
+    assert none.values(*scaled[:2]) == pytest.approx(hard, abs=1e-6)
 
 
 def test_scales_change_nothing_and_hard_bounds_may_leave_nothing():

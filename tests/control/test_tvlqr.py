@@ -8,7 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.control.differential_riccati import Coefficients, step_back
+from fflin.control.differential_riccati import Coefficients, solve_back, step_back
+from fflin.linear.sampling import GAUSS
 from tests.support.messages import says
 from tests.support.motions import motion
 
@@ -135,6 +136,29 @@ def test_a_step_is_of_order_four():
     errors = [np.abs(solved(n) - exact).max() for n in (8, 16, 32)]
     slopes = np.log2(np.divide(errors[:-1], errors[1:]))
     assert slopes == pytest.approx([4.0, 4.0], abs=0.25)
+
+
+def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
+    """Over one interval the weight of a node, which is negative, makes S negative at first."""
+
+    def at(t):
+        return Coefficients(
+            np.zeros((1, 1)), np.array([[np.exp(12.0 * (1.0 - t))]]), 1e-6 * np.eye(1)
+        )
+
+    with pytest.raises(np.linalg.LinAlgError):
+        step_back(*(at(c) for c in GAUSS), 1e3 * np.eye(1), 1.0)
+    times, values = solve_back(at, np.array([0.0, 1.0]), 1e3 * np.eye(1))
+    found = solve_ivp(
+        lambda t, P: np.exp(12.0 * (1.0 - t)) * P * P - 1e-6,
+        (1.0, 0.0),
+        [1e3],
+        method="LSODA",
+        rtol=1e-10,
+        atol=1e-14,
+    )
+    assert times[0] == 0.0
+    assert values[0, 0, 0] == pytest.approx(found.y[0, -1], rel=1e-5)
 
 
 def test_schedules_are_kept_and_bad_input_is_told(moving, tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 import fflin
 from fflin.dynamics.integrators import integrator
-from fflin.dynamics.state_rows import moving_error, readout, state_history
+from fflin.dynamics.state import moving_error, readout, state_history
 from tests.support.robots import BUNDLED, FRAMES, random_pose
 from tests.support.weights import unit_weights
 

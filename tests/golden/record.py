@@ -11,7 +11,7 @@ largest entry of the array, are these:
   for A, B, Q and R that are changed by 1e-9 at random. How much it changes for that, times 64 eps,
   is added: an eigensolver of Hamiltonian matrices is backward stable to some multiple of eps.
 - u of an allocation: thrusts that do the same are told apart by rows of 1e-7
-  (`kernel.sharing.LEAST`), so rounding of the loop grows by 1e7 in them.
+  (`kernel.allocation.LEAST`), so rounding of the loop grows by 1e7 in them.
 - the prediction error of a validity study is a difference of two motions: its rounding is that of
   the motions, of the size of the displacement, to which it is relative; their gain is of LAPACK.
 

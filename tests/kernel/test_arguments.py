@@ -16,14 +16,14 @@ from fflin.kernel.arguments import (
     LANED,
     REAL,
     WHOLE,
+    Kind,
     Struct,
     empty,
     laid_out,
-    opener,
     words_of,
 )
 from fflin.kernel.lanes import called, inlined
-from fflin.kernel.parts import PartLibrary
+from fflin.kernel.machine_code import PartLibrary, opener, translated
 
 pytestmark = pytest.mark.compiled
 
@@ -36,7 +36,7 @@ OUTER = Struct(
     on=FLAG,
     flags=FLAGS,
     indices=INDICES,
-    table=numba.types.Array(numba.intp, 2, "C"),
+    table=Kind(np.intp, 2),
     lanes=LANED,
     inner=INNER,
     more=INNER,
@@ -105,21 +105,25 @@ def test_an_empty_value_has_all_fields():
     assert len(words_of(value, OUTER)) == OUTER.size == 20
 
 
-def test_parts_are_compiled_with_what_calls_them():
-    @called
-    def square(x):
-        return x * x + 1.0
+@called
+def square(x):
+    return x * x + 1.0
 
-    @inlined
-    def twice(x):
-        return 2.0 * square(x)
+
+@inlined
+def twice(x):
+    return 2.0 * square(x)
+
+
+def test_parts_are_compiled_with_what_calls_them():
+    one, other = translated(square), translated(twice)
 
     @numba.njit
     def total(x):
-        return twice(x) - square(3.0 * x)
+        return other(x) - one(3.0 * x)
 
-    assert total(2.0) == 10.0 - 37.0
-    for part in (square, twice):
+    assert total(2.0) == twice(2.0) - square(6.0) == 10.0 - 37.0
+    for part in (one, other):
         (made,) = part.overloads.values()
         assert isinstance(made.library, PartLibrary)
         assert made.library.get_pointer_to_function(made.fndesc.llvm_func_name) == 0

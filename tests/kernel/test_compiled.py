@@ -1,8 +1,10 @@
 """The compiled kernel on disk: made once, told once, and never from older sources."""
 
+import io
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillWaits
 from dataclasses import replace
@@ -29,10 +31,10 @@ def signatures():
 @pytest.fixture
 def compiled(monkeypatch, tmp_path, signatures):
     """A function of the kernel that keeps its code in a folder of its own."""
-    from fflin.kernel import derivatives as batch_kernel
+    from fflin.kernel import machine_code
 
     new = SimpleNamespace(stats=SimpleNamespace(cache_path=tmp_path), compile=signatures.append)
-    monkeypatch.setattr(batch_kernel, "derive", new)
+    monkeypatch.setattr(machine_code, "translated", lambda function: new)
     kernel_code._prepared.cache_clear()
     yield new
     kernel_code._prepared.cache_clear()
@@ -150,8 +152,8 @@ def test_processes_compile_one_at_a_time_and_a_killed_one_leaves_no_lock(tmp_pat
 @pytest.mark.parametrize("name", BUNDLED)
 def test_one_set_of_machine_code_serves_every_robot_policy_and_option(robots, name):
     """Motions and campaigns under every policy, with limits, wheels, pulses, samples and faults."""
-    from fflin.kernel.loop import advance
-    from fflin.kernel.tally import take
+    advance = kernel_code.kernel("loop", "advance")
+    take = kernel_code.kernel("statistics", "take")
 
     for make in POLICIES:
         if make is between_gains and not robots[name].n:
@@ -170,3 +172,17 @@ def test_one_set_of_machine_code_serves_every_robot_policy_and_option(robots, na
     fflin.monte_carlo(robot, law, given, limits="urdf", **options, threads=1)
     fflin.monte_carlo(robots[name], None, {"q_b": 0.1}, runs=1, duration=0.1, engine="compiled")
     assert [len(each.signatures) for each in (advance, take)] == [1, 1]
+
+
+def test_a_terminal_shows_the_seconds_of_a_compilation(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(kernel_code, "_INTERVAL", 0.01)
+    for stderr, shown in ((Terminal(), True), (io.StringIO(), False)):
+        monkeypatch.setattr(sys, "stderr", stderr)
+        with kernel_code._seconds_shown("the loop"):
+            time.sleep(0.1)
+        assert ("\rcompiling the loop: 0 s " in stderr.getvalue()) == shown
+        assert stderr.getvalue().endswith("\r\x1b[2K") == shown

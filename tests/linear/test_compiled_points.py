@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.linear import prepared
+from fflin.linear import linearization
 from tests.batch.test_equations import TILTED, operating_points
 from tests.support.robots import random_point
 
@@ -95,7 +95,7 @@ def test_one_point_goes_by_python_unless_asked_otherwise(robots):
 def test_an_engine_that_cannot_is_refused(robots, monkeypatch):
     with pytest.raises(fflin.UnknownNameError, match="'fast'"):
         fflin.Linearizer(robots["cubesat"], engine="fast")
-    monkeypatch.setattr(prepared, "numba_is_there", lambda: False)
+    monkeypatch.setattr(linearization, "numba_is_there", lambda: False)
     with pytest.raises(fflin.InputError, match=r"'compiled'.*fflin\[fast"):
         fflin.Linearizer(robots["cubesat"], engine="compiled")
     monkeypatch.undo()

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.linear import trajectory_sampling
+from fflin.linear import linear_trajectory
 from tests.support.motions import motion
 from tests.support.robots import mostly, random_point
 
@@ -215,8 +215,8 @@ def test_a_step_of_the_transition_is_of_order_four(monkeypatch):
     exact = transition(along, 0.0, 0.2)
     errors = []
     for parts in (1, 2, 4):
-        monkeypatch.setattr(trajectory_sampling, "_MOST_PARTS", parts)
-        found = next(trajectory_sampling.transitions(along, along.matrices, 0.2))[1]
+        monkeypatch.setattr(linear_trajectory, "_MOST_PARTS", parts)
+        found = next(linear_trajectory.transitions(along, along.matrices, 0.2))[1]
         errors.append(np.abs(found - exact).max())
     assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx([4.0, 4.0], abs=0.5)
 

@@ -1,5 +1,7 @@
 """The equations of A, B and f0 over rows of points, and what they are in closed form."""
 
+from itertools import product
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -13,11 +15,15 @@ from fflin.linear.state_equations import assemble, at_rest
 from tests.support.robots import random_point, random_pose
 
 COUNT = 5
-CASES = [(frame, own, False) for frame in ("hybrid", "local", "world") for own in (True, False)]
-CASES.append(("local", True, True))
+GRAVITY = [{"gravity": (0.0, 0.0, 0.0)}, {"gravity": (0.3, -1.0, 2.0)}]
+CASES = [
+    *product(("hybrid", "local", "world"), (True, False), (False,), GRAVITY),
+    *product(("local",), (True,), (True,), GRAVITY),
+    (None, False, False, {"orbit": fflin.CircularOrbit(500e3)}),
+]
 
 
-def rows_of(robot, frame, own, *, orbit=False):
+def rows_of(robot, frame, own):
     """State, actuation, chart, nu, u and rates of some points, and the same point by point."""
     rng = np.random.default_rng(3)
     reference = None if own else random_pose(rng, 40.0)
@@ -25,7 +31,7 @@ def rows_of(robot, frame, own, *, orbit=False):
     actuation = Actuation(state)
     source = Accelerations(state, actuation, robot.create_data())
     q, v, u = map(np.array, zip(*(random_point(robot, rng) for _ in range(COUNT)), strict=True))
-    if orbit:
+    if robot.orbit:
         q[:, :3] *= 0.1
     nv, nu = state.nx // 2, state.velocities(v)
     chart = Standing(COUNT) if own else state.charts(q)
@@ -48,25 +54,14 @@ def assembled(state, actuation, chart, nu, u, rates, moving):
     return A, own.by_u, f0
 
 
-@pytest.mark.parametrize(("frame", "own", "moving"), CASES)
-@pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (0.3, -1.0, 2.0)])
-def test_many_rows_are_the_same_as_one_after_the_other(robots, frame, own, moving, gravity):
-    robot = robots["planar_detumble"].replace(gravity=gravity)
+@pytest.mark.parametrize(("frame", "own", "moving", "fields"), CASES)
+def test_many_rows_are_the_same_as_one_after_the_other(robots, frame, own, moving, fields):
+    robot = robots["planar_detumble"].replace(**fields)
     state, actuation, (chart, nu, u, rates), points = rows_of(robot, frame, own)
     many = Rates(*(np.array(part) for part in zip(*rates, strict=True)))
     found = assembled(state, actuation, chart, nu, u, many, moving)
     for row, point in enumerate(points):
         for all_rows, one in zip(found, assembled(state, actuation, *point, moving), strict=True):
-            assert np.abs(all_rows[row] - one).max() < 1e-13 * max(1.0, np.abs(one).max())
-
-
-def test_rows_in_an_orbit_are_the_same_as_one_after_the_other(robots):
-    robot = robots["planar_detumble"].replace(orbit=fflin.CircularOrbit(500e3))
-    state, actuation, (chart, nu, u, rates), points = rows_of(robot, None, False, orbit=True)
-    many = Rates(*(np.array(part) for part in zip(*rates, strict=True)))
-    found = assembled(state, actuation, chart, nu, u, many, False)
-    for row, point in enumerate(points):
-        for all_rows, one in zip(found, assembled(state, actuation, *point, False), strict=True):
             assert np.abs(all_rows[row] - one).max() < 1e-13 * max(1.0, np.abs(one).max())
 
 

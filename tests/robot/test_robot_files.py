@@ -2,13 +2,14 @@
 
 import time
 import warnings
+from importlib.resources import files
 
 import numpy as np
 import pytest
 
 import fflin
 from fflin.robot.catalog import bundled_directory
-from fflin.robot.input_files import ROBOT_KEYS
+from fflin.robot.robot_files import KEYS
 from tests.support.messages import says
 from tests.support.robots import BUNDLED
 
@@ -338,7 +339,7 @@ STRANGE = (
 
 
 @pytest.mark.parametrize("value", STRANGE)
-@pytest.mark.parametrize("key", ROBOT_KEYS)
+@pytest.mark.parametrize("key", KEYS)
 def test_a_value_of_a_strange_structure_is_one_line(key, value, written):
     head = "" if key == "urdf" else 'urdf = "planar_detumble"\n'
     with pytest.raises(fflin.FflinError, match=r"sat\.toml:") as caught:
@@ -346,3 +347,10 @@ def test_a_value_of_a_strange_structure_is_one_line(key, value, written):
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
     if "0x" in value:
         assert key in str(caught.value) and "too many digits" in str(caught.value)
+
+
+def test_the_draft_and_the_guide_have_every_key():
+    draft = files("fflin.robot").joinpath("assets", "robot.toml").read_text("utf-8")
+    for name, key in KEYS.items():
+        assert key.meaning
+        assert (key.heading or f"{name} = ") in draft or f"${name}" in draft, name

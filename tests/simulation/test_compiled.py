@@ -306,9 +306,9 @@ def test_eight_lanes_are_eight_runs(robots):
         own = fflin.from_model(model, inputs=robot.inputs)
         options = {"x0": share * displaced(lin), "duration": 2.0, "dt": 0.01, "linear": False}
         plan, plant = planned(own, policy, **options)
-        count = len(plant.drives.gain)
-        drives = plant.drives._replace(gain=np.full(count, gain))
-        plans.append((plan, Plant(plant.state, drives=drives)))
+        count = len(plant.faults.gain)
+        faults = plant.faults._replace(gain=np.full(count, gain))
+        plans.append((plan, Plant(plant.state, faults=faults)))
     parts = [
         packing.packed(plan, plant, Conserved(plant.robot, plan.q), batch_tree(plant.robot))
         for plan, plant in plans
@@ -332,10 +332,10 @@ def test_eight_lanes_are_eight_runs(robots):
 
 def in_lanes(parts):
     """What differs between eight runs: start, inertias, inputs, and what is kept."""
-    robot, course, point = parts.robot, parts.course, parts.point
+    robot, reference, point = parts.robot, parts.reference, parts.point
     return (
-        *(robot.tree.bodies, *robot.drives),
-        *(course.start, course.weight, course.per_mass, point.q, point.nu),
+        *(robot.tree.bodies, *robot.faults),
+        *(reference.start, reference.weight, reference.per_mass, point.q, point.nu),
     )
 
 
@@ -362,3 +362,13 @@ def test_a_command_that_is_no_number_is_told(robots):
         said.append(str(caught.value))
     assert said[0] == said[1]
     assert "tau_b.x" in said[0]
+
+
+def test_a_long_run_in_python_says_what_the_compiled_loop_would_take(robots, monkeypatch, caplog):
+    monkeypatch.setattr(compiled, "_LONG_RUN", 0.0)
+    options = {"duration": 0.1, "linear": False}
+    fflin.simulate(robots["cubesat"], **options, engine="python")
+    (record,) = caplog.records
+    assert "--engine compiled" in record.message
+    fflin.simulate(robots["cubesat"], **options, events=[lambda t, q, v: 1.0])
+    assert len(caplog.records) == 1  # which the compiled loop does not do

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.dynamics.state_rows import moved_by
+from fflin.dynamics.state import moved_by
 from fflin.simulation.motion_plot import resting_from
 from tests.support.motions import tracked
 from tests.support.weights import unit_weights

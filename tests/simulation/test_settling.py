@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.control.policies import thrusters_push_every_way
+from fflin.control.policies import thrusters_give_every_wrench
 from fflin.simulation.times import time_to_settle
 
 
@@ -56,16 +56,16 @@ def test_a_loop_that_takes_for_ever_is_looked_at_for_a_minute():
     assert time_to_settle(robot, fflin.StateFeedback(lin, K), q, None) == 60.0
 
 
-def test_which_thrusters_push_every_way():
+def test_which_thrusters_give_every_wrench():
     inspector, cubesat = (
         fflin.load(name, inputs=fflin.load_inputs(name)) for name in ("inspector", "cubesat")
     )
-    assert thrusters_push_every_way(inspector) and thrusters_push_every_way(cubesat)
-    assert not thrusters_push_every_way(fflin.load("cubesat"))
+    assert thrusters_give_every_wrench(inspector) and thrusters_give_every_wrench(cubesat)
+    assert not thrusters_give_every_wrench(fflin.load("cubesat"))
     fewer = [each for each in inspector.inputs if getattr(each, "name", "") != "top_left_front"]
-    assert not thrusters_push_every_way(inspector.replace(inputs=fewer))
+    assert not thrusters_give_every_wrench(inspector.replace(inputs=fewer))
     helped = [*fewer, fflin.BaseTorque(), fflin.BaseForce()]
-    assert thrusters_push_every_way(inspector.replace(inputs=helped))
+    assert thrusters_give_every_wrench(inspector.replace(inputs=helped))
 
 
 def test_what_is_not_fed_back_does_not_lengthen_or_shorten_a_run():

@@ -56,7 +56,7 @@ def sound(folder):
     vector = (0.0, 0.0, 1.0)
     joint = robot.joint_names[0]
     return {
-        "acceleration_lqr": {"lin": lin, "Qp": 1.0, "Qv": 1.0, "Ra": 1.0, "dt": None},
+        "acceleration_lqr": {"lin": lin, "Qp": 1.0, "Qv": 1.0, "Ra": 1.0},
         "Accelerometer": {"frame": "base"},
         "Allocation": {"policy": fflin.StateFeedback(lin, gain.K), "design": robot},
         "BaseForce": {"max": 1.0, "min": (-1.0, -1.0, 0.0)},
@@ -183,6 +183,15 @@ def sound(folder):
             **{"disturbance": None, "callback": None, "linear": None, "every": 1, "x0": None},
             **{"frame": "hybrid", "reference": None, "target": None},
         },
+        "FlexibleAppendage": {
+            **{"frame": "base", "frequency": [0.5], "translation": np.zeros((3, 1))},
+            **{"rotation": np.zeros((3, 1)), "damping": 0.01, "name": "array"},
+            **{"inertia": None, "rigid": False},
+        },
+        "Slosh": {
+            **{"frame": "base", "mass": 1.0, "position": vector, "frequency": 0.2},
+            **{"length": None, "axis": (0, 0, 1), "damping": 0.01, "name": "tank"},
+        },
         "StateFeedback": {"lin": lin, "K": gain.K},
         "StateMap": {"robot": robot, "reference": None, "frame": "hybrid"},
         "sweep": found
@@ -209,6 +218,11 @@ def sound(folder):
             **{"frames": (), "limits": None, "workers": None, "threads": 1, "engine": None},
         },
         "velocity": {"robot": robot, "values": {}},
+        "CLaw": {"folder": fflin.write_c(gain, folder / "c_code"), "compiler": "cc"},
+        "write_c": {
+            **{"law": gain, "folder": folder / "c_code_2", "robot": robot, "limits": "urdf"},
+            **{"name": "controller", "real": "double"},
+        },
         "visualize": {
             **{"robot": robot, "motion": motion, "html": folder / "a.html", "open": False},
             **{"tool": None, "fps": 10.0, "speed": 1.0, "scene": "space", "cloud": None},
@@ -239,7 +253,7 @@ def sound(folder):
         "Robot.replace": {
             **{"self": robot, "inputs": robot.inputs, "outputs": robot.outputs, "gravity": vector},
             **{"stiffness": 1.0, "damping": {}, "rest": {}, "passive": [], "weights": {}},
-            "start": {},
+            **{"point": {}, "target": {}, "start": {}},
         },
         "StateMap.to_pinocchio": {"self": fflin.StateMap(robot), "x": lin.x0},
         "StateMap.to_state": {"self": fflin.StateMap(robot), "q": q, "v": v},

@@ -62,6 +62,8 @@ def settling(robot, duration, *, reference=HOME, predicted=False):
         urdf_sha256=robot.urdf_sha256,
         stopped="",
         wheels=tuple(robot.wheels),
+        modes=tuple(joint.name for joint in robot.modes),
+        mode_rotations=np.array([joint.rotation for joint in robot.modes]),
     )
 
 

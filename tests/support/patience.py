@@ -110,6 +110,23 @@ def finishing(process, what="", *, limit=LIMIT, stall=STALL):
         assert not reason, reason[0]
 
 
+@contextlib.contextmanager
+def in_own_session(command, folder, *, stdout=subprocess.PIPE):
+    """Start a command whose whole group of processes Ctrl-C can reach; see `finishing`."""
+    with (
+        subprocess.Popen(
+            command,
+            cwd=folder,
+            stdout=stdout,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        ) as process,
+        finishing(process),
+    ):
+        yield process
+
+
 def finished(command, *, input=None, capture_output=False, check=False, watch=(), **options):
     """Run a command as `subprocess.run` does, and kill it when waiting for it is in vain."""
     if capture_output:

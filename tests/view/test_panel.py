@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.view.motion_page import subtitle
+from fflin.view.page import subtitle
 from fflin.view.panel import errors, panel
 from tests.support.motions import led, settling
 from tests.support.robots import random_pose

@@ -7,8 +7,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.robot.frames import ROOT
-from fflin.view.phases import _flight
+from fflin.robot.joints import ROOT
+from fflin.view.playback import _flight
 from tests.support.phases import DEBRIS, TWIST, phases
 
 # Positions travel as 32-bit floats, of metres.

@@ -1,19 +1,28 @@
-"""Reader of URDF files, which builds a Pinocchio model with a free-flyer root joint."""
+"""Reader of URDF and xacro files, which builds a Pinocchio model with a free-flyer root joint."""
 
 import hashlib
+import sys
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
 import pinocchio as pin
 
-from fflin.base.errors import UrdfError
-from fflin.base.writing import read_file
-from fflin.robot.urdf.joints import UNLIMITED, JointElement, Mimic, counted_leaders, resolve_mimics
+from fflin.base.errors import MissingPackageError, UrdfError
+from fflin.base.process import import_path_without
+from fflin.base.writing import read_file, remember
+from fflin.robot.urdf.joints import (
+    UNLIMITED,
+    JointElement,
+    Mimic,
+    Urdf,
+    counted_leaders,
+    read_description,
+    resolve_mimics,
+)
 from fflin.robot.urdf.links import INERTIA, Link, Pose, inertia_notes
-from fflin.robot.urdf.tree import Urdf, read_description
-from fflin.robot.urdf.xacro import expand, first_xacro
 from fflin.robot.urdf.xml import Element, enumerated, named, parse, told
 
 _SIZE_LIMIT = 64 * 2**20
@@ -27,6 +36,18 @@ _STACK = 16 * 2**20
 
 # What the values of attributes cannot hold as it is.
 _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
+
+# How long an expansion may take [s]; xacro's expressions and macros may be without end.
+XACRO_LIMIT = 60.0
+
+# Run as a file: by a module's name or as a text it could import from the working folder.
+_CHILD = str(Path(__file__).with_name("xacro_child.py"))
+
+# What lies below these does not reach the model, so a "${" there is no reason to expand.
+_IGNORED = {
+    *("visual", "collision", "material", "gazebo", "transmission", "ros2_control"),
+    *("sensor", "plugin", "safety_controller", "calibration"),
+}
 
 
 class Advice(NamedTuple):
@@ -210,3 +231,48 @@ def _numbers(values: tuple[float, ...]) -> str:
 def _quoted(text: str) -> str:
     """Write an attribute's value. The standard library's ways load far more than they do."""
     return f'"{text.translate(_ENTITIES)}"'
+
+
+def first_xacro(root: Element) -> Element | None:
+    """Return the first element that makes use of xacro; declaring its prefix does not count."""
+    for element in chain([root], root.iterate(_IGNORED)):
+        marked = any("${" in value or "$(" in value for value in element.attributes.values())
+        if marked or element.tag.startswith("xacro:"):
+            return element
+    return None
+
+
+def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
+    """Return a xacro document as plain URDF, and what xacro said; `first` is for errors."""
+    import json
+    import subprocess
+    from importlib.util import find_spec
+
+    use = f", first used by <{first.tag}> in line {first.line}" if first else ""
+    if not (find_spec("xacro") and find_spec("xacrodoc")):
+        raise MissingPackageError(
+            f"{path}: the file is written in xacro{use}, which needs another package; install it "
+            "with: pip install 'fflin[xacro]'"
+        )
+    failed = f"{path}: xacro cannot expand the file{use}"
+    child = [sys.executable, "-I", "-X", "utf8", "-W", "ignore", _CHILD]
+    try:
+        done = subprocess.run(
+            [*child, str(path), str(XACRO_LIMIT), *import_path_without("", path.parent)],
+            input=document,
+            capture_output=True,
+            timeout=XACRO_LIMIT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise UrdfError(
+            f"{failed}: the expansion takes more than {XACRO_LIMIT:g} s; look for a macro or an "
+            "expression that never ends"
+        ) from None
+    said = done.stderr.decode(errors="replace").splitlines()
+    if done.returncode:
+        why = " ".join(said[-1:]) or f"its process ended with exit code {done.returncode}"
+        raise UrdfError(f"{failed}: {why[:300]}")
+    files, _, urdf = done.stdout.partition(b"\n")
+    remember(*json.loads(files))
+    return urdf, [f"{path.name}: {line}" for line in said if line]

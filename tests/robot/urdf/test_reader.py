@@ -15,7 +15,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.robot.urdf import xacro as expansion
+from fflin.robot.urdf import reader as expansion
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.reader import describe, read_urdf
 from fflin.robot.urdf.xml import parse
@@ -332,7 +332,7 @@ def test_without_xacrodoc_one_line_says_how(monkeypatch):
 def test_a_xacro_without_end_is_one_line(endless, monkeypatch):
     """In Python, inside a call that holds the interpreter, and by macros."""
     pytest.importorskip("xacrodoc")
-    monkeypatch.setattr(expansion, "LIMIT", 1.0)
+    monkeypatch.setattr(expansion, "XACRO_LIMIT", 1.0)
     with pytest.raises(fflin.UrdfError, match=r"xacro.* 1 s"):
         read(arm(child=endless, attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"'))
 

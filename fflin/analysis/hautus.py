@@ -1,0 +1,311 @@
+"""Controllable and observable subspaces by the Popov-Belevitch-Hautus test, pole by pole.
+
+`split_by_poles` tests any pair (A, B), or the dual pair (A^T, C^T), by [A - s E, B].
+`unobservable` tests second-order systems by [p^2 M + p D + K; C_s + p C_v], with less rounding.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fflin.analysis.mechanics import SecondOrder, rates_of_positions
+from fflin.analysis.ranks import (
+    EPS,
+    Decision,
+    FixedPoles,
+    Margin,
+    Noisy,
+    Values,
+    decided,
+    image,
+    judged,
+    null_space,
+    right_vectors,
+    stacked,
+    unit_columns,
+)
+from fflin.base.validation import Array
+
+# A singular value above _SUSPICIOUS is not zero. Only eigenvectors whose product with inputs of
+# unit length is smaller, or whose eigenvalue has a neighbour this near, need a singular value.
+_SUSPICIOUS = 1e-3
+
+# Eigenvalues nearer than this are the same: rounding moves a defective one by its square root.
+# Second-order poles nearer than _DEFECTIVE are taken for defective, of which eigenvectors say too
+# little.
+_SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
+
+# The Rayleigh quotient of a singular vector converges quadratically to the pole, in few steps.
+# Second-order poles take twice as many, each of less than _NEAR times the pole.
+_REFINEMENTS, _NEAR = 4, 0.1
+
+# Poles that sampling brings this near to each other may hide what the continuous model shows.
+_ALIASED = 1e-6
+
+# A slower decay may be a defective pair of poles at zero, which rounding moves by its square root.
+_DECAY = 1e-7
+
+# A motion of which a sample leaves less has died out: the rest is rounding.
+_DEAD = 1e4 * EPS
+
+
+class _Scaled(NamedTuple):
+    """A pair in coordinates of energy: ``x = to_x @ xi``, time in units of `unit` seconds."""
+
+    A: Array
+    to_x: Array
+    from_x: Array
+    unit: float
+    tolerance: float
+
+
+def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
+    """Scale Jacobians to units of energy, and of time so that A has a size of about 1."""
+    # Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
+    # likewise over the time unit. The tolerance is twenty times the rounding of M^-1, or that of
+    # the exponential which the slopes of a sampled model are a difference of.
+    nv = len(M)
+    p, v = slice(0, nv), slice(nv, None)
+    L = np.linalg.cholesky(M)
+    N = rates_of_positions(X)
+    to_velocity, zero = np.linalg.inv(L.T), np.zeros((nv, nv))
+    to_x = np.block([[N @ to_velocity, zero], [zero, to_velocity]])
+    back = np.block([[L.T @ np.linalg.inv(N), zero], [zero, L.T]])
+    A = back @ X @ to_x
+    turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
+    rate = max(turning, drag, np.sqrt(fall))
+    # Without forces no unit of time is better than another.
+    unit = 1.0 / rate if rate > 0.0 else 1.0
+    if dt:
+        # Sampled at the period of its only vibration, the model shows only rounding as forces.
+        unit = min(unit, 100.0 * dt)
+    # With time in this unit, positions are measured in it too.
+    stretch = np.repeat((unit, 1.0), nv)
+    to_x, back = to_x * stretch, back / stretch[:, None]
+    root = np.sqrt(M.diagonal())
+    condition = float(np.linalg.cond(M / np.outer(root, root)))
+    A = unit * A * stretch / stretch[:, None]
+    noise = EPS * (unit / dt + float(np.linalg.norm(A, 2))) if dt else 0.0
+    return _Scaled(A, to_x, back, unit, 20.0 * max(len(X) * EPS * condition, noise))
+
+
+class Split(NamedTuple):
+    """The state space of a model, split into what its inputs reach and the rest."""
+
+    inside: Array  # (nx, d), basis of the controllable subspace
+    outside: Array  # (nx, nx - d), basis of a complement; the unobservable subspace of a dual pair
+    rows: Array  # (nx - d, nx) with rows @ x what no input acts on
+    fixed: FixedPoles  # of the complement
+
+
+def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False) -> Split:
+    """Split the state space of (X, B) by left vectors w [A - s E, B] = 0 at every eigenvalue s."""
+    # They are split off by an orthogonal transformation, until there are none: so that the whole of
+    # a defective eigenvalue goes. A staircase would carry the rounding of a weak step into the
+    # next.
+    # X is A, or (A - E)/dt of a sampled model; `drive` is B, or C^T of the dual pair.
+    pair = _scaled(X, M, dt)
+    A, to = (pair.A.T, pair.to_x.T) if dual else (pair.A, pair.from_x)
+    B = unit_columns(to @ drive)
+    inside, margin = np.eye(len(A)), Margin()
+    rest: Array = np.zeros((len(A), 0))
+    while inside.shape[1]:
+        lost, found = _left_vectors(inside.T @ A @ inside, inside.T @ B, pair.tolerance)
+        margin &= found.transformed(inside)
+        if not lost.shape[1]:
+            break
+        rest = np.hstack((rest, inside @ lost))
+        inside = inside @ image(lost, 0.5)[1]
+    nv = len(A) // 2
+    margin = margin.halved().transformed(pair.to_x[nv:, nv:])
+    split = Split(
+        pair.to_x @ inside, pair.to_x @ rest, rest.T @ pair.from_x, FixedPoles(margin=margin)
+    )
+    if not rest.shape[1]:
+        return split
+    rates, vectors = np.linalg.eig(rest.T @ A @ rest)
+    shapes = pair.to_x @ rest @ vectors
+    poles = 1.0 + dt * rates / pair.unit if dt else rates / pair.unit
+    decay = 1.0 - np.abs(poles) if dt else -rates.real
+    least, most = int(decay.argmin()), int(decay.argmax())
+    settling = decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least]).halved()
+    if dt and abs(poles[most]) < _DEAD:
+        # Motions that die out between samples cannot be distinguished.
+        margin &= decided(1.0, shapes[:, most]).halved()
+    return split._replace(fixed=FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling))
+
+
+def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
+    """Return an orthonormal real basis (m, k) of the left eigenvectors that are orthogonal to B."""
+    from scipy.linalg import eig
+
+    poles, left = eig(A, left=True, right=False)
+    unseen = np.linalg.norm(left.conj().T @ B, axis=1) < _SUSPICIOUS
+    distances = np.abs(poles[:, None] - poles) + np.eye(len(A))
+    near = unseen | (distances.min(axis=1) < _SUSPICIOUS)
+    # Rounding splits a defective zero into several poles, so that zero itself is tested first.
+    candidates = [0j, *poles[(poles.imag >= 0.0) & near]]
+    found: Array = np.zeros((len(A), 0))
+    margin, known = Margin(), np.zeros(0, dtype=complex)
+    for pole in candidates:
+        vectors, at, decision = _left_vectors_at(A, B, complex(pole), tolerance)
+        if (np.abs(known - at) < _SAME_POLE).any():
+            continue
+        margin &= decision
+        if not vectors.shape[1]:
+            continue
+        known = np.append(known, at)
+        parts = np.hstack((vectors.real, vectors.imag)) if abs(at.imag) > _SAME_POLE else vectors
+        parts = np.real(parts)
+        # Poles that differ only by rounding have the same vectors.
+        new = parts - found @ (found.T @ parts)
+        found = np.hstack((found, image(new, _SUSPICIOUS)[0]))
+    return found, margin
+
+
+def _left_vectors_at(
+    A: Array, B: Array, pole: complex, tolerance: float
+) -> tuple[Array, complex, Margin]:
+    """Return the left vectors (m, k) at a pole, the pole itself, and the margin."""
+    size = len(A)
+    for _ in range(_REFINEMENTS):
+        shift = pole.real if abs(pole.imag) < _SAME_POLE else pole
+        U, values, _ = np.linalg.svd(np.hstack((A - shift * np.eye(size), B)))
+        last = U[:, -1]
+        refined = complex(last.conj() @ A @ last)
+        if not pole or abs(refined - pole) < EPS or values[-1] > _SUSPICIOUS:
+            break
+        pole = refined
+    rank = int((values > tolerance).sum())
+    states = 2 if abs(shift.imag) > _SAME_POLE else 1
+    return U[:, rank:], complex(shift), judged(values / tolerance, U, rank, states)
+
+
+class Unobservable(NamedTuple):
+    """Free motions that a measurement of positions and velocities does not observe."""
+
+    motions: Array  # (2 nv, k), basis of the unobservable subspace, (s, ds/dt)
+    shapes: tuple[tuple[complex, Values], ...]  # (nv, m), of each continuous pole or pair but zero
+    fixed: FixedPoles
+
+
+def unobservable(
+    system: SecondOrder, position: Noisy, velocity: Noisy, dt: float
+) -> Unobservable | None:
+    """Find the motions that ``position @ s + velocity @ ds/dt`` does not show.
+
+    They are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p; None where
+    eigenvectors do not tell: of other K or D, of aliased or defective poles.
+    """
+    # Those of the pole zero come in chains of two at the most: K s = K v = D v = C_s v = 0 and
+    # C_s s + C_v v = 0. What hides from the inputs are, by symmetry, those of C_s = S^T, C_v = 0.
+    if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
+        return None
+    at_zero, margin = _missed_at_zero(system, position, velocity)
+    motions, poles = [at_zero], [0j] * at_zero.shape[1]
+    slowest = Decision(np.inf)
+    starts, decided_zero = system.poles
+    margin &= decided_zero
+    missed: list[tuple[complex, Values]] = []
+    for start in starts:
+        shapes, pole, judged = _missed_shapes_at(system, position, velocity, complex(start))
+        if any(abs(pole - other) < _SAME_POLE * abs(pole) for other, _ in missed):
+            continue
+        margin &= judged
+        if not shapes.shape[1]:
+            continue
+        if not _simple(system, shapes, pole):
+            return None
+        missed.append((pole, shapes))
+        motion = np.vstack((shapes, pole * shapes))
+        pair = [pole, pole.conjugate()] if pole.imag else [pole]
+        motions += [motion.real, motion.imag][: len(pair)]
+        poles += [each for each in pair for _ in shapes.T]
+        slow = max(-pole.real / abs(pole) / (1e2 * EPS * len(system.M)), 0.0)
+        slowest = min(slowest, Decision(slow, shapes[:, 0]), key=lambda decision: decision.ratio)
+    known = [pole for pole, _ in missed]
+    near = [abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(known) for b in known[:i]]
+    near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in known]
+    if any(near):
+        return None
+    fixed = FixedPoles(
+        poles=np.exp(np.array(poles) * dt) if dt else np.array(poles),
+        decays=not at_zero.shape[1] and slowest.ratio > 1.0,
+        margin=margin,
+        settling=Margin() if at_zero.shape[1] else decided(slowest.ratio, slowest.at),
+    )
+    return Unobservable(np.hstack(motions), tuple(missed), fixed)
+
+
+def _missed_at_zero(system: SecondOrder, position: Noisy, velocity: Noisy) -> tuple[Array, Margin]:
+    none, empty = (Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values))
+    rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
+    fast, slow = np.abs(velocity.values).max(initial=0.0), np.abs(position.values).max(initial=0.0)
+    unit = slow / fast if fast and slow else 1.0
+    scale = np.concatenate((1.0 / system.size, unit / system.size))
+    basis, margin = null_space(stacked([*rows, [position, velocity]]) @ np.diag(scale))
+    return basis * scale[:, None], margin.halved().transformed(1.0 / system.size)
+
+
+def _missed_shapes_at(
+    system: SecondOrder, position: Noisy, velocity: Noisy, pole: complex
+) -> tuple[Values, complex, Margin]:
+    """Return the shapes (nv, k) that are missed at a pole, the pole refined, and the margin."""
+    M, K, D = system.M, system.K.values, system.D.values
+    for step in range(2 * _REFINEMENTS):
+        # Rows are scaled by what stands in them: a slow mode beside a fast one keeps its figures.
+        s = pole if pole.imag else pole.real
+        size = abs(s)
+        weight = np.sqrt(
+            size**2 * M.diagonal() + size * np.abs(D.diagonal()) + np.abs(K.diagonal())
+        )
+        units = np.outer(weight, weight)
+        spread = 4.0 * EPS * size**2 * np.outer(system.size, system.size)
+        spread = (spread + size * system.D.noise + system.K.noise) / units
+        noise = (position.noise + size * velocity.noise) / weight
+        pencil = (s * s * M + s * D + K) / units
+        seen = (position.values + s * velocity.values) / weight
+        stack = Noisy(np.vstack((pencil, seen)), np.vstack((spread, noise)))
+        values, vectors, rank, margin = right_vectors(stack, 2 if pole.imag else 1)
+        shapes = vectors / weight[:, None]
+        refined = _root(system, shapes[:, -1], pole)
+        moved = abs(refined - pole) / size
+        if not 4.0 * EPS < moved < _NEAR or (step and values[-1] > _SUSPICIOUS):
+            break
+        pole = refined
+    return shapes[:, rank:], pole, margin.transformed(1.0 / weight)
+
+
+def _root(system: SecondOrder, shape: Values, near: complex) -> complex:
+    """Return the root of the scalar equation of a shape that is nearest to a pole."""
+    left = shape
+    if abs(shape @ system.M @ shape) < 0.1 * abs(shape.conj() @ system.M @ shape):
+        left = shape.conj()  # where poles are equal, shape^T M shape may vanish
+    a, b, c = (left @ X @ shape for X in (system.M, system.D.values, system.K.values))
+    root = np.sqrt(complex(b * b - 4.0 * a * c))
+    q = -(b + (root if (np.conj(b) * root).real >= 0.0 else -root)) / 2.0
+    roots = [q / a, c / q] if q else [0j]
+    refined = complex(min(roots, key=lambda value: abs(value - near)))
+    if not near.imag:
+        return complex(refined.real)
+    if not system.D.values.any():
+        return complex(0.0, refined.imag)
+    return refined
+
+
+def _simple(system: SecondOrder, shapes: Values, pole: complex) -> bool:
+    """Whether a pole has as many eigenvectors as its multiplicity, beyond rounding."""
+    change = shapes.T @ (2.0 * pole * system.M + system.D.values) @ shapes
+    size = np.abs(shapes).T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(system.D.values))
+    least = np.linalg.svd(change, compute_uv=False)[-1]
+    return least > _DEFECTIVE * np.linalg.norm(size @ np.abs(shapes))
+
+
+def _aliased(poles: Values, dt: float) -> bool:
+    """Whether sampling maps two poles to one, or a vibration to a pole at rest."""
+    s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
+    apart = s[:, None] - s
+    turns = np.round(apart.imag / (2.0 * np.pi))
+    return ((turns != 0.0) & (np.abs(apart - 2j * np.pi * turns) < _ALIASED)).any()

@@ -1,0 +1,387 @@
+"""Reduced linear models: without conserved momenta, without wheels, or of chosen states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any, TypeAlias, TypeVar
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from fflin.analysis.mechanics import checked, conserved, floating_inertia, second_order, slopes
+from fflin.analysis.names import undecided
+from fflin.analysis.ranks import Margin, Noisy, echelon, image, null_space
+from fflin.base.errors import InputError, StabilizabilityError, listed
+from fflin.base.names import input_keys
+from fflin.base.validation import Array, frozen
+from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.state import StateMap
+from fflin.linear.files import given
+from fflin.linear.model import LinearModel, same_certificate
+from fflin.robot.joints import frame_index
+from fflin.robot.robot import Robot
+
+Indices: TypeAlias = NDArray[np.intp]
+Make: TypeAlias = Callable[[LinearModel], LinearModel]
+Part = TypeVar("Part", bound=LinearModel)
+
+# What is smaller, relative to the rest, is rounding.
+_ROUNDING = 1e-9
+
+# Largest part of f0, relative to it, that the reduced state may leave out.
+_DRIFT = 1e-9
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class ReducedModel(LinearModel):
+    """Linear model reduced to the coordinates on which inputs, springs and dampers act.
+
+    Let z be the reduced state and x the full state; then ``z = S x`` for all motions. For motions
+    with zero conserved momenta, ``x - x0 = T (z - z0)``. A saved file contains the model, but not
+    the maps T and S.
+
+    Attributes
+    ----------
+    T : ndarray (nx, nz)
+        Map from the reduced state to the full state.
+    S : ndarray (nz, nx)
+        Map from the full state to the reduced state; it selects the states that have the same
+        names.
+    momenta : ndarray (k, nx)
+        Rows L1 of the conserved momenta, which are zero in the reduced model.
+    coordinates : ndarray (k, nx)
+        Rows L2 of the coordinates whose rates are the momenta; they are zero in the reduced model.
+    margin : Margin
+        Certainty of the rank decision on the conserved momenta, as in `Controllability`.
+    notes : tuple of str
+        Ranks that rounding error leaves undecided.
+
+    Examples
+    --------
+    >>> motors = [fflin.JointTorque(f"joint_{i}") for i in (1, 2, 3)]
+    >>> arm = fflin.load("planar_detumble", inputs=motors)
+    >>> reduced = fflin.momentum_reduction(fflin.linearize(arm))
+    >>> reduced.T.shape, reduced.momenta.shape
+    ((18, 6), (6, 18))
+    >>> bool(abs(reduced.S @ reduced.T - np.eye(6)).max() < 1e-12)
+    True
+    """
+
+    T: Array
+    S: Array
+    momenta: Array
+    coordinates: Array
+    margin: Margin
+    notes: tuple[str, ...]
+
+
+def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) -> ReducedModel:
+    r"""Remove the conserved momenta from a model, exactly.
+
+    A momentum :math:`W M \nu` that no input, spring or damper changes stays zero if it starts at
+    zero. The reduction removes it, and the coordinate that it drives. For an unactuated base these
+    are all six momenta, and with :math:`G = -M_{bb}^{-1} M_{bm}`
+
+    .. math::
+        \nu_b = G \dot q_m, \quad M^* \ddot q_m = \tau_m - K q_m - D \dot q_m, \quad
+        M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}.
+
+    These are equations (9.2) and (9.3) of docs/derivation.md.
+
+    If inputs act on the attitude or on the position of the base, the states of this coordinate are
+    kept. Without springs the result is minimal; with springs it may contain vibrations that no
+    input drives. Its transfer function from inputs to joint states equals the full model's.
+
+    Reaction wheels are removed as well, whatever their momentum (9.4), while the attitude that they
+    control is kept. Three kinds of wheels are kept with their angles:
+
+    - wheels whose speeds are to be controlled (9.5);
+    - wheels on a carrier that rotates at the operating point;
+    - wheels with friction.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Model about rest, continuous or sampled.
+    wheel_speeds : bool, optional
+        Whether to keep wheels whose speeds the inputs can control. By default they are kept if
+        inputs other than the wheels can rotate the base.
+
+    Returns
+    -------
+    ReducedModel
+        `LinearModel` with the maps ``T`` and ``S``. It has 2 r states, where r is nv minus the
+        number of conserved momenta; all states are kept if no momentum is conserved. Its ``M`` is
+        the inertia of the kept coordinates while the others are free to follow. Its outputs are the
+        outputs of `lin`, except outputs of removed wheels, for which ``T`` has zeros.
+
+    Raises
+    ------
+    InputError
+        If the operating point drifts in a removed direction, or `lin` is not a linear model.
+    ModelError
+        If the robot's model was changed after the linear model was made.
+
+    References
+    ----------
+    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
+
+    Examples
+    --------
+    >>> motors = [fflin.JointTorque(f"joint_{i}") for i in (1, 2, 3)]
+    >>> arm = fflin.load("planar_detumble", inputs=motors)
+    >>> reduced = fflin.momentum_reduction(fflin.linearize(arm))
+    >>> reduced.state_names[:2], len(fflin.lqr(reduced, 1.0, 1.0).poles)
+    (('q_m.joint_1', 'q_m.joint_2'), 6)
+    """
+    whole = checked(lin)
+    wheels = leaving(whole, wheel_speeds)
+    lin = without(whole, wheels) if len(wheels) else whole
+    momenta = conserved(lin)
+    z, T = momenta.selected, momenta.T
+    judged = [name not in lin.ignorable for name in lin.state_names]
+    drift = float(np.abs(lin.f0 - T @ lin.f0[z])[judged].max(initial=0.0))
+    if drift > _DRIFT * float(np.abs(lin.f0).max()):
+        raise InputError(
+            f"the operating point is not an equilibrium: |f0| is {np.abs(lin.f0).max():.3g} and "
+            "drives states that the reduction removes; linearise at rest"
+        )
+    stays = picked(lin.state_names, whole.state_names)
+    reduced = ReducedModel(
+        **part_of(lin, np.eye(len(T))[z], T, momenta.rates.T @ lin.M @ momenta.rates),
+        T=stays.T @ T,
+        S=stays[z],
+        momenta=momenta.momenta @ stays,
+        coordinates=momenta.coordinates @ stays,
+        margin=momenta.margin,
+        notes=undecided(lin, momenta.margin, "kept by the reduction", len(z)),
+    )
+    return certified(reduced, whole, partial(momentum_reduction, wheel_speeds=wheel_speeds))
+
+
+def generalized_inertia(lin: LinearModel) -> Array:
+    r"""Return the generalized inertia: the joints' inertia while the base is free (9.3).
+
+    .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
+
+    The definition is by Umetani and Yoshida, see `momentum_reduction`.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Full model of the robot, at any velocity.
+
+    Returns
+    -------
+    ndarray (n, n)
+        Generalized inertia M*; its inverse is the joint block of M^-1.
+
+    Raises
+    ------
+    InputError
+        If the model lacks the states of the base.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> fflin.generalized_inertia(lin).shape
+    (3, 3)
+    """
+    lin = checked(lin)
+    joints = sum(name.startswith("q_m.") for name in lin.state_names)
+    if len(lin.A) != 12 + 2 * joints:
+        raise InputError("the model lacks the states of the base; give the unreduced model")
+    inertia = floating_inertia(lin.M, range(6, 6 + joints), range(6))
+    return (inertia + inertia.T) / 2.0
+
+
+def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") -> Array:
+    r"""Return the generalized Jacobian from joint rates to a frame's velocity (9.3).
+
+    The base is free, and the momentum of the robot is zero.
+
+    .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
+
+    The definition is by Umetani and Yoshida, see `momentum_reduction`.
+
+    Parameters
+    ----------
+    robot : Robot
+    q : array_like (nq,), optional
+        Configuration; neutral by default.
+    frame : str
+        Name of a frame of the model.
+
+    Returns
+    -------
+    ndarray (6, n)
+        Jacobian from joint rates to angular velocity [rad/s], then velocity of the frame's origin
+        [m/s], both in Pinocchio's world axes.
+
+    Raises
+    ------
+    UnknownNameError
+        If the frame is unknown.
+    InputError
+        If `q` is not a configuration of the robot.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> fflin.generalized_jacobian(robot, frame="hand").shape
+    (6, 3)
+    """
+    state = StateMap(robot)
+    q = robot.neutral() if q is None else robot.checked_configuration(q)
+    model, data = robot.model, robot.create_data()
+    index, axes = frame_index(model, frame), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    full = pin.computeFrameJacobian(model, data, q, index, axes)
+    J = state.columns(np.vstack((full[LINEAR], full[ANGULAR])))
+    M = state.project(pin.crba(model, data, q).T)
+    return J[:, 6:] - J[:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])
+
+
+def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
+    """Return the names of the inputs that are wheels."""
+    keys = (key.partition(".") for key in input_keys(lin))
+    return tuple(name for group, _, name in keys if group == "wheel")
+
+
+def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
+    """Return the wheels (k,) on whose angle nothing depends, and those whose speed is so too."""
+    # A speed matters where the carrier turns at the point, and where the wheel has friction.
+    nv, wanted = len(lin.M), {f"q_m.{name}" for name in wheel_inputs(lin)}
+    at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
+    if not len(at):
+        return at, at
+    system = second_order(lin.generator or lin)
+    angle, speed = (~matrix.values[:, at].any(axis=0) for matrix in (system.K, system.D))
+    return at[angle], at[angle & speed]
+
+
+def leaving(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
+    """Return the wheels (k,) that leave a design (9.5)."""
+    # Inputs that turn nothing at rest may still spin wheels: as many as they do so independently
+    # can be momenta. By default these stay where something else turns the base.
+    if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
+        raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
+    _, free = ignorable_wheels(lin)
+    if len(free) and wheel_speeds is None:
+        turning = [name.startswith("q_b.") for name in lin.state_names[: len(lin.M)]]
+        wheel_speeds = bool(second_order(lin.generator or lin).S.values[turning].any())
+    if not len(free) or not wheel_speeds:
+        return free
+    forces = rigid_forces(without(lin.generator or lin, free))
+    sizes = np.linalg.norm(forces.values, axis=0)
+    idle = null_space(forces @ np.diag(1.0 / np.where(sizes > 0.0, sizes, 1.0)))[0]
+    motors = [lin.input_names.index(lin.state_names[i].removeprefix("q_m.")) for i in free]
+    spun = image(idle[motors], _ROUNDING)[0]
+    return np.delete(free, echelon(spun, np.ones(len(free)))[1])
+
+
+def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
+    """Return the model of the states that are regulated; `lin` itself where it has no wheels."""
+    # What is `leaving` leaves it, the angles of other wheels too where nothing depends on them, so
+    # that there are fewer positions than rates; and the base's position where no input pushes it.
+    if not wheel_inputs(lin):
+        return lin
+    source, nv = lin.generator or lin, len(lin.M)
+    idle = ~second_order(source).S.values.any(axis=1)
+    base = [i for i in range(nv) if idle[i] and lin.state_names[i].startswith("r_b.")]
+    columns = [*base, *(i + nv for i in base)]
+    if np.abs(np.delete(source.A[:, columns], columns, axis=0)).max(initial=0.0) > _ROUNDING:
+        base = []  # in axes that turn one direction is part of the others
+    left = np.union1d(base, leaving(lin, wheel_speeds)).astype(np.intp)
+    part = without(lin, left)
+    angles = {lin.state_names[i] for i in ignorable_wheels(lin)[0]}
+    rest = [name for name in part.state_names if name not in angles]
+    if len(rest) == len(part.M):
+        raise StabilizabilityError(f"the model contains wheel speeds alone{damped_wheels(part)}")
+    return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
+
+
+def damped_wheels(part: LinearModel) -> str:
+    """Return what to do where wheels have damping, of a model that may be without their angles."""
+    nv, rates = len(part.M), slopes(part)[-len(part.M) :, -len(part.M) :]
+    least = _ROUNDING * (np.abs(part.M) @ np.abs(rates)).diagonal()
+    dragged = -(part.M @ rates).diagonal() > least
+    names = [part.state_names[i - nv].removeprefix("qdot_m.") for i in np.flatnonzero(dragged)]
+    damped = [name for name in names if name in wheel_inputs(part)]
+    if not damped:
+        return ""
+    return f": wheel speeds stay in the model due to the damping of {listed(damped)}; remove it"
+
+
+def rigid_forces(body: LinearModel) -> Noisy:
+    """Return what the inputs do to the rigid motions (r, nu), which no spring holds."""
+    system = second_order(body)
+    motions = null_space(system.K.T @ np.diag(1.0 / system.size))[0] / system.size[:, None]
+    return system.S.after(motions.T)
+
+
+def without(lin: LinearModel, left: Indices) -> LinearModel:
+    """Return a model without coordinates (k,) and their rates, exact whatever these do (9.4)."""
+    kept = np.setdiff1d(np.arange(len(lin.M)), left)
+    names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
+    rest = floating_inertia(lin.M, kept, left)
+    return selected(_balanced(lin), names, rest, partial(without, left=left))
+
+
+def _balanced(lin: LinearModel) -> LinearModel:
+    """Return a model without the forces that are rounding of a spin, which its parts lack."""
+    nv, A, system = len(lin.M), lin.A.copy(), second_order(lin)
+    if not lin.dt and not system.K.values.any():
+        A[nv:, :nv] = 0.0
+    if not lin.dt and not system.D.values.any():
+        A[nv:, nv:] = 0.0
+    return replace(lin, A=A)
+
+
+def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
+    """Return the model of some states, of the inertia M, and of the outputs that see no others."""
+    S = picked(names, lin.state_names)
+    seen, values = seen_through(lin, S), part_of(lin, S, S.T, M)
+    values |= {"C": seen @ values["C"], "D": seen @ lin.D, "y0": seen @ lin.y0}
+    for key in ("output_names", "output_units"):
+        values[key] = tuple(getattr(lin, key)[i] for i in seen.argmax(axis=1))
+    return certified(LinearModel(**values), lin, make)
+
+
+def picked(names: Sequence[str], of: Sequence[str]) -> Array:
+    """Return S (k, n) that picks names from others."""
+    return np.eye(len(of))[[of.index(name) for name in names]]
+
+
+def seen_through(lin: LinearModel, S: Array) -> Array:
+    """Return O (k, ny) that picks the outputs which see none but the states S x."""
+    others = np.abs(lin.C - lin.C @ S.T @ S).max(axis=1, initial=0.0)
+    return np.eye(len(lin.C))[others <= 1e-12 * np.abs(lin.C).max(axis=1, initial=0.0)]
+
+
+def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
+    """Return the fields of a model of the states z = S x of the inertia M, the others T z."""
+    names = tuple(lin.state_names[i] for i in S.argmax(axis=1))
+    whole = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
+    return whole | {
+        "A": S @ lin.A @ T,
+        "B": S @ lin.B,
+        "C": lin.C @ T,
+        "f0": S @ lin.f0,
+        "x0": S @ lin.x0,
+        "state_names": names,
+        "state_units": tuple(lin.state_units[i] for i in S.argmax(axis=1)),
+        "_ignorable": partial(given, tuple(name for name in names if name in lin.ignorable)),
+        "_drift": None if lin.drift is None else S @ lin.drift,
+        "_inertia": partial(given, frozen(M)),
+    }
+
+
+def certified(part: Part, lin: LinearModel, make: Make) -> Part:
+    """Return a part with the certificate of the whole, and with what made it of its source."""
+    fingerprint, source = part.fingerprint, lin.generator
+    certify = partial(same_certificate, lin, fingerprint)
+    of = (fingerprint, make(source)) if lin.dt and source is not None else None
+    return replace(part, _certify=certify, _source=of)

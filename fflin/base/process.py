@@ -1,0 +1,73 @@
+"""State of the process: progress bar on stderr, folders of imports, threads of BLAS."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_PATIENCE = 1.0  # seconds before a bar is shown
+_INTERVAL = 0.1
+
+
+class Progress:
+    """A bar; `shown` None shows it on a terminal, once the run takes long."""
+
+    def __init__(self, shown: bool | None = None) -> None:
+        terminal = sys.stderr is not None and sys.stderr.isatty()
+        self._shown = terminal if shown is None else shown
+        self._start = time.monotonic()
+        self._next = self._start + (_PATIENCE if shown is None else 0.0)
+        self._drawn = False
+
+    def update(self, done: int, total: int, what: str = "") -> None:
+        """Say how many steps of how many are done, and of `what`."""
+        if not self._shown or (now := time.monotonic()) < self._next:
+            return
+        self._next = now + _INTERVAL
+        share = done / total
+        left = (now - self._start) * (1.0 - share) / share
+        bar = "#" * round(30 * share)
+        self._drawn = True
+        said = f"\r{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left "
+        print(said, end="", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Take the bar away."""
+        if self._drawn:
+            print("\r\x1b[2K", end="", file=sys.stderr, flush=True)
+
+
+def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
+    """Return `sys.path` without some folders, whatever their entries are called."""
+    return [entry for entry in sys.path if not any(same_folder(entry, each) for each in folders)]
+
+
+def same_folder(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> bool:
+    """Whether two names lead to one folder; an empty one is the working folder's."""
+    try:
+        return os.path.samefile(first or os.curdir, second or os.curdir)
+    except (OSError, ValueError):  # one of them does not exist
+        return False
+
+
+def in_one_thread(function: Callable[P, T]) -> Callable[P, T]:
+    """Limit BLAS to one thread within a function.
+
+    With many small matrices, several threads only wait for each other.
+    """
+
+    @wraps(function)
+    def limited(*args: P.args, **kwargs: P.kwargs) -> T:
+        from threadpoolctl import threadpool_limits
+
+        with threadpool_limits(1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return limited

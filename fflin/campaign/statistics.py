@@ -1,0 +1,184 @@
+"""Statistics of a run: final and largest errors, settling times, and histories at a few times.
+
+Their size does not depend on how long the run is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fflin.base.rotation import conjugate, quaternion_product
+from fflin.base.validation import Array
+from fflin.dynamics.state import StateMap
+from fflin.kernel.arguments import empty, laid_out, words_of
+from fflin.kernel.compiled import kernel
+from fflin.kernel.statistics import RUN_STATISTICS, note
+from fflin.kernel.tree import LANES
+from fflin.simulation.packing import no_law
+from fflin.simulation.plan import Plan
+from fflin.simulation.report import DWELL, SETTLED, THERE
+
+# Kinds of errors with their units; the error of a kind is its largest entry. Wheels and modes are
+# no joints.
+KINDS = {
+    "attitude": "deg",
+    "position": "m",
+    "joints": "rad|m",
+    "turning": "rad/s",
+    "moving": "m/s",
+    "rates": "rad/s|m/s",
+}
+STOPS = ("", "diverged", "left the chart", "stopped")
+
+
+class Outcome(NamedTuple):
+    """Outcomes of runs, one row of each array per run."""
+
+    q: Array  # (N, nq), final
+    v: Array  # (N, nv)
+    x: Array  # (N, nx)
+    u: Array  # (N, nu)
+    largest_x: Array  # (N, nx), errors
+    largest_u: Array  # (N, nu)
+    errors: Array  # (N, kinds), final
+    largest: Array  # (N, kinds)
+    settle: Array  # (N, kinds) [s], settling times; infinite if the error has not settled
+    error_history: Array  # (N, times, kinds), infinite after a run was stopped
+    input_history: Array  # (N, times, nu), zero after a run was stopped
+    stop: Array  # (N,), index into STOPS
+    end: Array  # (N,) [s]
+
+
+def stop_of(message: str) -> int:
+    """Return the index into STOPS of the message with which a run ended."""
+    found = (at for at, word in enumerate(STOPS) if word and message.startswith(word))
+    return next(found, len(STOPS) - 1) if message else 0
+
+
+def kinds_of(state: StateMap) -> NDArray[np.intp]:
+    """Return the index into KINDS of each state (nx,).
+
+    It is 0 for the attitude and for states without a kind, such as modes, and -1 for wheels.
+    """
+    kind = np.zeros(state.nx, dtype=np.intp)
+    groups, wheels = state.groups, state.robot.wheels
+    for number, group in enumerate((groups.r_b, groups.q_m, groups.omega_b, groups.v_b), 1):
+        kind[group] = number
+    kind[groups.qdot_m] = len(KINDS) - 1
+    for index, joint in enumerate(state.robot.joints):
+        if joint.mode or joint.name in wheels:
+            kind[groups.q_m.start + index] = 0 if joint.mode else -1
+            kind[groups.qdot_m.start + index] = 0
+    return kind
+
+
+class RunStatistics:
+    """Statistics of one run, or of eight parallel runs in compiled code; see `lanes.Statistics`.
+
+    Errors are those from the state `target` (nx,), or from a moving one (steps + 1, nx) whose q and
+    nu are the arrays of `path`. Histories are kept at `steps`.
+    """
+
+    span = 2**20  # steps between checks of `over`
+
+    def __init__(
+        self,
+        plan: Plan,
+        state: StateMap,
+        target: Array,
+        steps: Array,
+        path: Sequence[Array],
+        count: int,
+    ) -> None:
+        self._dt, self._state, self._steps, self._count = plan.times.dt, state, steps, count
+        self.over = np.zeros(count, dtype=bool)  # every run goes on to its end
+        robot, kinds, nu = state.robot, len(KINDS), len(plan.initial)
+        first = target if target.ndim == 1 else target[0]
+        x, y, z = first[:3].tolist()
+        attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
+        law, marks = no_law(state, plan.initial), empty(RUN_STATISTICS)
+        law.path.point.q[3:7] = quaternion_product(conjugate(state.origin_quaternion), attitude)
+        way, speed = path or (np.zeros(0), np.zeros(0))
+        marks = marks._replace(
+            robot=marks.robot._replace(
+                index=np.array([joint.idx_q for joint in robot.joints], dtype=np.intp),
+                circling=np.array([joint.unbounded for joint in robot.joints], dtype=bool),
+                scale=np.array([joint.scale for joint in robot.joints]),
+            ),
+            law=law._replace(near=first[state.groups.q_m]),
+            path=law.path,
+            home=first,
+            way=way,
+            speed=speed,
+            kind=kinds_of(state),
+            settled=SETTLED,
+            there=np.full(kinds, THERE),
+            steps=steps,
+            at=marks.at._replace(q=np.zeros(robot.nq), nu=np.zeros(state.nx // 2)),
+            sizes=np.zeros(kinds),
+            largest_x=np.zeros(state.nx),
+            largest_u=np.zeros(nu),
+            largest=np.zeros(kinds),
+            outside=np.full(kinds, -1.0),
+            errors=np.full(len(steps) * kinds, np.inf),
+            inputs=np.zeros(len(steps) * nu),
+        )
+        self._fresh: list[tuple[Array, Array]] = []
+        if count == LANES:
+            self._marks = laid_out(marks, RUN_STATISTICS, lambda *pair: self._fresh.append(pair))
+            self._words = words_of(self._marks, RUN_STATISTICS)
+        else:
+            self._marks = as_lists(marks)
+
+    def reset(self) -> None:
+        """Begin with eight other runs."""
+        for lanes, initial in self._fresh:
+            lanes[:] = initial
+
+    def add(self, first: int, rows: Sequence[Array], raw: Any) -> None:
+        """Add the rows (steps, count, ..) of q, nu, u, .. from step `first` on, also as `raw`."""
+        if self._count == LANES:
+            take = kernel("statistics", "take", "the run statistics")
+            take(self._words, raw, first, len(rows[0]))
+        else:
+            note(self._marks, raw, first, len(rows[0]))
+        self._last = [each[-1] for each in rows[:3]]
+
+    def outcome(self, done: int, stop: Array) -> Outcome:
+        """Return the outcomes of the runs after so many steps; `stop` are indices into STOPS."""
+        (q, nu, u), marks = self._last, self._marks
+
+        def by_run(values: Any, *shape: int) -> Array:
+            shape = shape or (len(values),)
+            return np.moveaxis(np.reshape(values, (*shape, self._count)), -1, 0)
+
+        settled = by_run(marks.outside) + 1.0
+        late = (stop != 0.0)[:, None] | (settled > (1.0 - DWELL) * (done + 1))
+        return Outcome(
+            q=q,
+            v=self._state.spread(nu),
+            x=by_run(marks.law.x),
+            u=u,
+            largest_x=by_run(marks.largest_x),
+            largest_u=by_run(marks.largest_u),
+            errors=by_run(marks.sizes),
+            largest=by_run(marks.largest),
+            settle=np.where(late, np.inf, settled * self._dt),
+            error_history=by_run(marks.errors, len(self._steps), len(KINDS)),
+            input_history=by_run(marks.inputs, len(self._steps), u.shape[1]),
+            stop=stop,
+            end=np.full(self._count, done * self._dt),
+        )
+
+
+def as_lists(value: Any) -> Any:
+    """Return nested named tuples of arrays with lists, whose entries Python reads faster."""
+    if isinstance(value, tuple):
+        made: Any = type(value)
+        return made._make(map(as_lists, value))
+    return value.tolist() if isinstance(value, np.ndarray) else value

@@ -1,0 +1,78 @@
+"""The command `export`, which writes C code of a control law."""
+
+from __future__ import annotations
+
+import argparse
+
+from fflin.base.errors import FileError
+from fflin.base.tables import headed
+from fflin.commands import DONE
+from fflin.commands.arguments import (
+    OUTPUT,
+    Commands,
+    add,
+    command,
+    group_of,
+    input_file,
+    input_name,
+)
+
+
+def add_commands(commands: Commands) -> None:
+    """Add export."""
+    export = command(
+        commands,
+        "export",
+        _export,
+        "write C99 code of a gain, compensator or gain schedule, with a test program",
+        example="fflin export gain.npz --robot servicer_7dof --limits urdf -o flight",
+    )
+    what = "gain, compensator or gain schedule saved by fflin: .npz, .mat or .json"
+    export.add_argument("file", metavar="FILE", type=input_file, help=what)
+    group = group_of(export, OUTPUT)
+    folder = "folder of the code; it is made if necessary"
+    group.add_argument("-o", "--output-folder", metavar="FOLDER", required=True, help=folder)
+    add(
+        group,
+        "--robot",
+        "robot that the design was made for: a name in `fflin robots`, a URDF or a robot.toml. By "
+        "default the robot that FILE names",
+        metavar="ROBOT",
+        type=input_name,
+    )
+    limits = "limit the inputs as in simulate (urdf), or not (none, default)"
+    add(group, "--limits", limits, choices=("urdf", "none"), default="none")
+    add(group, "--name", "prefix of the names in C", metavar="NAME", default="controller")
+    real = "type of the numbers; double by default"
+    add(group, "--real", real, choices=("double", "float"), default="double")
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from fflin.commands.cli import kind_of
+    from fflin.control.gain import Gain
+    from fflin.control.gain_schedule import GainSchedule
+    from fflin.control.kalman import Compensator
+    from fflin.export.writing import write_c
+    from fflin.robot.loading import load
+
+    kinds = {kind.__name__: kind for kind in (Gain, GainSchedule, Compensator)}
+    kind = kind_of(arguments.file)
+    if kind not in kinds and arguments.file.is_file():
+        raise FileError(
+            f"{arguments.file} holds {kind or 'no result of fflin'}, expected a Gain, a "
+            "GainSchedule or a Compensator"
+        )
+    law = kinds.get(kind, Gain).load(arguments.file)
+    folder = write_c(
+        law,
+        arguments.output_folder,
+        robot=load(arguments.robot) if arguments.robot else None,
+        limits=None if arguments.limits == "none" else arguments.limits,
+        name=arguments.name,
+        real=arguments.real,
+    )
+    name, real = arguments.name, arguments.real
+    test = f"cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm && ./{name}_test"
+    print(headed("export", f"{law!r} in C99, with numbers of type {real}"))
+    print(f"wrote {folder}; to test it there: {test}")
+    return DONE

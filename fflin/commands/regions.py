@@ -1,0 +1,222 @@
+"""The commands `validity` and `funnel`: regions in which a model or a regulator holds."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import nullcontext
+from typing import Any
+
+from fflin.base.errors import InputError
+from fflin.base.tables import headed
+from fflin.commands import DONE
+from fflin.commands.arguments import (
+    CONTROLLER,
+    OUTPUT,
+    TRAJECTORY,
+    Commands,
+    add,
+    add_frame,
+    add_output_file,
+    add_point,
+    add_robot,
+    add_system,
+    assignment,
+    command,
+    count_of,
+    group_of,
+    input_file,
+    number,
+    output_file,
+    whole,
+)
+from fflin.commands.loops import along
+from fflin.commands.points import linear_model, load_robot, once
+from fflin.commands.regulator import add_weights, gain_of, regulated_part
+from fflin.commands.tracking import add_trajectory
+from fflin.commands.visual import add_figure, check_figure, draw
+
+_ERRORS = "attitude [deg], position [m], joints, turning (omega_b), moving (v_b) or rates"
+_RUNS = ["knots", "samples", "seed", "confidence", "threads"]
+
+# Options of other commands, which `along` refuses.
+_NONE = "free gain controller target_joint target_rpy target_position target_velocity effort"
+_NONE += " equilibrium"
+_NONE += " joint rpy position velocity"
+
+
+def add_commands(commands: Commands) -> None:
+    """Add validity and funnel."""
+    _add_validity(commands)
+    _add_funnel(commands)
+
+
+def _add_validity(commands: Commands) -> None:
+    validity = command(
+        commands,
+        "validity",
+        _validity,
+        "measure how far the robot can be displaced until the linear model or its regulator fails",
+        example="fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
+        common="joint inputs weights q r bryson dt reduce attitude offset spread samples seed "
+        "jobs limits frames plot",
+    )
+    add_point(validity)
+    add_weights(validity)
+    runs = group_of(validity, "runs")
+    add(runs, "--attitude", "largest rotation of the base [deg]", number, "X", default=90.0)
+    add(runs, "--offset", "largest displacement of the base [m]", number, "X", default=0.5)
+    add(runs, "--spread", "largest displacement of a joint [rad|m]", number, "X", default=1.0)
+    add(runs, "--samples", "number of random runs", count_of, default=100)
+    add(runs, "--seed", "random seed of the runs", whole, "S", default=0)
+    add(runs, "--jobs", "number of processes, at most one for each core", count_of, default=1)
+    add(
+        runs,
+        "--limits",
+        "saturate the inputs at the limits of the robot (urdf), or never (none, default)",
+        choices=("urdf", "none"),
+        default="none",
+    )
+    add(
+        runs,
+        "--frames",
+        "also test the loop with base velocities and inputs in these axes",
+        choices=("hybrid", "local", "world"),
+        nargs="+",
+        default=(),
+    )
+    add_figure(validity, "plot the results")
+
+
+def _add_funnel(commands: Commands) -> None:
+    funnel = command(
+        commands,
+        "funnel",
+        _funnel,
+        "measure from which errors the regulator along a trajectory still reaches a goal",
+        example="fflin funnel arm.toml --trajectory plan.csv --schedule gains.npz "
+        "--goal attitude=1",
+        common="trajectory schedule goal within weights q r knots samples seed confidence threads "
+        "step limits limit frame inputs output-file plot html",
+    )
+    add_robot(funnel)
+    add_system(funnel)
+    add_frame(group_of(funnel, TRAJECTORY))
+    add_trajectory(funnel)
+    add_weights(funnel)
+    runs, shown = group_of(funnel, "runs"), group_of(funnel, OUTPUT)
+    add(
+        group_of(funnel, CONTROLLER),
+        "--schedule",
+        "use the gains that tvlqr saved; without this option, gains are designed along the "
+        "trajectory",
+        input_file,
+    )
+    goal = f"largest error allowed at the end: {_ERRORS}"
+    add(runs, "--goal", goal, assignment, repeatable=True)
+    within = "largest error allowed at any time of a run; names as in --goal"
+    add(runs, "--within", within, assignment, repeatable=True)
+    add(
+        runs,
+        "--limits",
+        "saturate the inputs at the limits of the robot (urdf, default), or never (none)",
+        choices=("urdf", "none"),
+        default="urdf",
+    )
+    add(
+        runs,
+        "--limit",
+        "largest magnitude of an input, group or pattern; it takes precedence over --limits",
+        assignment,
+        repeatable=True,
+    )
+    add(runs, "--knots", "number of knots to test", count_of, default=10)
+    add(runs, "--samples", "number of runs from each knot", count_of, default=100)
+    add(runs, "--seed", "random seed of the runs", whole, "S", default=0)
+    add(runs, "--confidence", "confidence level of the intervals", number, "P", default=0.95)
+    add(runs, "--threads", "number of threads; by default one for each core", count_of)
+    add(runs, "--step", "integration step [s]; chosen automatically by default", number, "H")
+    add(
+        shown, "--html", "write a page that plays the motion with the funnel as a tube", output_file
+    )
+    add_figure(funnel, "plot the funnel")
+    what = "save the funnel to FILE: .npz, .mat or .json"
+    add_output_file(shown, what, "Funnel")
+    funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
+
+
+_FREE = "as large as it takes; --limits urdf cuts them"
+
+
+def _validity(arguments: argparse.Namespace) -> int:
+    from fflin.base.process import Progress
+    from fflin.batch.workers import OwnWorkers
+    from fflin.campaign.validity import validity
+
+    robot, lin = linear_model(arguments)
+    check_figure(arguments.plot)
+    lin = regulated_part(lin, arguments)
+    gain = gain_of(lin, arguments)
+    judged = lin.discretize(arguments.dt) if arguments.dt else lin
+    bar, cut = Progress(), arguments.limits == "urdf"
+    try:
+        with OwnWorkers(arguments.jobs) if arguments.jobs > 1 else nullcontext() as executor:
+            found = validity(
+                robot,
+                judged,
+                gain,
+                attitude=arguments.attitude,
+                position=arguments.offset,
+                joint=arguments.spread,
+                samples=arguments.samples,
+                seed=arguments.seed,
+                frames=arguments.frames,
+                limits="urdf" if cut else None,
+                executor=executor,
+                progress=bar.update,
+            )
+    finally:
+        bar.close()
+    print(headed("validity", str(found)))
+    if cut or any(name in lin.limits for name in lin.input_names):
+        print("inputs were " + ("cut to the limits of the robot" if cut else _FREE))
+    draw(arguments.plot, "plot_validity", found)
+    return DONE
+
+
+def _funnel(arguments: argparse.Namespace) -> int:
+    from fflin.base.process import Progress
+    from fflin.base.record import FORMATS
+    from fflin.base.writing import check_place
+    from fflin.campaign.funnel import funnel
+
+    if arguments.trajectory is None and arguments.schedule is None:
+        raise InputError("neither --trajectory nor --schedule is given; give one of them, or both")
+    check_figure(arguments.plot)
+    for path, endings in ((arguments.html, (".html",)), (arguments.output_file, FORMATS)):
+        if path:
+            check_place(path, endings)
+    robot = load_robot(arguments)
+    policy, _ = along(robot, arguments)
+    given = once("--limit", arguments.limit)
+    urdf = "urdf" if arguments.limits == "urdf" else None
+    limits: Any = [urdf, given] if urdf and given else given or urdf
+    options: dict[str, Any] = {"limits": limits, "dt": arguments.step}
+    kept = {key: getattr(arguments, key) for key in _RUNS} | options
+    kept["within"], bar = once("--within", arguments.within), Progress()
+    try:
+        goal = once("--goal", arguments.goal)
+        found = funnel(robot, policy, goal, progress=bar.update, **kept)
+    finally:
+        bar.close()
+    print(headed("funnel", str(found)))
+    draw(arguments.plot, "plot_funnel", found)
+    if arguments.output_file:
+        found.save(arguments.output_file)
+        print(f"wrote {arguments.output_file}")
+    if arguments.html:
+        from fflin.simulation.simulate import simulate
+        from fflin.view.visualize import visualize
+
+        visualize(robot, simulate(robot, policy, **options), html=arguments.html, funnel=found)
+        print(f"wrote {arguments.html}: {arguments.html.stat().st_size / 1e6:.2f} MB")
+    return DONE

@@ -1,0 +1,183 @@
+"""Mass properties of a robot at a point, and what its wheels and thrusters can do there."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations, islice, product
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.tables import counted, folded, grid
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.inputs import named_wheels
+from fflin.robot.limits import limits_of
+from fflin.robot.robot import Robot
+from fflin.robot.wheels import carrier
+
+_FACETS = 20_000  # normals that are computed at once
+_MANY = 36  # thrusters, which have 400 000 facets
+
+# A force or torque that is smaller, relative to the sum of all thrusts, is rounding error.
+_ROUNDING = 1e-9
+
+_AXES = "xyz"
+
+
+def point_report(robot: Robot, q: Array, v: Array) -> str:
+    """Show mass, centre of mass, inertia, wheels and thrusters at a point, in base axes."""
+    center, inertia = mass_properties(robot, q)
+    moments, axes = np.linalg.eigh(inertia)
+    axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), range(3)])
+    head = ["inertia", *_AXES, "principal", *(f"axis {axis}" for axis in _AXES)]
+    rows = [head]
+    for row, moment, axis, name in zip(inertia, moments, axes.T, _AXES, strict=True):
+        shown = ["." if abs(x) < _ROUNDING * moments[-1] else f"{x:.5g}" for x in row]
+        along = ["." if abs(x) < _ROUNDING else f"{x:.4f}" for x in axis]
+        rows.append([name, *shown, f"{moment:.5g}", *along])
+    wheels, thrusters = wheel_report(robot, q, v), thruster_report(robot, q, center)
+    head_line = (
+        f"centre of mass {_vector(center)} m from the base frame; inertia about it in kg\u00a0m^2; "
+        "at the operating point, in base axes"
+    )
+    parts = [f"{folded([head_line])}\n\n{grid(rows)}", wheels, thrusters]
+    return "\n\n".join(part for part in parts if part)
+
+
+def mass_properties(robot: Robot, q: Array) -> tuple[Array, Array]:
+    """Return the centre of mass (3,) [m] and the inertia (3, 3) [kg m^2] about it, in base axes."""
+    data, q = robot.create_data(), _at_origin(q)
+    pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
+    return data.com[0].copy(), np.array(data.Ig.inertia)
+
+
+def wheel_momenta(robot: Robot, q: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Return axes (3, k) of the wheels in base axes, their momenta (k,) and largest momenta (k,).
+
+    Momenta [N m s] are relative to the carriers of the wheels.
+    """
+    data = robot.create_data()
+    pin.forwardKinematics(robot.model, data, _at_origin(q))
+    limits, axes, stored, largest = limits_of(robot), [], [], []
+    for name, wheel in named_wheels(robot.inputs):
+        joint, axis = carrier(robot.model, wheel)
+        axes.append(data.oMi[joint].rotation @ axis)
+        if wheel.inertia:
+            stored.append(wheel.inertia * v[robot.joint(name).idx_v])
+            largest.append(wheel.inertia * limits.get(f"qdot_m.{name}", (0.0, math.inf))[1])
+        else:
+            stored.append(wheel.momentum)
+            largest.append(math.inf)
+    return np.array(axes).reshape(-1, 3).T, np.array(stored), np.array(largest)
+
+
+def wheel_report(robot: Robot, q: Array, v: Array) -> str:
+    """Show the total momentum of the wheels, and whether they span three axes."""
+    axes, stored, largest = wheel_momenta(robot, q, v)
+    if not stored.size:
+        return ""
+    total, rank = axes @ stored, int(np.linalg.matrix_rank(axes, tol=1e-6))
+    spans = {3: "three axes", 2: "only two axes", 1: "only one axis"}[rank]
+    text = (
+        f"{counted(stored.size, 'wheel')}: total momentum {_vector(total)} N m s, "
+        f"{np.linalg.norm(total):.4g} in all; they span {spans}"
+    )
+    if rank == 3 and np.isfinite(largest).all():
+        least = least_reach(axes, -largest, largest, np.eye(3))
+        text += f", with at least {least:.4g} N m s in every direction at their largest speeds"
+    return folded([text])
+
+
+def thruster_report(robot: Robot, q: Array, center: Array) -> str:
+    """Show whether the thrusters push every way, and their least force and torque."""
+    actuation = Actuation(StateMap(robot))
+    if "thrust" not in actuation.groups:
+        return ""
+    # Imported where there are thrusters: both take longer than all the rest of the report.
+    from fflin.control.policies import gives_every_wrench
+    from fflin.control.saturation import input_limits
+
+    thrusters = actuation.groups["thrust"]
+    W = actuation.columns(robot.create_data(), _at_origin(q))[:6, thrusters]
+    W[:3] -= np.cross(center, W[3:].T).T
+    head = f"{counted(len(thrusters), 'thruster')} alone"
+    if not gives_every_wrench(W, np.full(len(thrusters), fill_value=True)):
+        missing = unreachable(W)
+        shown = [f"{kind} along {', '.join(axes)}" for kind, axes in missing.items() if axes]
+        reason = f": no pure {' and no pure '.join(shown)}" if shown else ""
+        return folded([f"{head} do not push every way{reason}"])
+    low, high = (each[thrusters] for each in input_limits(robot, limits_of(robot)))
+    if not np.isfinite(high).all():
+        return folded([f"{head} push every way; not all of them have a limit (max)"])
+    if len(thrusters) > _MANY:
+        return f"{head} push every way"
+    torque, force = (least_reach(W, low, high, axes) for axes in np.hsplit(np.eye(6), 2))
+    return folded(
+        [
+            f"{head} push every way: in any direction at least {force:.4g} N without torque about "
+            f"the centre of mass, or {torque:.4g} N m without force"
+        ]
+    )
+
+
+def unreachable(W: Array) -> dict[str, list[str]]:
+    """Return the directions of pure torque and pure force that no thrusts u >= 0 give as W u."""
+    from scipy.optimize import nnls
+
+    size = np.linalg.norm(W, axis=0)
+    directions = W[:, size > 0.0] / size[size > 0.0]
+    found: dict[str, list[str]] = {"torque": [], "force": []}
+    for (kind, axis), unit in zip(product(found, _AXES), np.eye(6), strict=True):
+        for sign, wanted in (("+", unit), ("-", -unit)):
+            if nnls(directions, wanted)[1] > _ROUNDING:
+                found[kind].append(f"{sign}{axis}")
+    return found
+
+
+def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
+    r"""Return the largest r such that some inputs give W u = r kept d for every unit vector d.
+
+    The values W u of inputs between `low` and `high` form a zonotope
+    :math:`\{w : n^T w \le h(n)\}` with :math:`h(n) = \sum_i \max(low_i n^T W_i, high_i n^T W_i)`.
+    The normals n of its facets are orthogonal to m - 1 independent columns of W. Within the
+    subspace that the columns of `kept` span, a facet is at the distance
+    :math:`h(n) / |kept^T n|` from the origin; r is the least of these distances.
+
+    Parameters
+    ----------
+    W : ndarray (m, k)
+        Wrenches of unit inputs, of rank m.
+    low, high : ndarray (k,)
+        Limits of the inputs, which contain 0.
+    kept : ndarray (m, d)
+        Orthonormal columns.
+    """
+    scale = np.linalg.norm(W, axis=1)
+    columns = W / scale[:, None]
+    columns /= np.linalg.norm(columns, axis=0)
+    subsets, least = combinations(range(W.shape[1]), len(W) - 1), math.inf
+    while chunk := list(islice(subsets, _FACETS)):
+        chosen = columns[:, np.array(chunk)].transpose(1, 0, 2)  # (facets, m, m - 1)
+        minors = [np.linalg.det(np.delete(chosen, row, axis=1)) for row in range(len(W))]
+        normals = np.stack(minors, axis=1) * (-1.0) ** np.arange(len(W))
+        normals = normals[np.linalg.norm(normals, axis=1) > _ROUNDING]
+        within = np.linalg.norm(normals / scale @ kept, axis=1)
+        crossing = within > _ROUNDING * np.linalg.norm(normals / scale, axis=1)
+        along = (normals / scale)[crossing] @ W
+        for each in (along, -along):
+            reach = np.maximum(each * low, each * high).sum(axis=1) / within[crossing]
+            least = min(least, float(reach.min(initial=math.inf)))
+    return least
+
+
+def _at_origin(q: Array) -> Array:
+    """Return the configuration with the base at the origin, so that world axes are base axes."""
+    at_origin = q.copy()
+    at_origin[:7] = pin.SE3ToXYZQUAT(pin.SE3.Identity())
+    return at_origin
+
+
+def _vector(values: Array) -> str:
+    return f"({', '.join(f'{x:.4g}' for x in np.round(values, 12) + 0.0)})"

@@ -1,0 +1,228 @@
+"""Search for a plan by sequential quadratic programming with multiple shooting."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.control.shooting import Point, Shooting
+from fflin.control.stage_qp import StageQP, StageRows
+from fflin.dynamics.state import StateMap
+
+# The goal and the limits are sought to this accuracy in rad, m and s.
+_ENDS = 1e-8
+
+# A state is limited at points within an interval once an iterate exceeds its limit there by the
+# first share of it. The limit is tightened by the second share, since the motion may exceed it
+# between these points.
+_LIMITED, _TIGHTER = 0.002, 0.005
+
+# Intervals are flown as one motion where they miss each other by no more.
+_MEETS = 1e-10
+
+# One motion that misses the end by more is not corrected.
+_NEARLY = 1e-3
+
+# Accuracy of the ends of intervals during the search, and at its end.
+_SEEKS, _FLIES = 1e-6, 1e-8
+
+# Iterations go on until one would save less than this share of the effort, or so often.
+_SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
+
+# What a step of wheels costs beside others, as they may take any.
+_OF_WHEELS = 1e-6
+
+# What missing the goal or a limit by 1 rad or m costs, in efforts of the guess.
+_PRICE = 1e3
+
+Flags = NDArray[np.bool_]
+
+
+class Trial(NamedTuple):
+    """Knots and inputs, the gaps between the intervals, and the distances to limits of states."""
+
+    q: Array  # (N + 1, nq)
+    v: Array  # (N + 1, nv)
+    u: Array  # (N + 1, nu)
+    missed: Array  # (N, nx)
+    knots: Array  # how far the knots may move down and up (2, N + 1, nx)
+    inside: Array  # and the points within the intervals (2, N, parts - 1, nx)
+
+    @property
+    def gap(self) -> float:
+        """The largest gap between intervals."""
+        return float(np.abs(self.missed).max())
+
+    def outside(self, limited: Flags) -> float:
+        """Return the sum of what knots and `limited` points within intervals exceed of limits."""
+        return float(excess(self.knots).sum() + excess(self.inside)[limited].sum())
+
+
+class Search(NamedTuple):
+    """Search for the inputs of least effort that lead from a start to an end."""
+
+    # The Hessian is that of Gauss and Newton. Steps of the states also cost something, which
+    # falls while whole steps succeed (Levenberg and Marquardt).
+
+    shooting: Shooting
+    start: Point
+    end: Point
+    asked: Flags  # states whose value at the end is prescribed (nx,)
+    bounds: Array  # limits of states (2, nx)
+    limits: Array  # limits of inputs (2, nu)
+    cost: Array  # of squared inputs (N + 1, nu)
+    parts: int  # states are limited at the ends of so many equal parts of each interval
+
+    def best(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Return q, v and u at knots of the least effort, or that lead nearest to the end.
+
+        The search begins at the given knots and inputs.
+        """
+        shooting, cost, u = self.shooting, self.cost, np.clip(u, *self.limits)
+        shooting.refine(q, v, u, _SEEKS)
+        wheels = [*shooting.wheels, *(shooting.state.nx // 2 + i for i in shooting.wheels)]
+        near = np.where(np.isin(range(shooting.state.nx), wheels), _OF_WHEELS, 1.0) / len(q)
+        first, trial = near, self._trial(q, v, u)
+        limited, price = self._exceeding(trial), 0.0 * trial.missed
+
+        def merit(u: Array, missed: Array, outside: float) -> float:
+            lost = (price * np.abs(missed)).sum() + _PRICE * outside
+            return float((cost * u * u).sum() / 2.0 + lost)
+
+        for _ in range(_MOST):
+            step = self._step(trial, limited, near, cost * trial.u)
+            if step is None:
+                return self._acting(self._flown(trial.u))
+            z, du, y, outside = step
+            # What the multipliers say that it costs to miss (Powell).
+            price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
+            was, share = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
+            saved = was - merit(trial.u + du, 0.0 * trial.missed, outside)
+            for _ in range(_MOST_HALVINGS):
+                new = np.clip(trial.u + share * du, *self.limits)
+                there = self._trial(*shooting.moved(trial.q, trial.v, share * z), new)
+                after = merit(new, there.missed, there.outside(limited))
+                if was - after >= 1e-4 * share * saved:
+                    trial = there
+                    break
+                share *= 0.5
+            near = near * (0.2 if share == 1.0 else 1.0 if share > 0.25 else 3.0)
+            known, limited = limited, limited | self._exceeding(trial)
+            if saved <= _SAVED * was and (limited == known).all():
+                break
+        return self._acting(self._closed(trial, limited, first))
+
+    @property
+    def _size(self) -> Array:
+        """Magnitudes of the limits of states (nx,), zero without limits."""
+        size: Array = np.abs(np.where(np.isfinite(self.bounds), self.bounds, 0.0)).max(axis=0)
+        return size
+
+    def _trial(self, q: Array, v: Array, u: Array) -> Trial:
+        shooting, state = self.shooting, self.shooting.state
+        parts = shooting.parts(q, v, u, self.parts)
+        knots = self.bounds[:, None] - limited_values(state, q, v)
+        knots[0, 0], knots[1, 0] = -np.inf, np.inf
+        way = shooting.between((q[-1], v[-1]), self.end)
+        knots[:, -1, self.asked] = np.clip(way, *knots[:, -1])[self.asked]
+        points = limited_values(state, *(each[:, :-1] for each in parts))
+        tighter = self.bounds + _TIGHTER * np.array((self._size, -self._size))
+        inside = tighter[:, None, None] - points
+        return Trial(q, v, u, shooting.apart(q, v, parts), knots, inside)
+
+    def _exceeding(self, trial: Trial) -> Flags:
+        """Return whether points (N, parts - 1, nx) or their neighbours exceed a limit."""
+        beyond: Flags = excess(trial.inside) > (_LIMITED + _TIGHTER) * self._size
+        near = beyond.copy()
+        near[:, 1:] |= beyond[:, :-1]
+        near[:, :-1] |= beyond[:, 1:]
+        return near
+
+    def _step(
+        self, trial: Trial, limited: Flags, near: Array, effort: Array
+    ) -> tuple[Array, Array, Array, float] | None:
+        """Return the best step of knots and inputs, its multipliers and what it leaves outside."""
+        u, nx = trial.u, self.shooting.state.nx
+        if not max(trial.outside(limited), trial.gap) < np.inf:
+            return None
+        try:
+            A, B, D, inside = self.shooting.slopes(trial.q, trial.v, u, self.parts)
+        except InputError:  # it has diverged
+            return None
+        k, part, state = np.nonzero(limited)
+        least, largest = trial.inside[:, k, part, state]
+        rows = StageRows(k, inside[k, part, state], least, largest, _PRICE)
+        low, high = np.concatenate((trial.knots, self.limits[:, None] - u), axis=2)
+        weights = np.hstack((np.tile(near, (len(u), 1)), self.cost))
+        H, of_x = weights[:, :, None] * np.eye(weights.shape[1]), np.zeros((len(u), nx))
+        g, soft = np.hstack((of_x, effort)), np.hstack((of_x + _PRICE, np.full(u.shape, np.inf)))
+        scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))
+        found = StageQP(
+            np.zeros(nx), A, B, D, trial.missed, H, g, low, high, soft, rows, scale
+        ).solve()
+        if found is None:
+            return None
+        left = np.array((rows.low, rows.high)) - rows.values(found.x, found.u)
+        return *found, float(excess(trial.knots - found.x).sum() + excess(left).sum())
+
+    def _closed(self, trial: Trial, limited: Flags, near: Array) -> Trial:
+        """Return a trial whose intervals meet, by the least changes, as one motion if possible."""
+        shooting, last = self.shooting, _NEARLY
+        shooting.refine(trial.q, trial.v, trial.u, _FLIES)
+        trial = self._trial(*trial[:3])
+        for _ in range(_MOST_CLOSING):
+            limited = limited | self._exceeding(trial)
+            if trial.gap <= _MEETS and trial.outside(limited) <= _ENDS:
+                one = self._flown(trial.u)
+                limited, before = limited | self._exceeding(one), last
+                last = one.outside(limited)
+                if last <= _ENDS:
+                    return one
+                # Errors may grow so much along one motion that its end cannot be corrected.
+                if not last <= 0.5 * before:
+                    return trial
+                trial = one
+            step = self._step(trial, limited, near, 0.0 * trial.u)
+            if step is None:
+                break
+            u = np.clip(trial.u + step[1], *self.limits)
+            trial = self._trial(*shooting.moved(trial.q, trial.v, step[0]), u)
+        return trial if trial.gap <= _MEETS else self._flown(trial.u)
+
+    def _flown(self, u: Array) -> Trial:
+        """Return the motion under inputs from the start, without gaps."""
+        q, v = (x[:: self.parts] for x in self.shooting.flown(self.start, u, self.parts))
+        trial = self._trial(q, v, u)
+        return trial._replace(missed=0.0 * trial.missed)
+
+    def _acting(self, trial: Trial) -> tuple[Array, Array, Array]:
+        """Return q, v and u; if u is held, its last row repeats the input of the last interval."""
+        u = np.vstack((trial.u[:-1], trial.u[-2])) if self.shooting.held else trial.u
+        return trial.q, trial.v, u
+
+
+def cost_of_inputs(shooting: Shooting, R: Array, u: Array) -> Array:
+    """Return the cost of squared inputs (N + 1, nu), scaled so that the guess costs 1."""
+    h = shooting.h
+    # Of the knots in an integral: by the trapezoidal rule, or as long as each input is held.
+    held = np.append(h, h[-1]) if shooting.held else 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
+    cost = held[:, None] * R
+    cost /= (cost * u * u).sum() or cost.sum()
+    return cost
+
+
+def limited_values(state: StateMap, q: Array, v: Array) -> Array:
+    """Return the limited values (.., nx): positions and rates of joints, zero for the base."""
+    n, values = state.robot.n, np.zeros((*q.shape[:-1], state.nx))
+    values[..., 6 : 6 + n] = state.joint_positions(q)
+    values[..., state.nx - n :] = state.velocities(v)[..., 6:]
+    return values
+
+
+def excess(room: Array) -> Array:
+    """Return how far points are outside of limits, from how far they may move down and up."""
+    return np.maximum(np.maximum(room[0], -room[1]), 0.0)

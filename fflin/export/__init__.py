@@ -1,0 +1,1 @@
+"""C code of control laws for flight software, and its simulation in the loop."""

@@ -1,0 +1,210 @@
+"""Policy that calls the C code of a control law, for simulations in the loop."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import FileError, InputError, MissingPackageError
+from fflin.base.validation import Array
+from fflin.base.writing import as_path
+from fflin.control.linear_controller import Loop, Sample
+from fflin.control.policies import Policy
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.outputs import Measuring
+from fflin.dynamics.state import StateMap
+from fflin.export.laws import measured
+from fflin.linear.fit import sensed
+from fflin.robot.robot import Robot
+
+_INVALID = 2  # status of a step
+
+
+class CLaw:
+    """Policy that compiles the C code of `write_c` and calls it.
+
+    The C compiler of the system (``cc``) makes a shared library of the code in a temporary folder.
+
+    Parameters
+    ----------
+    folder : path
+        Folder that `write_c` wrote.
+    compiler : str
+        Command of the C compiler.
+
+    Attributes
+    ----------
+    name : str
+        Name of the code, see `write_c`.
+    dt : float
+        Sampling time [s]; 0 for a law without one.
+    frame : str
+        Axes of the inputs, as in `LinearModel`.
+    origin : pin.SE3 or None
+        Reference of the state, which the axes of the inputs are relative to.
+
+    Raises
+    ------
+    FileError
+        If the folder does not hold the files of one law.
+    MissingPackageError
+        If there is no C compiler.
+    InputError
+        If the code cannot be compiled, or it was written from a design without a model.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> gain = fflin.lqr(fflin.linearize(robot))
+    >>> policy = fflin.CLaw(fflin.write_c(gain, "flight"))
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> fflin.simulate(robot, policy, v0=v0, duration=1.0).u.shape[1]
+    9
+    """
+
+    def __init__(self, folder: str | Path, *, compiler: str = "cc") -> None:
+        source = as_path(folder)
+        found = [x for x in source.glob("*.json") if x.with_suffix(".c").is_file()]
+        if len(found) != 1:
+            raise FileError(
+                f"{source}: holds {len(found)} pairs of .json and .c, expected the files of one "
+                "law, written by fflin.write_c"
+            )
+        try:
+            self._about: dict[str, Any] = json.loads(found[0].read_text("utf-8"))
+            self.name: str = self._about["name"]
+            self.dt: float = self._about["dt"]
+            self.frame: Any = self._about["frame"]
+            kind, real = self._about["kind"], self._about["real"]
+            placement = self._about["reference"]
+            self.origin = None if placement is None else pin.XYZQUATToSE3(np.array(placement))
+            if (
+                kind not in ("state", "output", "samples")
+                or real not in ("double", "float")
+                or self.dt < 0.0
+            ):
+                raise ValueError("kind, real or dt")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise FileError(f"{found[0]}: not a file of fflin.write_c ({error!r})") from None
+        if kind == "output" and placement is None:
+            raise InputError(
+                "the C code was written from a Compensator alone, without the model about which "
+                "outputs are measured; write it from an OutputFeedback"
+            )
+        self._real = ctypes.c_double if real == "double" else ctypes.c_float
+        self._library = _compiled(source / f"{self.name}.c", compiler)
+        try:
+            self._step = getattr(self._library, f"{self.name}_step")
+        except AttributeError:
+            raise FileError(
+                f"{source}: the code has no function {self.name}_step; write it again with "
+                "fflin.write_c"
+            ) from None
+
+    def __repr__(self) -> str:
+        about = self._about
+        return f"CLaw('{self.name}', {about['kind']}, {about['real']}, dt={self.dt:g} s)"
+
+    def bind(self, robot: Robot) -> Policy:
+        """Return policy(t, q, v) -> u for a robot, with a separate memory for each call.
+
+        Raises
+        ------
+        InputError
+            If states, inputs or outputs of the robot differ from those of the C code.
+        """
+        state = StateMap(robot, reference=self.origin, frame=self.frame)
+        there = {"input": Actuation(state).names, "state": state.names}
+        for kind, names in self._about["names"].items():
+            if names != list(there[kind] if kind in there else sensed(state)[0]):
+                raise InputError(
+                    f"the C code of '{self.name}' has other {kind}s than '{robot.name}'; write it "
+                    "again for this robot"
+                )
+        of_outputs = self._about["kind"] == "output"
+        return _OutputLoop(self, state) if of_outputs else self._state_policy(robot)
+
+    def _state_policy(self, robot: Robot) -> Policy:
+        world, n, real = StateMap(robot, frame=self.frame), robot.n, self._real
+        # In C an array has one entry at least.
+        given, u = (real * (13 + 2 * max(n, 1)))(), (real * len(self._about["u0"]))()
+        at = [*range(7 + n), *range(7 + max(n, 1), 13 + n + max(n, 1))]
+        samples = self._about["kind"] == "samples"
+
+        def policy(t: float, q: Array, v: Array) -> Array:
+            for k, value in zip(at, measured(world, q, v).tolist(), strict=True):
+                given[k] = value
+            sample = (ctypes.c_ulong(round(t / self.dt)),) if samples else ()
+            self._check(self._step(*sample, given, u), t)
+            return np.array(u)
+
+        return policy
+
+    def output_step(self, z: Array, y: Array, t: float) -> tuple[Array, Array]:
+        """Return u and the next z of a step with outputs y."""
+        real = self._real
+        memory = (real * max(len(z), 1))(*z.tolist())
+        u = (real * len(self._about["u0"]))()
+        self._check(self._step(memory, (real * len(y))(*y.tolist()), u), t)
+        return np.array(u), np.array(memory)[: len(z)]
+
+    def _check(self, status: int, t: float) -> None:
+        if status == _INVALID:
+            raise InputError(
+                f"the C code of '{self.name}' returned INVALID at t = {t:g} s: an argument was not "
+                "finite or too large"
+            )
+
+
+class _OutputLoop(Loop):
+    """Loop whose controller is the C code."""
+
+    def __init__(self, law: CLaw, state: StateMap) -> None:
+        about = law._about
+        q, v = map(np.array, about["point"])
+        there = Measuring(state, q), state.read(q, v)
+        super().__init__(state, law.dt, None, about["memory"], lambda _: None, lambda _: there)
+        self._law, self._u0 = law, np.array(about["u0"])
+
+    def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
+        """Return the command of a sample; an accelerometer measures under this command."""
+        by = self.at(t)
+        u, _ = self._law.output_step(self.estimate, measure(by, self._u0), t)
+        u, self.estimate = self._law.output_step(self.estimate, measure(by, u), t)
+        return u
+
+
+def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
+    """Return the shared library of a source file."""
+    if not isinstance(compiler, str) or "\0" in compiler:
+        raise InputError(f"compiler is {compiler!r}, expected the name of a C compiler, such as cc")
+    command = shutil.which(compiler)
+    if command is None:
+        raise MissingPackageError(
+            f"there is no C compiler '{compiler}'; install one, such as gcc, or give compiler="
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "law.so"
+        flags = ["-std=c99", "-O2", "-fPIC", "-shared", "-ffp-contract=off"]
+        done = subprocess.run(
+            [command, *flags, "-o", str(library), str(source), "-lm"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if done.returncode:
+            line = next((x for x in done.stderr.splitlines() if "error" in x), done.stderr)
+            raise InputError(f"{source}: cannot be compiled: {line}")
+        try:
+            return ctypes.CDLL(str(library))
+        except OSError as error:
+            raise InputError(f"'{compiler}' made no library of {source}: {error}") from None

@@ -1,0 +1,273 @@
+"""C source, header and test program of a control law."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Sequence
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base import __version__
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.base.writing import as_path, write_whole
+from fflin.export.laws import CASES, OutputLaw, StateLaw, law_of
+from fflin.robot.robot import Robot
+
+_DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
+_FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
+
+# Greatest error of a double relative to the sizes of the terms.
+_DOUBLE_ERROR = 1e-14
+
+
+def write_c(
+    law: Any,
+    folder: str | Path,
+    *,
+    robot: Robot | None = None,
+    limits: Any = None,
+    name: str = "controller",
+    real: str = "double",
+) -> Path:
+    r"""Write a control law as C99, with a test program.
+
+    The folder then contains ``NAME.h``, ``NAME.c``, the test program ``NAME_test.c`` and
+    ``NAME.json``, which `CLaw` reads. The code needs no library except ``sqrt``. It allocates no
+    memory and has no global variables. The header describes each entry of the arguments.
+
+    - For a state feedback, ``NAME_step`` takes the measured attitude, position, joint angles and
+      velocities. It computes the state as `StateMap` does, and then the inputs.
+    - For an output feedback, ``NAME_step`` takes the outputs y, and a memory that the caller owns.
+    - For gains along a trajectory, ``NAME_step`` also takes the number of the sample.
+
+    Parameters
+    ----------
+    law : Gain, StateFeedback, ScheduledFeedback, OutputFeedback, LinearController or GainSchedule
+        Or a `Compensator` or `TrajectoryFeedback`. Controllers and gains along a trajectory must be
+        sampled.
+    folder : path
+        Folder of the files; it is made if necessary.
+    robot : Robot, optional
+        Robot of the law. Necessary only if the law is from a file, and the name of its robot is not
+        the name of a robot that `load` takes.
+    limits : "urdf", float, mapping or list, optional
+        Limits of the inputs as in `simulate`. By default the inputs are not limited.
+    name : str
+        Prefix of all names in C, and of the files.
+    real : {"double", "float"}
+        Type of the numbers.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    InputError
+        If the law cannot be written in C, its robot is not known, or an argument is invalid.
+    FileError
+        If a file cannot be written.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> gain = fflin.lqr(fflin.linearize(robot))
+    >>> folder = fflin.write_c(gain, "flight")
+    >>> sorted(path.name for path in folder.iterdir())
+    ['controller.c', 'controller.h', 'controller.json', 'controller_test.c']
+    """
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name):
+        raise InputError(
+            f"name is {name!r}, expected a letter and then letters, digits or _, for names in C"
+        )
+    if not isinstance(real, str) or real not in ("double", "float"):
+        raise InputError(f"real is {real!r}, expected 'double' or 'float'")
+    target = as_path(folder)
+    tables = law_of(law, robot, limits)
+    contents = _Texts(tables, name, real).files()
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be made: {error.strerror}") from None
+    paths = {target / file: text.encode() for file, text in contents.items()}
+    write_whole(paths)
+    return target
+
+
+class _Texts:
+    """The files of a law, filled into the templates of this folder."""
+
+    def __init__(self, law: StateLaw | OutputLaw, name: str, real: str) -> None:
+        self.law, self.name, self.real, self.cases = law, name, real, law.cases()
+        # Unit roundoff of a float times the number of operations.
+        self.error = _DOUBLE_ERROR if real == "double" else law.operations * 2.0**-24
+        bounds = self.error * np.max([case.scale for case in self.cases], axis=0)
+        sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, law.input_units, strict=False)]
+        inputs, robot = (law.input_names, law.input_units), law.robot
+        self.kind = "state" if isinstance(law, StateLaw) else "output"
+        self.words = {
+            **(_DOUBLE if real == "double" else _FLOAT),
+            **{"name": name, "NAME": name.upper(), "real": real, "count": f"{CASES}"},
+            **{"law": law.title, "frame": law.frame or "not known"},
+            "robot": _plain(robot.name if robot else "unknown"),
+            "sha256": (robot.urdf_sha256 if robot else "") or "not known",
+            "world": ", the orbital frame" if robot and robot.orbit else "",
+            "fflin_version": __version__,
+            "pinocchio_version": pin.__version__,
+            "sample_time": f"{law.dt!r} s" if law.dt else "none, the law is continuous in time",
+            "error": f"{self.error:.2g}",
+            "tolerances": _listed(law.input_names, sizes, ""),
+            "inputs": f"{len(law.low)}",
+            "input_rows": _listed(*inputs, ""),
+            "input_list": _listed(*inputs, "u"),
+            **{key: self.array(getattr(law, key)) for key in ("u0", "low", "high")},
+            "row": "0",
+        }
+        self.words |= self._state(law) if isinstance(law, StateLaw) else self._output(law)
+
+    def files(self) -> dict[str, str]:
+        """Return {file name: content}."""
+        self.words["interface"] = self._filled(f"{self.kind}_interface.h")
+        self.words["limiting"] = self._filled("limiting.c").rstrip()
+        self.words |= self._vectors()
+        self.words["run"] = self._filled(f"{self.kind}_run.c")
+        law, lin = self.law, self.law.lin
+        follows = isinstance(law, StateLaw) and law.follows
+        about = {
+            **{"name": self.name, "real": self.real, "frame": law.frame, "dt": law.dt},
+            "kind": "samples" if follows else self.kind,
+            "names": {"input": law.input_names, self.kind: law.names},
+            "u0": law.u0[0].tolist(),
+            "memory": len(law.terms.A) if isinstance(law, OutputLaw) else 0,
+            "reference": None if lin is None else lin.placement.tolist(),
+            "point": None if lin is None else [lin.q.tolist(), lin.v.tolist()],
+        }
+        return {
+            f"{self.name}.h": self._filled("header.h"),
+            f"{self.name}.c": self._filled(f"{self.kind}_law.c"),
+            f"{self.name}_test.c": self._filled("test.c"),
+            f"{self.name}.json": json.dumps(about, indent=1) + "\n",
+        }
+
+    def _filled(self, template: str) -> str:
+        text = files("fflin.export").joinpath("templates", template).read_text("utf-8")
+        return Template(text).substitute(self.words)
+
+    def _vectors(self) -> dict[str, str]:
+        """Return the words of the test program."""
+        law, rows, nu = self.law, [], len(self.law.low)
+        for case in self.cases:
+            out = case.out.copy()
+            out[:nu] = np.clip(out[:nu], law.low, law.high)
+            numbers = map(self.array, (case.given, out, self.error * case.scale))
+            status = int((out != case.out).any())
+            rows.append(f"{{{case.sample}UL, {', '.join(numbers)}, {status}}}")
+        given, out = self.cases[0].given, self.cases[0].out
+        names = [*map(_plain, law.input_names), *(f"next z[{k}]" for k in range(len(out) - nu))]
+        return {
+            "vectors": "{\n" + ",\n".join(rows) + "}",
+            "ins": f"{len(given)}",
+            "outs": f"{len(out)}",
+            "out_names": ",\n".join(f'    "{each}"' for each in names),
+        }
+
+    def _state(self, law: StateLaw) -> dict[str, str]:
+        state, (rows, nx), follows = law.state, law.x0.shape, law.follows
+        n = state.robot.n
+        words = {
+            **{"joints": f"{n}", "joints_max": f"{max(n, 1)}", "states": f"{nx}"},
+            **{"rows": f"{rows}", "gains": f"{len(law.K)}"},
+            "state_columns": _listed(state.names, state.units, ""),
+            "state_list": _listed(state.names, state.units, "x"),
+            "joint_list": _listed(state.names[6 : 6 + n], state.units[6 : 6 + n], "joints"),
+            "reference": self.array(law.placements),
+            "x0": self.array(law.x0),
+            "K": self.array(law.K),
+            "in_reference_axes": _whole(state.axes),
+            "continuous": _whole(joint.unbounded for joint in state.robot.joints),
+            **dict.fromkeys(("interpolation", "gains_between", "sample_argument"), ""),
+            **dict.fromkeys(("sample_given", "sample_comment"), ""),
+            "feedback": f"feed_back({'(int)row' if follows else 0}, 1, x, u);",
+        }
+        if follows:
+            words |= {
+                "sample_argument": "unsigned long sample, ",
+                "sample_given": "given->sample, ",
+                "sample_comment": "sample counts sample times from the start, 0.",
+                "row": f"(sample < {rows - 1}UL ? sample : {rows - 1}UL)",
+            }
+        if law.axes:
+            joints, sizes = state.robot.joint_names, [len(values) for values in law.axes.values()]
+            padded = [np.pad(x, (0, max(sizes) - len(x))) for x in law.axes.values()]
+            self.words |= {
+                **{"axis_count": f"{len(sizes)}", "axis_room": f"{max(sizes)}"},
+                "corners": f"{2 ** len(sizes)}",
+                "axis_joint": _whole(joints.index(name) for name in law.axes),
+                "axis_size": _whole(sizes),
+                "axis_points": self.array(padded),
+            }
+            words["interpolation"] = self._filled("interpolation.c")
+            words["feedback"] = "feed_back_between(measured, x, u);"
+            words["gains_between"] = ", K interpolated linearly between joint angles"
+        return words
+
+    def _output(self, law: OutputLaw) -> dict[str, str]:
+        by, ny = law.terms, len(law.names)
+        return {
+            **{"states": f"{len(by.A)}", "states_max": f"{max(len(by.A), 1)}", "outputs": f"{ny}"},
+            "output_columns": _listed(law.names, law.output_units, ""),
+            "output_list": _listed(law.names, law.output_units, "y"),
+            **{key: self.array(_at_least_one(getattr(by, key))) for key in "ABCD"},
+            "y0": self.array(by.y0),
+            "continuous": _whole(law.continuous),
+        }
+
+    def array(self, values: Any) -> str:
+        """Return an initialiser of an array."""
+        values = np.asarray(values)
+        if values.ndim > 1:
+            return "{\n" + ",\n".join(map(self.array, values)) + "}"
+        if self.real == "float":
+            with np.errstate(over="ignore"):
+                narrow = values.astype(np.float32)
+            if (np.isfinite(values) & ~np.isfinite(narrow)).any():
+                raise InputError("the law has numbers too large for a float; take real='double'")
+            values = narrow.astype(float)
+        end = "F" if self.real == "float" else ""
+        shown = (f"{x!r}{end}" if np.isfinite(x) else _open(x) for x in values.tolist())
+        return "{" + ", ".join(shown) + "}"
+
+
+def _open(bound: float) -> str:
+    return "NO_LIMIT" if bound > 0.0 else "-NO_LIMIT"
+
+
+def _at_least_one(matrix: Array) -> Array:
+    """Return a matrix with a zero row or column where it has none, as C has no empty arrays."""
+    rows, columns = matrix.shape
+    return np.pad(matrix, ((0, int(not rows)), (0, int(not columns))))
+
+
+def _whole(values: Iterable[Any]) -> str:
+    return "{" + (", ".join(str(int(x)) for x in values) or "0") + "}"
+
+
+def _plain(text: str) -> str:
+    """Return a text that may stand in a comment and in a string of C."""
+    return re.sub(r"[^\w .,+^()\[\]/-]", "_", text, flags=re.ASCII)
+
+
+def _listed(names: Sequence[str], units: Sequence[str], array: str) -> str:
+    """Return lines of a comment: index, name and unit of each entry."""
+    return "\n".join(
+        f" *   {f'{array}[{k}]' if array else k}  {_plain(name)} [{_plain(unit) or '-'}]"
+        for k, (name, unit) in enumerate(zip(names, units, strict=True))
+    )

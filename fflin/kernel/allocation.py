@@ -1,0 +1,299 @@
+"""Allocation: the commands of one set of inputs, realised by another set within its limits.
+
+The least squares within bounds are found by an active set method, which begins with all thrusts at
+zero. The problem is strictly convex, so that the order in which inputs meet their bounds does not
+matter.
+
+References
+----------
+C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, SIAM, 1995, chapter 23.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+
+import numpy as np
+
+from fflin.kernel.arguments import INDICES, LANED, Struct, empty
+from fflin.kernel.displacements import columns_of
+from fflin.kernel.forward import MECHANICS, POINT, configure, push, seen, turn_held
+from fflin.kernel.inertia import factorise
+from fflin.kernel.lanes import (
+    add_row,
+    called,
+    inlined,
+    load,
+    poke,
+    root,
+    row_product,
+    store,
+    width,
+    write_scaled,
+)
+from fflin.kernel.rnea import write_columns
+from fflin.kernel.vectors import copy, put3
+
+# Weight of the inputs themselves: of all inputs with the same effect it selects the smallest.
+LEAST = 1e-7
+_LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
+
+
+class LeastSquares(
+    namedtuple("LeastSquares", "least most columns given A Q R b wanted x s low high state")
+):
+    """The x (k,) within `least` and `most` (k,) that makes the sum of columns nearest to a force.
+
+    `columns` has the k columns of an input's unit force, one after the other, and then the force.
+    What follows is work space: the `given` columns of a lane; `A`, the same divided by their norm;
+    their orthogonal factors `Q` and `R` with the rows of `LEAST` below; the remainder `b`; the
+    force `wanted` of length 1; the solution `s` without bounds; the scaled bounds `low` and
+    `high`; and the `state` of each input.
+    """
+
+
+class Allocation(namedtuple("Allocation", "asking giving point work problem")):
+    """The robot whose inputs are commanded, and the robot whose inputs realise the command.
+
+    The `point` has q and the inputs of either; `work` is work space. There is no allocation where
+    `problem` has no inputs.
+    """
+
+
+LEAST_SQUARES = Struct(LeastSquares, columns=LANED, state=INDICES)
+ALLOCATION = Struct(
+    Allocation,
+    asking=MECHANICS,
+    giving=MECHANICS,
+    point=POINT,
+    work=LANED,
+    problem=LEAST_SQUARES,
+)
+
+
+def least_squares(least, most, size):
+    """Return a problem with bounds (k,) and forces (size,), whose arrays hold numbers."""
+    count = len(least)
+    return empty(LEAST_SQUARES)._replace(
+        least=least,
+        most=most,
+        columns=np.zeros((count + 1) * size),
+        given=np.zeros((count + 1) * size),
+        A=np.zeros(count * size),
+        Q=np.zeros(count * (size + count)),
+        R=np.zeros(count * count),
+        b=np.zeros(size + count),
+        wanted=np.zeros(size),
+        x=np.zeros(count),
+        s=np.zeros(count),
+        low=np.zeros(count),
+        high=np.zeros(count),
+        state=np.zeros(count, dtype=np.intp),
+    )
+
+
+@inlined
+def half_solve(work, tree, x, first):
+    """Turn a force at x into D^-1/2 L^-T f, whose square is that of its accelerations by M."""
+    for k in range(len(tree.row) - 1, -1, -1):
+        value, row = load(x, first + k), tree.row[k]
+        for t in range(tree.depth[k]):
+            at = first + tree.path[row + t]
+            store(x, at, load(x, at) - load(work, tree.packed + row + t) * value)
+        store(x, first + k, value * root(load(work, tree.scaled + row + tree.depth[k])))
+
+
+@inlined
+def allocate(allocation, point, commanded):
+    """Write the inputs of a command, or the inputs that realise it where there is an allocation."""
+    if len(allocation.problem.least) == 0:
+        copy(commanded, 0, point.u, 0, len(point.u))
+    else:
+        _realise(allocation, point, commanded)
+
+
+@called
+def _realise(allocation, point, commanded):
+    """Write the inputs whose accelerations are nearest to those of a command."""
+    work, asking, giving = allocation.work, allocation.asking, allocation.giving
+    own, tree, problem = allocation.point, asking.tree, allocation.problem
+    size, count, columns = len(tree.row), len(problem.least), problem.columns
+    copy(point.q, 0, own.q, 0, len(own.q))
+    configure(work, asking, own.q)
+    factorise(work, tree)
+    copy(commanded, 0, own.pushing, 0, len(commanded))
+    turn_held(asking, own)
+    push(work, asking, own.pushing)
+    copy(work, asking.layout.c, columns, count * size, size)
+    _write_all(work, giving, own, columns)
+    for column in range(count + 1):
+        half_solve(work, tree, columns, column * size)
+    for lane in range(width(point.u)):
+        solve(problem, size, lane)
+        for index in range(count):
+            poke(point.u, index, lane, problem.x[index])
+
+
+@inlined
+def _write_all(work, giving, own, columns):
+    """Write the generalised force of a unit of each input, one after the other."""
+    tree, layout, loads = giving.tree, giving.layout, giving.loads
+    size, carried = len(tree.row), len(loads.body)
+    for entry in range(len(giving.row) * size):
+        store(columns, entry, 0.0)
+    for index in range(len(giving.row)):
+        if giving.row[index] >= 0:
+            store(columns, index * size + giving.row[index], 1.0)
+    for index in range(len(giving.held)):
+        at, axes = giving.held[index], columns_of(seen(giving, own.q))
+        for axis in range(3):
+            turned = axes[0][axis], axes[1][axis], axes[2][axis]
+            put3(columns, (at + axis) * size + giving.row[at], turned)
+    write_columns(work, tree, layout, loads)
+    for index in range(carried):
+        first = loads.input[index] * size
+        for row in range(size):
+            store(columns, first + row, load(work, layout.columns + row * carried + index))
+
+
+@called
+def solve(problem, size, lane):
+    """Write the solution of a lane into x; it is NaN where the force is."""
+    x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
+    least, most, count, given = problem.least, problem.most, len(problem.least), problem.given
+    write_scaled(problem.columns, lane, 1.0, given)
+    last = count * size
+    unit = root(row_product(given, 0, given, 0, last))
+    force = root(row_product(given, last, given, last, size))
+    nothing = not (unit > 0.0 and force > 0.0)
+    scale = 1.0 if nothing else unit / force
+    for j in range(count):
+        low[j], high[j] = least[j] * scale, max(most[j] * scale, least[j] * scale + 1e-15)
+        x[j] = min(max(0.0, low[j]), high[j])
+        problem.state[j] = _LOW if least[j] == 0.0 else _FREE
+    if not nothing:
+        write_scaled(given, 0, 1.0 / unit, A)
+        write_scaled(given[last:], 0, 1.0 / force, wanted)
+        changed = _solve_scaled(problem, size, 0)
+        # The rounding of what cannot be given would drown the rows of LEAST: it is removed.
+        wanted[:] = 0.0
+        for j in range(count):
+            add_row(wanted, 0, x[j], A, j * size, size)
+        _solve_scaled(problem, size, changed)
+    for j in range(count):
+        x[j] = min(max(x[j] / scale, least[j]), most[j]) + 0.0 * force
+
+
+@called
+def _solve_scaled(problem, size, changed):
+    """Write the solution of what is wanted into x, starting from x and the state of its entries.
+
+    Columns of the factor before the input `changed` are there. Return the same for the next call.
+    """
+    x, s, low, high, state = problem.x, problem.s, problem.low, problem.high, problem.state
+    count, newest = len(x), -1
+    for _ in range(20 * count):
+        _fit(problem, size, changed)
+        changed, hit, step = count, -1, 1.0
+        for j in range(count):
+            if state[j] == _FREE and not low[j] <= s[j] <= high[j]:
+                bound = low[j] if s[j] < low[j] else high[j]
+                way = (bound - x[j]) / (s[j] - x[j])
+                if hit < 0 or way < step:
+                    hit, step = j, way
+        if hit >= 0:
+            for j in range(count):
+                if state[j] == _FREE:
+                    x[j] += step * (s[j] - x[j])
+            x[hit] = low[hit] if s[hit] < low[hit] else high[hit]
+            state[hit] = _LOW if s[hit] < low[hit] else _HIGH
+            changed = hit
+            if hit != newest or step > 0.0:
+                newest = -1
+                continue
+            # It goes the wrong way by rounding alone: another is tried.
+            state[hit] += _TRIED
+            _fit(problem, size, changed)
+            changed = count
+        for j in range(count):
+            if state[j] == _FREE:
+                x[j] = s[j]
+            elif hit < 0:
+                state[j] %= _TRIED
+        newest = _steepest(problem, size)
+        if newest < 0:
+            break
+        state[newest] = _FREE
+        changed = min(changed, newest)
+    return changed
+
+
+@called
+def _fit(problem, size, changed):
+    """Write the least squares of the free inputs into s, and the remaining force into b.
+
+    By modified Gram and Schmidt, the force being the last column: as exact as Householder's. The
+    factor's columns before the first `changed` input are still there.
+    """
+    s, Q, R, b, state = problem.s, problem.Q, problem.R, problem.b, problem.state
+    count = len(s)
+    rows = size + count
+    _subtract_bound(problem, size)
+    for j in range(count):
+        if state[j] == _FREE:
+            if j >= changed:
+                _orthogonalise(problem, size, j)
+            s[j] = row_product(Q, j * rows, b, 0, rows)
+            add_row(b, 0, -s[j], Q, j * rows, rows)
+    for j in range(count - 1, -1, -1):
+        if state[j] == _FREE:
+            for i in range(j + 1, count):
+                if state[i] == _FREE:
+                    s[j] -= R[j * count + i] * s[i]
+            s[j] /= R[j * count + j]
+
+
+@inlined
+def _subtract_bound(problem, size):
+    """Write what is wanted, less what the inputs at bounds give, into b."""
+    x, b, state = problem.x, problem.b, problem.state
+    b[:] = 0.0
+    write_scaled(problem.wanted, 0, 1.0, b[:size])
+    for j in range(len(x)):
+        if state[j] != _FREE and x[j] != 0.0:
+            b[size + j] = -LEAST * x[j]
+            add_row(b, 0, -x[j], problem.A, j * size, size)
+
+
+@inlined
+def _orthogonalise(problem, size, j):
+    """Write the part of a column that is orthogonal to the free columns before it, of length 1."""
+    Q, R, state, count = problem.Q, problem.R, problem.state, len(problem.least)
+    rows = size + count
+    first = j * rows
+    column = Q[first : first + rows]
+    column[:] = 0.0
+    write_scaled(problem.A[j * size :], 0, 1.0, column[:size])
+    column[size + j] = LEAST
+    for i in range(j):
+        if state[i] == _FREE:
+            share = row_product(Q, i * rows, column, 0, rows)
+            add_row(column, 0, -share, Q, i * rows, rows)
+            R[i * count + j] = share
+    length = root(row_product(column, 0, column, 0, rows))
+    write_scaled(column, 0, 1.0 / length, column)
+    R[j * count + j] = length
+
+
+@called
+def _steepest(problem, size):
+    """Return the untried input at a bound that best leaves it; -1 where none does."""
+    best, found, A, b, state = 0.0, -1, problem.A, problem.b, problem.state
+    for j in range(len(state)):
+        if state[j] == _LOW or state[j] == _HIGH:
+            slope = LEAST * b[size + j] + row_product(A, j * size, b, 0, size)
+            if state[j] == _HIGH:
+                slope = -slope
+            if slope > best:
+                best, found = slope, j
+    return found

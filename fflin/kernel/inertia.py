@@ -1,0 +1,310 @@
+"""The joint-space inertia M by composite rigid bodies, its sparse factors, and its inverse.
+
+All vectors are in base axes, so that none is rotated from joint to joint; moments are about the
+joints, since about the base origin those of a light tool at the end of a long arm would lose their
+digits. Row i of the packed M holds what is not zero left of the diagonal: the coordinates on the
+path from the base to i, of which those of any coordinate on the path are the beginning.
+
+References
+----------
+R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, sections 6.2 and 6.5.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fflin.kernel import vectors as vec
+from fflin.kernel.lanes import floor, inlined, load, splat, store, transpose
+from fflin.kernel.tree import INERTIA, LANES, PLACE
+
+
+@inlined
+def cosine_and_sine(x):
+    """Return both of |x| < 1e6: taken to one octant in three steps, and there by polynomials.
+
+    The numbers are those of fdlibm (Sun Microsystems, 1993), exact to a unit in the last place.
+    """
+    turns = floor(x * (2.0 / np.pi) + 0.5)
+    x = x - turns * 1.57079632673412561417e00
+    x = x - turns * 6.07710050630396597660e-11
+    x = x - turns * 2.02226624879595063154e-21
+    z = x * x
+    p = -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10
+    p = 2.75573137070700676789e-06 + z * p
+    p = -1.98412698298579493134e-04 + z * p
+    p = 8.33333333332248946124e-03 + z * p
+    p = -1.66666666666666324348e-01 + z * p
+    sine = x + x * z * p
+    p = 2.08757232129817482790e-09 + z * -1.13596475577881948265e-11
+    p = -2.75573143513906633035e-07 + z * p
+    p = 2.48015872894767294178e-05 + z * p
+    p = -1.38888888888741095749e-03 + z * p
+    p = 4.16666666666666019037e-02 + z * p
+    cosine = (1.0 - 0.5 * z) + z * z * p
+    # Add the quarter turns again, whose cosine and sine are (1, 0), (0, 1), (-1, 0) or (0, -1).
+    half = floor(turns * 0.5)
+    odd = turns - half - half
+    sign = 1.0 - 2.0 * (half - 2.0 * floor(half * 0.5))
+    even, odd = sign * (1.0 - odd), sign * odd
+    return even * cosine - odd * sine, odd * cosine + even * sine
+
+
+@inlined
+def _place(work, at, parent, fixed, first, cosine, sine, shift):
+    """Write the place of a body into `work` at `at`, that of its parent being at `parent`."""
+    axes = vec.get_columns(work, parent)
+    x = vec.product(axes, vec.get3(fixed, first))
+    y = vec.product(axes, vec.get3(fixed, first + 3))
+    z = vec.product(axes, vec.get3(fixed, first + 6))
+    origin = vec.product(axes, vec.get3(fixed, first + 9))
+    vec.put3(work, at, vec.plus(vec.times(x, cosine), vec.times(y, sine)))
+    vec.put3(work, at + 3, vec.minus(vec.times(y, cosine), vec.times(x, sine)))
+    vec.put3(work, at + 6, z)
+    vec.put3(work, at + 9, vec.plus(origin, vec.times(z, shift)))
+
+
+@inlined
+def _inertia(work, at, place, bodies, first):
+    """Write a body's inertia about its joint: m, m c, and R I R^T by way of the columns of R I."""
+    axes = vec.get_columns(work, place)
+    store(work, at, load(bodies, first))
+    vec.put3(work, at + 1, vec.product(axes, vec.get3(bodies, first + 1)))
+    xx, xy, xz = vec.get3(bodies, first + 4)
+    yy, yz, zz = vec.get3(bodies, first + 7)
+    u = vec.product(axes, (xx, xy, xz))
+    v = vec.product(axes, (xy, yy, yz))
+    w = vec.product(axes, (xz, yz, zz))
+    _, yy, yz = vec.product(axes, (u[1], v[1], w[1]))
+    zz = vec.product(axes, (u[2], v[2], w[2]))[2]
+    vec.put3(work, at + 4, vec.product(axes, (u[0], v[0], w[0])))
+    vec.put3(work, at + 7, (yy, yz, zz))
+
+
+@inlined
+def _carry(work, at, above, place):
+    """Add a composite inertia, seen from the parent's joint, to the parent's."""
+    m = load(work, at)
+    h = vec.get3(work, at + 1)
+    xx, xy, xz = vec.get3(work, at + 4)
+    yy, yz, zz = vec.get3(work, at + 7)
+    d = vec.get3(work, place + 9)
+    e = vec.plus(h, vec.times(d, m))
+    px, py, pz = d[0] * (h[0] + e[0]), d[1] * (h[1] + e[1]), d[2] * (h[2] + e[2])
+    xy = xy - (d[0] * e[1] + h[0] * d[1])
+    xz = xz - (d[0] * e[2] + h[0] * d[2])
+    yz = yz - (d[1] * e[2] + h[1] * d[2])
+    vec.add(work, above, m)
+    vec.add3(work, above + 1, e)
+    vec.add3(work, above + 4, (xx + (py + pz), xy, xz))
+    vec.add3(work, above + 7, (yy + (px + pz), yz, zz + (px + py)))
+
+
+@inlined
+def inertia_times(work, at, w):
+    """Return I w of the inertia at `at`."""
+    xx, xy, xz = vec.get3(work, at + 4)
+    yy, yz, zz = vec.get3(work, at + 7)
+    return vec.dot((xx, xy, xz), w), vec.dot((xy, yy, yz), w), vec.dot((xz, yz, zz), w)
+
+
+@inlined
+def _momentum(work, at, axis, turns, slides):
+    """Return the momentum (angular, linear) about its joint of an inertia that the joint moves."""
+    m = load(work, at)
+    lever = vec.cross(vec.get3(work, at + 1), axis)
+    return (
+        vec.plus(vec.times(inertia_times(work, at, axis), turns), vec.times(lever, slides)),
+        vec.minus(vec.times(vec.times(axis, m), slides), vec.times(lever, turns)),
+    )
+
+
+@inlined
+def outwards(work, tree, q):
+    """Write the places of all bodies and their own inertias, outwards."""
+    places, own = tree.places, tree.own
+    one, zero = splat(work, 1.0), splat(work, 0.0)
+    vec.put3(work, places, (1.0, 0.0, 0.0))
+    vec.put3(work, places + 3, (0.0, 1.0, 0.0))
+    vec.put3(work, places + 6, (0.0, 0.0, 1.0))
+    _inertia(work, own, places, tree.bodies, 0)
+    for body in range(1, len(tree.parent)):
+        at = places + body * PLACE
+        value = load(q, tree.index[body])
+        if tree.unbounded[body]:
+            cosine, sine = value, load(q, tree.index[body] + 1)
+        elif tree.turns[body] != 0.0:
+            cosine, sine = cosine_and_sine(tree.turns[body] * value)
+        else:
+            cosine, sine = one, zero
+        above = places + tree.parent[body] * PLACE
+        shift = tree.slides[body] * value
+        _place(work, at, above, tree.fixed, body * PLACE, cosine, sine, shift)
+        _inertia(work, own + body * INERTIA, at, tree.bodies, body * INERTIA)
+
+
+@inlined
+def inwards(work, tree):
+    """Write the packed M and the composite inertias, inwards."""
+    bodies = len(tree.parent)
+    places, inertias, packed = tree.places, tree.inertias, tree.packed
+    zero = splat(work, 0.0)
+    for index in range(tree.entries):
+        store(work, packed + index, 0.0)
+    for index in range(bodies * INERTIA):
+        store(work, inertias + index, load(work, tree.own + index))
+    pair = 0
+    for body in range(bodies - 1, 0, -1):
+        at = inertias + body * INERTIA
+        place = places + body * PLACE
+        z = vec.get3(work, place + 6)
+        moment, force = _momentum(work, at, z, tree.turns[body], tree.slides[body])
+        _carry(work, at, inertias + tree.parent[body] * INERTIA, place)
+        above = body
+        while above > 0:
+            place = places + above * PLACE
+            z = vec.get3(work, place + 6)
+            value = tree.turns[above] * vec.dot(z, moment)
+            value = value + tree.slides[above] * vec.dot(z, force)
+            vec.add(work, packed + tree.target[pair], tree.share[pair] * value)
+            pair += 1
+            # The moment about the parent's joint.
+            moment = vec.plus(moment, vec.cross(vec.get3(work, place + 9), force))
+            above = tree.parent[above]
+        start, share = packed + tree.target[pair], tree.share[pair]
+        pair += 1
+        vec.add3(work, start, vec.times(moment, share))
+        vec.add3(work, start + 3, vec.times(force, share))
+    # The base's block (I, [m c]x, m), packed as the rows of a chain of six coordinates.
+    m = load(work, inertias)
+    hx, hy, hz = vec.get3(work, inertias + 1)
+    xx, xy, xz = vec.get3(work, inertias + 4)
+    yy, yz, zz = vec.get3(work, inertias + 7)
+    own = (xx, xy, yy, xz, yz, zz)
+    for index in range(6):
+        store(work, packed + index, own[index])
+    linear = (
+        zero,
+        hz,
+        zero - hy,
+        m,
+        zero - hz,
+        zero,
+        hx,
+        zero,
+        m,
+        hy,
+        zero - hx,
+        zero,
+        zero,
+        zero,
+        m,
+    )
+    for index in range(15):
+        store(work, packed + (6 + index), linear[index])
+    for index in range(len(tree.row)):
+        at = packed + (tree.row[index] + tree.depth[index])
+        vec.add(work, at, tree.armature[index])
+
+
+@inlined
+def factorise(work, tree):
+    """Turn the packed M into L, of unit diagonal, and 1 / D where `scaled` is, M = L^T D L."""
+    packed, scaled = tree.packed, tree.scaled
+    for k in range(len(tree.row) - 1, -1, -1):
+        row, depth = packed + tree.row[k], tree.depth[k]
+        inverse = 1.0 / load(work, row + depth)
+        store(work, scaled + (tree.row[k] + depth), inverse)
+        store(work, row + depth, 1.0)
+        for t in range(depth - 1, -1, -1):
+            share = load(work, row + t) * inverse
+            other = packed + tree.row[tree.path[tree.row[k] + t]]
+            for s in range(t + 1):
+                at = other + s
+                store(work, at, load(work, at) - share * load(work, row + s))
+            store(work, row + t, share)
+
+
+@inlined
+def solve(work, tree, x):
+    """Turn a force at x into the acceleration M^-1 f, by the factor."""
+    packed, size = tree.packed, len(tree.row)
+    for k in range(size - 1, -1, -1):
+        value, row = load(work, x + k), tree.row[k]
+        for t in range(tree.depth[k]):
+            at = x + tree.path[row + t]
+            store(work, at, load(work, at) - load(work, packed + row + t) * value)
+        pivot = load(work, tree.scaled + row + tree.depth[k])
+        store(work, x + k, value * pivot)
+    for k in range(size):
+        value, row = load(work, x + k), tree.row[k]
+        for t in range(tree.depth[k]):
+            value = value - load(work, packed + row + t) * load(work, x + tree.path[row + t])
+        store(work, x + k, value)
+
+
+@inlined
+def keep_diagonal(work, tree):
+    """Write the diagonal of the packed M aside, which its factor overwrites."""
+    for k in range(len(tree.row)):
+        value = load(work, tree.packed + tree.row[k] + tree.depth[k])
+        store(work, tree.diagonal + k, value)
+
+
+@inlined
+def invert_factor(work, tree):
+    """Turn L into U = L^-1, and write V = L^-1 D^-1."""
+    packed, scaled = tree.packed, tree.scaled
+    zero = splat(work, 0.0)
+    for k in range(len(tree.row)):
+        row, depth = packed + tree.row[k], tree.depth[k]
+        for t in range(depth):
+            total = zero - load(work, row + t)
+            for s in range(t + 1, depth):
+                other = packed + tree.row[tree.path[tree.row[k] + s]]
+                total = total - load(work, row + s) * load(work, other + t)
+            store(work, row + t, total)
+            above = tree.path[tree.row[k] + t]
+            pivot = load(work, scaled + (tree.row[above] + tree.depth[above]))
+            store(work, scaled + (tree.row[k] + t), total * pivot)
+
+
+@inlined
+def multiply(work, tree, judged):
+    """Write M^-1 = U D^-1 U^T, and at `judged` the sum of M_ii (M^-1)_ii."""
+    packed, scaled, square = tree.packed, tree.scaled, tree.square
+    size = len(tree.row)
+    coupling = splat(work, 0.0)
+    for i in range(size):
+        left = packed + tree.row[i]
+        for j in range(i + 1):
+            right = scaled + tree.row[j]
+            total = load(work, left) * load(work, right)
+            for t in range(1, tree.common[i, j]):
+                total = total + load(work, left + t) * load(work, right + t)
+            store(work, square + (i * size + j), total)
+            store(work, square + (j * size + i), total)
+            if i == j:
+                coupling = coupling + total * load(work, tree.diagonal + i)
+    store(work, judged, coupling)
+
+
+@inlined
+def pack(rows, first, lanes):
+    """Write the rows of eight points lane beside lane."""
+    for entry in range(len(lanes)):
+        for lane in range(LANES):
+            lanes[entry, lane] = rows[first + lane, entry]
+
+
+@inlined
+def unpack(work, start, entries, out, first, offset):
+    """Write entries that stand lane beside lane to the rows of eight points, from a column on."""
+    stride = out.shape[1]
+    whole = entries - entries % LANES
+    to = first * stride + offset
+    for entry in range(0, whole, LANES):
+        transpose(work, start + entry, out, to + entry, stride)
+    for entry in range(whole, entries):
+        for lane in range(LANES):
+            out[first + lane, offset + entry] = work[start + entry, lane]

@@ -1,0 +1,232 @@
+"""Compilation of the kernel's functions by numba, with the functions that they call.
+
+`translated` makes a numba function of a function of the kernel. numba optimises each function and
+makes machine code of it, with all that it calls, before the function that calls it: what is ten
+calls deep is compiled ten times. Here a part, called by other compiled functions alone, is kept as
+LLVM has it, and compiled once with the function that is called from Python.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from types import FunctionType, ModuleType
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core.codegen import CPUCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import (
+    infer_getattr,
+    intrinsic,
+    lower_getattr_generic,
+    models,
+    register_model,
+)
+from numba.np.arrayobj import populate_array
+
+from fflin.kernel.arguments import Opener, Struct
+from fflin.kernel.lane_code import OPERATIONS
+from fflin.kernel.lanes import HOW, LOOPS
+
+_WORD, _DOUBLE = ir.IntType(64), ir.DoubleType()
+
+
+class _NoEnvironments:
+    """A code generator; functions without machine code have no environment to be written."""
+
+    def __init__(self, codegen: Any) -> None:
+        self._codegen = codegen
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._codegen, name)
+
+    def set_env(self, *_: Any) -> None:
+        """Write nothing."""
+
+
+class PartLibrary(CPUCodeLibrary):
+    """The code of a part, and which others it calls."""
+
+    def __init__(self, codegen: Any, name: str) -> None:
+        super().__init__(codegen, name)
+        self._whole: Any = None
+
+    @property
+    def codegen(self) -> Any:
+        """What makes code of it."""
+        return _NoEnvironments(self._codegen)
+
+    def finalize(self) -> None:
+        """Take no more code; optimise none."""
+        self._raise_if_finalized()
+        self._finalized = True
+
+    def add_linking_library(self, library: Any) -> None:
+        """Note that a function of another library is called."""
+        super().add_linking_library(library)
+        self._reload_init.update(library._reload_init)
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return 0: there is no machine code."""
+        self._ensure_finalized()
+        return 0
+
+    def _called(self, found: dict[Any, None]) -> None:
+        for library in self._linking_libraries:
+            if library not in found:
+                found[library] = None
+                if isinstance(library, PartLibrary):
+                    library._called(found)
+
+    def _own_module(self) -> Any:
+        """Return the code without that of what it calls."""
+        return super()._get_module_for_linking()
+
+    def _get_module_for_linking(self) -> Any:
+        """Return the code with that of all parts it calls, each once."""
+        if self._whole is None:
+            found: dict[Any, None] = {self: None}
+            self._called(found)
+            self._whole = self._own_module().clone()
+            for library in list(found)[1:]:
+                part = isinstance(library, PartLibrary)
+                module = library._own_module() if part else library._get_module_for_linking()
+                self._whole.link_in(module, preserve=True)
+        return self._whole
+
+
+class PartCompiler(Compiler):
+    """The pipeline of a part."""
+
+    def __init__(self, typingctx: Any, targetctx: Any, library: Any, *rest: Any) -> None:
+        super().__init__(typingctx, targetctx, library, *rest)
+        if library is None:
+            self.state.library = PartLibrary(self.state.targetctx.codegen(), "part")
+
+
+class _StructType(numba.types.Type):
+    """The numba type of a struct: a pointer to its words."""
+
+    def __init__(self, struct: Struct) -> None:
+        self.struct = struct
+        super().__init__(name=struct.name)
+
+
+def _numba_type(kind: Any) -> Any:
+    """Return the numba type of a kind."""
+    if isinstance(kind, Struct):
+        return _StructType(kind)
+    number = numba.from_dtype(np.dtype(kind.dtype))
+    return numba.types.Array(number, kind.axes, "C") if kind.axes else number
+
+
+@register_model(_StructType)
+class _StructModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _WORD.as_pointer())
+
+
+@infer_getattr
+class _Fields(AttributeTemplate):
+    key = _StructType
+
+    def generic_resolve(self, kind: Any, name: str) -> Any:
+        found = kind.struct.kinds.get(name)
+        return None if found is None else _numba_type(found)
+
+
+@lower_getattr_generic(_StructType)
+def _field(context: Any, builder: Any, kind: Any, words: Any, name: str) -> Any:
+    found, first = _numba_type(kind.struct.kinds[name]), kind.struct.places[name]
+
+    def at(place: int) -> Any:
+        return builder.gep(words, [_WORD(first + place)])
+
+    def word(place: int) -> Any:
+        value = builder.load(at(place))
+        # No store of a double makes it another, so it need not be read again.
+        value.set_metadata("invariant.load", builder.module.add_metadata([]))
+        return value
+
+    if isinstance(found, _StructType):
+        return at(0)
+    if found == numba.types.float64:
+        return builder.bitcast(word(0), _DOUBLE)
+    if found == numba.types.boolean:
+        return builder.trunc(word(0), ir.IntType(1))
+    if not isinstance(found, numba.types.Array):
+        return word(0)
+    array = context.make_array(found)(context, builder)
+    shape = [word(1 + axis) for axis in range(found.ndim)]
+    size = context.get_constant(
+        numba.intp, context.get_abi_sizeof(context.get_data_type(found.dtype))
+    )
+    strides = [size]
+    for length in shape[:0:-1]:
+        strides.insert(0, builder.mul(strides[0], length))
+    data = builder.inttoptr(word(0), array.data.type)
+    populate_array(array, data, shape, strides, size, None)
+    return array._getvalue()
+
+
+def opener(kind: Struct) -> Any:
+    """Return the numba function that takes an array of words for a struct."""
+
+    @intrinsic
+    def opened(typing: Any, words: Any) -> Any:
+        def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
+            return context.make_array(words)(context, builder, arguments[0]).data
+
+        return _StructType(kind)(words), generate
+
+    return opened
+
+
+# A product and a sum may become one fused instruction, which rounds once; a quotient by zero is
+# infinite; and no references to arrays are counted, which takes three quarters of the time else,
+# and makes no function able to allocate.
+_OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
+_PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
+_DECORATORS = {
+    "inlined": numba.njit(forceinline=True, **_PART),
+    "listed": numba.njit(inline="always", **_OPTIONS),
+    "called": numba.njit(**_PART),
+    "compiled": numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS),
+}
+
+
+@cache
+def translated(function: Any) -> Any:
+    """Return the numba function of a function of the kernel, which calls numba functions alone."""
+    names = {"__name__": function.__module__, **function.__globals__}
+    for name in function.__code__.co_names:
+        if name in names:
+            names[name] = _counterpart(names[name])
+    twin = FunctionType(
+        function.__code__, names, function.__name__, function.__defaults__, function.__closure__
+    )
+    return _DECORATORS[HOW[function]](twin)
+
+
+def _counterpart(value: Any) -> Any:
+    """Return what stands in compiled code for a global value of the kernel's modules."""
+    if isinstance(value, Opener):
+        return opener(value.kind)
+    if isinstance(value, ModuleType) and value.__name__.startswith("fflin.kernel."):
+        return _translated_module(value)
+    if isinstance(value, FunctionType) and LOOPS.get(value, value) in HOW:
+        return translated(LOOPS.get(value, value))
+    return OPERATIONS.get(value, value) if callable(value) else value
+
+
+@cache
+def _translated_module(module: ModuleType) -> ModuleType:
+    twin = ModuleType(module.__name__)
+    for name, value in vars(module).items():
+        if not isinstance(value, ModuleType):
+            setattr(twin, name, _counterpart(value))
+    return twin

@@ -1,0 +1,305 @@
+r"""Modes of appendages as bodies on joints, taken out of the links that carry them.
+
+Each mode is equivalent to one ball on one screw joint, whose spatial inertia I and twist S for a
+unit of the amplitude satisfy I S = L and S^T I S = 1, with the participation L of the mode. The
+ball is taken out of the link's inertia, so that the sum of both is the link in the URDF.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import FflinWarning, InputError
+from fflin.base.validation import Array
+from fflin.robot.appendages import Appendage, FlexibleAppendage, Slosh, rigid_inertia
+from fflin.robot.joints import ROOT, Joint, find_frame
+from fflin.robot.mass_properties import Piece, as_inertia
+from fflin.robot.mounting import Mounted, difference, inertia_of
+from fflin.robot.wheels import turned_to
+
+# An eigenvalue of M_rr - L L^T below minus this share of the largest of M_rr is negative.
+_NEGATIVE = 1e-9
+# Mass properties of a file and of the URDF that differ by less than this share agree.
+_AGREE = 1e-2
+# What the balls of a body's modes take of its mass at most. CRBA adds up the inertias from the
+# last joint on, which is only possible if each sum has a mass.
+_LARGEST_SHARE = 0.9
+# A ball nearer to its appendage's frame than this share of the body's radius of gyration stands for
+# no rotation about it.
+_SHORTEST = 0.05
+# Nor may the balls be lighter than this share of the mass that needs no rotor.
+_LIGHTEST = 1e-6
+# Participation below this share of the other part, in the body's size, is none.
+_NONE = 1e-14
+
+
+class _Modes(NamedTuple):
+    """An appendage as seen by the body that carries it: participation L (6, k) in its frame."""
+
+    appendage: Appendage
+    joint: int
+    placement: pin.SE3
+    L: Array  # rows: translation, rotation about the body's origin
+
+
+def mounted_appendages(
+    model: pin.Model,
+    bodies: list[pin.Inertia],
+    appendages: Sequence[Appendage],
+    links: Mapping[str, Piece],
+) -> tuple[list[Mounted], dict[str, dict[str, float]]]:
+    """Return the bodies of all modes, taken out of the bodies that carry them, and the springs."""
+    found = [_seen(model, item) for item in appendages]
+    for item in found:
+        _compare_inertia(item, bodies, links)
+    for joint in dict.fromkeys(item.joint for item in found):
+        of = "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
+        _require_inertia(bodies[joint], of, [item for item in found if item.joint == joint])
+    parts: list[Mounted] = []
+    springs: dict[str, dict[str, float]] = {"stiffness": {}, "damping": {}}
+    for item in found:
+        if isinstance(item.appendage, Slosh):
+            parts += _liquid(item.appendage, item, bodies)
+        for kind, values in item.appendage.springs.items():
+            springs[kind] |= values
+    balls = {
+        joint: [ball for item in found if item.joint == joint for ball in _balls(item, body)]
+        for joint, body in enumerate(bodies)
+    }
+    for joint, of_body in balls.items():
+        mass = sum(ball.mass for ball in of_body)
+        lighter = min(1.0, _LARGEST_SHARE * bodies[joint].mass / mass) if mass else 1.0
+        if lighter < _LIGHTEST:
+            raise InputError(
+                f"mode '{of_body[0].name}' has a participation in translation, but the slosh of "
+                f"its body leaves it {bodies[joint].mass:.3g} kg; the mass in the URDF must "
+                "include both"
+            )
+        for ball in of_body:
+            part, removed = ball.mounted(joint, lighter)
+            parts.append(part)
+            bodies[joint] = difference(bodies[joint], removed)
+    return parts, springs
+
+
+def _seen(model: pin.Model, item: Appendage) -> _Modes:
+    joint, placement = find_frame(model, item.frame)
+    R, p = placement.rotation, placement.translation
+    t, r = (R @ part for part in np.split(item.participation, 2))
+    r = r + np.cross(p, t, axisb=0, axisc=0)
+    return _Modes(item, joint, placement, np.vstack((t, r)))
+
+
+def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[str, Array]:
+    """Return {mode: effective masses and moments of inertia (6,)} in the appendage's frame.
+
+    They are fractions of the inertia of the file for appendages that have one, and otherwise of the
+    body of `model` that carries the appendage, both about the origin of its frame.
+    """
+    found: dict[str, Array] = {}
+    for item in appendages:
+        joint, placement = find_frame(model, item.frame)
+        total = model.inertias[joint].se3Action(placement.inverse()).matrix()
+        if isinstance(item, FlexibleAppendage) and item.inertia is not None:
+            total = item.inertia
+        squares = item.participation.T**2
+        shares = squares / np.maximum(total.diagonal(), 1e-300)
+        found |= dict(zip(item.modes, shares, strict=True))
+    return found
+
+
+def _compare_inertia(item: _Modes, bodies: list[pin.Inertia], links: Mapping[str, Piece]) -> None:
+    """Warn if a file's rigid inertia differs from the link's."""
+    appendage = item.appendage
+    if not isinstance(appendage, FlexibleAppendage) or appendage.inertia is None:
+        return
+    of_file, link = rigid_inertia(appendage.inertia), links.get(appendage.frame)
+    of_link, what = bodies[item.joint], f"the body with frame '{appendage.frame}'"
+    if link is not None:
+        of_link, what = as_inertia(link), f"link '{appendage.frame}'"
+    of_link = of_link.se3Action(item.placement.inverse())
+    M = of_link.matrix()
+    size = _radius_of_gyration(of_link.mass, M[3:, 3:])
+    scale = np.array([1.0, 1.0, 1.0, *[1.0 / size] * 3])
+    apart = np.abs(M - appendage.inertia) * np.outer(scale, scale)
+    if apart.max() > _AGREE * max(M[0, 0], of_file.mass):
+        both = [
+            f"{body.mass:.4g} kg at {_point(body.lever)} m with moments of inertia "
+            f"{_point(body.inertia.diagonal())} kg m^2 about it"
+            for body in (of_file, of_link)
+        ]
+        warnings.warn(
+            f"flexible appendage '{appendage.title}': its file has {both[0]}, but {what} has "
+            f"{both[1]}, in the axes of the frame; correct the URDF, or take the file's with "
+            "rigid=True",
+            FflinWarning,
+            stacklevel=6,
+        )
+
+
+def _radius_of_gyration(mass: float, inertia: Array) -> float:
+    """Return the root mean square distance [m] of a body's mass from the origin of its inertia."""
+    return math.sqrt(max(float(np.trace(inertia)), 1e-300) / max(2.0 * mass, 1e-300))
+
+
+def _point(values: Array) -> str:
+    return f"({', '.join(f'{x:.4g}' for x in values)})"
+
+
+def _require_inertia(body: pin.Inertia, of: str, found: Sequence[_Modes]) -> None:
+    """Raise `InputError` if M_rr - L L^T of a body has a negative eigenvalue."""
+    # About the centre of mass, in units in which the mass and the radius of gyration are one.
+    size = _radius_of_gyration(body.mass, body.inertia)
+    left = np.zeros((6, 6))
+    left[:3, :3], left[3:, 3:] = body.mass * np.eye(3), body.inertia / size**2
+    largest = float(np.linalg.eigvalsh(left)[-1])
+    for item in found:
+        moments = item.L[3:] - np.cross(body.lever, item.L[:3], axisb=0, axisc=0)
+        for mode, t, r in zip(item.appendage.modes, item.L[:3].T, moments.T, strict=True):
+            column = np.append(t, r / size)
+            left -= np.outer(column, column)
+            finite = np.isfinite(left).all()
+            least = float(np.linalg.eigvalsh(left)[0]) if finite else -math.inf
+            if not least >= -_NEGATIVE * largest:
+                raise InputError(
+                    f"mode '{mode}' has more participation ({np.linalg.norm(t):.3g} kg^0.5, "
+                    f"{np.linalg.norm(r):.3g} kg^0.5 m about the centre of mass) than "
+                    f"{of} with {body.mass:.4g} kg can have: M_rr - L L^T "
+                    f"has the eigenvalue {least:.2g} in units of its mass and radius of gyration; "
+                    "the inertia in the URDF must include the appendage as if it were rigid"
+                )
+
+
+class _Ball(NamedTuple):
+    """A mode's ball: its participation (3,), (3,) in the body's frame, and where it is."""
+
+    name: str
+    t: Array
+    r: Array  # what remains about the ball's centre
+    center: Array
+    mass: float  # [kg] with which no rotor is needed
+    moment: float  # [kg m^2]
+    lever: float  # [m] distance from the appendage's frame; 0 if it is too small to turn about
+
+    @property
+    def rotation(self) -> float:
+        r"""Rotation [rad] that a unit of the amplitude stands for.
+
+        The ball turns by w, and moves by v at its distance c from the appendage's frame; the
+        rotation is at most :math:`|w| + |v| / |c|`.
+        """
+        turned = float(np.linalg.norm(self.r)) / self.moment if self.moment else 0.0
+        moved = float(np.linalg.norm(self.t)) / self.mass if self.mass else 0.0
+        return turned + (moved / self.lever if self.lever else 0.0)
+
+    def mounted(self, joint: int, lighter: float) -> tuple[Mounted, pin.Inertia]:
+        """Return the ball on its joint, and the inertia to take out of the body."""
+        mass = lighter * self.mass
+        v = self.t / mass if mass else np.zeros(3)
+        w = self.r / self.moment if self.moment else np.zeros(3)
+        # A rotor supplies what a lighter ball lacks or has too much of: S^T I S + rotor = 1.
+        rotor = 1.0 - float(self.t @ v + self.r @ w)
+        moving, turning = float(np.linalg.norm(v)), float(np.linalg.norm(w))
+        sphere = self.moment * np.eye(3)
+        removed = inertia_of(mass, self.center, sphere)
+        if turning:
+            axis, scale = w / turning, turning
+            origin: Array = self.center + np.cross(w, v) / turning**2
+            pitch = float(v @ w) / turning**2
+            motion: Any = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
+        else:
+            axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
+            origin, motion = self.center, pin.JointModelPZ()
+        R = turned_to(axis)
+        own = inertia_of(mass, R.T @ (self.center - origin), sphere)
+        mode = Joint(
+            self.name,
+            idx_q=0,
+            idx_v=0,
+            unbounded=False,
+            prismatic=not turning,
+            kind="modal",
+            scale=scale,
+            rotation=self.rotation,
+        )
+        if abs(rotor) < 1e-13:
+            rotor = 0.0
+        return Mounted(mode, joint, pin.SE3(R, origin), motion, own, rotor / scale**2), removed
+
+
+def _balls(item: _Modes, body: pin.Inertia) -> list[_Ball]:
+    """Return a ball for each mode of a flexible appendage."""
+    if not isinstance(item.appendage, FlexibleAppendage):
+        return []
+    p = item.placement.translation
+    size = _radius_of_gyration(body.mass, body.matrix()[3:, 3:])
+    balls = []
+    for name, column in zip(item.appendage.modes, item.L.T, strict=True):
+        t, r = column[:3], column[3:]
+        # About the appendage's frame; only there is a translation without a rotation one.
+        r = r - np.cross(p, t)
+        square = float(t @ t)
+        center = np.zeros(3)
+        if math.sqrt(square) * size > _NONE * float(np.linalg.norm(r)):
+            center = np.cross(t, r) / square
+            # No farther out than the body is large.
+            center *= min(1.0, size / max(float(np.linalg.norm(center)), 1e-300))
+        else:
+            t, square = np.zeros(3), 0.0
+        r = r - np.cross(center, t)
+        rest = float(np.linalg.norm(r))
+        far = max(size, float(np.linalg.norm(p))) * math.sqrt(square)
+        if rest <= _NONE * max(far, float(np.linalg.norm(column[3:]))):
+            r, rest = np.zeros(3), 0.0
+        moment = rest**2 + size**2 * square if rest else 0.0
+        mass = square + (rest / size) ** 2 if square else 0.0
+        lever = float(np.linalg.norm(center))
+        lever = lever if lever >= _SHORTEST * size else 0.0
+        balls.append(_Ball(name, t, r, p + center, mass, moment, lever))
+    return balls
+
+
+def _liquid(slosh: Slosh, item: _Modes, bodies: list[pin.Inertia]) -> list[Mounted]:
+    """Return two joints, the second with the mass, which is taken out of the body."""
+    joint, placement = item.joint, item.placement
+    axes = placement.rotation @ slosh.axes
+    at = placement * np.array(slosh.position)
+    point = np.zeros((3, 3))
+    bodies[joint] = difference(bodies[joint], inertia_of(slosh.mass, at, point))
+    first, _ = slosh.modes
+    x, y, z = axes.T
+    empty = pin.Inertia.Zero()
+    if slosh.length is None:
+        across = [
+            Joint(name, 0, 0, False, prismatic=True, kind="slosh", inertia=slosh.modal_mass)
+            for name in slosh.modes
+        ]
+        along_x, along_y = turned_to(x), turned_to(y)
+        between = pin.SE3(along_x.T @ along_y, np.zeros(3))
+        mass = inertia_of(slosh.mass, np.zeros(3), point)
+        slide = pin.JointModelPZ
+        return [
+            Mounted(across[0], joint, pin.SE3(along_x, at), slide(), empty),
+            Mounted(across[1], first, between, slide(), mass),
+        ]
+    swings = [
+        Joint(
+            name, 0, 0, False, prismatic=False, kind="slosh", inertia=slosh.modal_mass, rotation=1.0
+        )
+        for name in slosh.modes
+    ]
+    # About -y, then about x, the mass moves along x and y.
+    about_y, about_x = turned_to(-y), turned_to(x)
+    between = pin.SE3(about_y.T @ about_x, np.zeros(3))
+    mass = inertia_of(slosh.mass, about_x.T @ (-slosh.length * z), point)
+    hinge = pin.JointModelRZ
+    return [
+        Mounted(swings[0], joint, pin.SE3(about_y, at + slosh.length * z), hinge(), empty),
+        Mounted(swings[1], first, between, hinge(), mass),
+    ]

@@ -1,0 +1,504 @@
+r"""Flexible appendages and slosh: passive degrees of freedom of a link, as bodies on joints.
+
+A clamped appendage with the twist V of its frame, modal amplitudes :math:`\eta` of unit modal mass
+and the participation L (6, k) has the kinetic energy
+
+.. math:: T = \tfrac12 V^T M_{rr} V + V^T L \dot\eta + \tfrac12 \dot\eta^T \dot\eta.
+
+Each mode is equivalent to one ball on one screw joint, whose spatial inertia I and twist S for a
+unit of the amplitude satisfy I S = L and S^T I S = 1. The ball is taken out of the link's inertia,
+so that the sum of both is the link in the URDF.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, FrozenArrays, as_double, number
+from fflin.robot.inputs import Vector3, three_numbers, unit_vector
+from fflin.robot.mounting import about_origin, inertia_of
+
+# First root of J_1'(x) = 0: k R of the first lateral mode of a circular cylinder.
+_FIRST_ROOT = 1.8411837813406593
+_FASTEST = 1e12  # [Hz]
+
+
+class Appendage(FrozenArrays):
+    """Base class of passive parts of a link."""
+
+    KEY: ClassVar[str]  # its table in a robot file
+    frame: str
+    name: str | None
+
+    @property
+    def title(self) -> str:
+        """Name by which the coordinates begin."""
+        return self.name or self.frame
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        raise NotImplementedError
+
+    @property
+    def participation(self) -> Array:
+        """Participation L (6, k) in the frame: translation over rotation about its origin."""
+        raise NotImplementedError
+
+    @property
+    def springs(self) -> dict[str, dict[str, float]]:
+        """{"stiffness": {mode: value}, "damping": {mode: value}} of the coordinates."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class FlexibleAppendage(Appendage):
+    r"""Flexible part of a link, such as a solar array, described by its clamped modes.
+
+    Each mode becomes a coordinate of q_m, its modal amplitude in kg^0.5 m for unit modal mass, with
+    the name NAME_mode_1, NAME_mode_2, ... It has the stiffness :math:`\omega^2` and the damping
+    :math:`2 \zeta \omega`, and no motor. The link's inertia in the URDF must include the appendage
+    as if it were rigid.
+
+    Parameters
+    ----------
+    frame : str
+        Frame of the model at which the appendage is clamped, on the base or on any link.
+    frequency : float or sequence of float (k,)
+        Frequencies [Hz] of the clamped appendage.
+    translation : array_like (3, k)
+        Modal participation in translation [kg^0.5]: the linear momentum of each mode for a unit of
+        its rate, in the frame's axes. The effective mass of a mode along an axis is its square.
+    rotation : array_like (3, k)
+        Modal participation in rotation [kg^0.5 m]: the angular momentum about the frame's origin.
+    damping : float or sequence of float (k,)
+        Damping ratios, from 0 to 1.
+    name : str, optional
+        Name with which the coordinates begin; the frame's name by default.
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, a value is not finite, a frequency is not positive, or a damping ratio
+        is not between 0 and 1. When the robot is made: if the inertia of the carrying body cannot
+        have this participation, because :math:`M_{rr} - L L^T` is not positive semidefinite.
+
+    Examples
+    --------
+    >>> array = fflin.FlexibleAppendage(
+    ...     "base", [0.3], [[0.0], [0.0], [2.0]], [[3.0], [0.0], [0.0]], name="array"
+    ... )
+    >>> robot = fflin.load("planar_detumble", appendages=[array])
+    >>> robot.joint_names[-1], round(robot.stiffness["array_mode_1"], 3)
+    ('array_mode_1', 3.553)
+    """
+
+    KEY = "flexible"
+    frame: str
+    frequency: Any
+    translation: Any
+    rotation: Any
+    damping: Any = 0.005
+    name: str | None = None
+    # M_rr (6, 6) of a file about the frame's origin, translation over rotation, and whether it
+    # replaces the inertia of the URDF.
+    inertia: Array | None = field(default=None, kw_only=True)
+    rigid: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        what = f"flexible appendage '{_text('frame', self.frame)}'"
+        frequency = np.atleast_1d(as_double(f"frequency of {what}", self.frequency))
+        if frequency.ndim != 1 or not frequency.size:
+            raise InputError(f"frequency of {what} is {self.frequency!r}, expected k numbers [Hz]")
+        modes = len(frequency)
+        damping = as_double(f"damping of {what}", self.damping)
+        if damping.shape not in ((), (modes,)):
+            raise InputError(
+                f"damping of {what} has shape {damping.shape}, expected one ratio or {modes}"
+            )
+        damping = np.broadcast_to(damping, modes).copy()
+        for mode, (f, ratio) in enumerate(zip(frequency, damping, strict=True), start=1):
+            if not 0.0 < f < _FASTEST:
+                raise InputError(
+                    f"frequency of mode {mode} of {what} is {f:g} Hz, expected more than 0 and "
+                    f"less than {_FASTEST:g}"
+                )
+            if not 0.0 <= ratio <= 1.0:
+                raise InputError(
+                    f"damping of mode {mode} of {what} is {ratio:g}, expected a ratio from 0 to 1"
+                )
+        for name, unit in (("translation", "kg^0.5"), ("rotation", "kg^0.5 m")):
+            value = as_double(f"{name} of {what}", getattr(self, name))
+            if value.shape != (3, modes):
+                raise InputError(
+                    f"{name} of {what} has shape {value.shape}, expected (3, {modes}): one column "
+                    f"[{unit}] for each of the {modes} frequencies"
+                )
+            if bad := np.flatnonzero(~np.isfinite(value).all(axis=0)).tolist():
+                raise InputError(f"{name} of mode {bad[0] + 1} of {what} is not finite")
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "frequency", frequency)
+        object.__setattr__(self, "damping", damping)
+        if self.name is not None:
+            _text("name", self.name)
+        super().__post_init__()
+
+    @classmethod
+    def from_nastran(
+        cls,
+        op4: Any,
+        asm: Any,
+        *,
+        frame: str,
+        origin: Any = None,
+        modes: int | None = None,
+        length: str = "m",
+        mass: str = "kg",
+        damping: Any = 0.005,
+        name: str | None = None,
+        rigid: bool = False,
+    ) -> FlexibleAppendage:
+        r"""Read a Craig-Bampton superelement that Nastran wrote as an external superelement.
+
+        The boundary is reduced to a rigid interface at the frame. With :math:`\Phi` the rigid
+        motions of the boundary, in the output coordinate systems of its grids, and V the modes of
+        unit modal mass of :math:`K_{qq}, M_{qq}`, the participation is
+        :math:`L = \Phi^T M_{bq} V` and the rigid inertia :math:`M_{rr} = \Phi^T M_{bb} \Phi`.
+
+        Parameters
+        ----------
+        op4 : path
+            Output4 file with the mass and stiffness matrix (mxx, maa or maax; kxx, kaa or kaax).
+        asm : path
+            Assembly file with the boundary grids and the points of the modes. If there is a .pch
+            file beside it, it says which degrees of freedom of the grids are kept.
+        frame : str
+            Frame of the model that is the interface. Its axes are the file's basic axes.
+        origin : sequence of float (3,), optional
+            Point of the file [m], in its basic coordinates, that is at the frame's origin; the mean
+            of the boundary grids by default.
+        modes : int, optional
+            Number of modes to use, the slowest first; all by default.
+        length : {"m", "mm", "cm", "in", "ft"}
+            Unit of length in the file.
+        mass : {"kg", "g", "tonne", "lb", "slug", "lbf s^2/in"}
+            Unit of mass in the file.
+        damping, name
+            As in `FlexibleAppendage`.
+        rigid : bool
+            Whether the file's rigid inertia replaces the URDF's inertia of the link at the frame.
+            Otherwise a warning gives both if they differ by more than 1 %.
+
+        Returns
+        -------
+        FlexibleAppendage
+
+        Raises
+        ------
+        InputError
+            If a file is missing, truncated or of another kind, or is no Craig-Bampton model; or if
+            pyYeti is not installed (``pip install 'fflin[nastran]'``).
+        UnknownNameError
+            If a unit is unknown.
+        """
+        from fflin.robot.nastran import read_superelement
+
+        found = read_superelement(op4, asm, origin=origin, modes=modes, length=length, mass=mass)
+        return cls(
+            frame,
+            found.frequency,
+            found.L[:3],
+            found.L[3:],
+            damping,
+            name,
+            inertia=found.inertia,
+            rigid=rigid,
+        )
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Names of the modes' coordinates."""
+        return tuple(f"{self.title}_mode_{k}" for k in range(1, 1 + len(self.frequency)))
+
+    @property
+    def participation(self) -> Array:
+        """Participation L (6, k) in the frame: translation over rotation about its origin."""
+        return np.vstack((self.translation, self.rotation))
+
+    @property
+    def springs(self) -> dict[str, dict[str, float]]:
+        """{"stiffness": {mode: value}, "damping": {mode: value}} of the modal amplitudes."""
+        omega = 2.0 * math.pi * self.frequency
+        values = {"stiffness": omega**2, "damping": 2.0 * self.damping * omega}
+        return {key: dict(zip(self.modes, x.tolist(), strict=True)) for key, x in values.items()}
+
+    def __str__(self) -> str:
+        from fflin.base.tables import grid
+
+        t, r = self.translation, self.rotation
+        rows = [["mode", "f [Hz]", "damping", *(f"m_{x}" for x in "xyz")]]
+        rows[0] += [f"I_{x}" for x in "xyz"]
+        for k, mode in enumerate(self.modes):
+            sizes = (*t[:, k] ** 2, *r[:, k] ** 2)
+            rows.append([mode, f"{self.frequency[k]:.5g}", f"{self.damping[k]:.3g}"])
+            rows[-1] += [f"{x:.3g}" for x in sizes]
+        sums = (*(t**2).sum(axis=1), *(r**2).sum(axis=1))
+        rows.append(["all modes", "", "", *(f"{x:.3g}" for x in sums)])
+        if self.inertia is not None:
+            of_file = self.inertia.diagonal()
+            rows.append(["rigid", "", "", *(f"{x:.4g}" for x in of_file)])
+            rows.append(["residual", "", "", *(f"{x:.3g}" for x in of_file - sums)])
+        head = f"{self.title}: {len(self.modes)} modes, clamped at frame '{self.frame}'"
+        if self.inertia is not None:
+            body = rigid_inertia(self.inertia)
+            x, y, z = body.lever
+            head += (
+                f"\n{body.mass:.5g} kg, centre of mass ({x:.4g}, {y:.4g}, {z:.4g}) m in the frame"
+            )
+        about = "effective masses m [kg] and moments of inertia I [kg m^2] about the frame"
+        return f"{head}\n{about}\n\n{grid(rows, 'l')}"
+
+
+@dataclass(frozen=True, eq=False)
+class Slosh(Appendage):
+    r"""Liquid that sloshes in a tank: a mass that is free to move across an axis.
+
+    The mass is a point. With `frequency` it moves on springs, by the coordinates NAME_x and NAME_y
+    [m]. With `length` it is a pendulum, whose coordinates are angles [rad]: it has no stiffness of
+    its own, and swings with :math:`\sqrt{a/l}` under an acceleration a along the axis, such as that
+    of a thruster, see ``linearize(..., moving=True)``. The link's inertia in the URDF must include
+    the mass.
+
+    Parameters
+    ----------
+    frame : str
+        Frame of the model, on the base or on any link.
+    mass : float
+        Mass m [kg] that sloshes.
+    position : sequence of float (3,)
+        Its position [m] at rest, in the frame.
+    frequency : float, optional
+        Frequency [Hz] of the mass on its springs. For a pendulum the frequency to which the damping
+        ratio refers.
+    length : float, optional
+        Length l [m] of the pendulum, whose hinge is at `position` + l `axis`.
+    axis : sequence of float (3,)
+        Axis of the tank in the frame's axes, opposite to the pull under which the liquid lies. The
+        directions x and y are perpendicular to it: x as near to the frame's x axis as possible, or
+        to its y axis if that is closer to the perpendicular plane.
+    damping : float
+        Damping ratio, from 0 to 1.
+    name : str, optional
+        Name with which the coordinates begin; the frame's name and "_slosh" by default.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite or out of range, or if neither a frequency nor a length is given.
+        When the robot is made: if the carrying body has not this much mass there.
+
+    Examples
+    --------
+    >>> tank = fflin.Slosh("base", 20.0, (0, 0, 0.1), frequency=0.2, damping=0.01, name="tank")
+    >>> fflin.load("planar_detumble", appendages=[tank]).joint_names[-2:]
+    ('tank_x', 'tank_y')
+    """
+
+    KEY = "slosh"
+    frame: str
+    mass: float
+    position: Vector3
+    frequency: float | None = None
+    length: float | None = None
+    axis: Vector3 = (0.0, 0.0, 1.0)
+    damping: float = 0.0
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        what = f"slosh '{_text('frame', self.frame)}'"
+        if self.name is not None:
+            what = f"slosh '{_text('name', self.name)}'"
+        for name, unit in (("mass", "kg"), ("frequency", "Hz"), ("length", "m")):
+            value = getattr(self, name)
+            if value is not None or name == "mass":
+                size = number(f"{name} of {what}", value)
+                if size <= 0.0:
+                    raise InputError(f"{name} of {what} is {size:g} {unit}, expected more than 0")
+                object.__setattr__(self, name, size)
+        if self.frequency is None and self.length is None:
+            raise InputError(
+                f"{what} has neither a frequency nor a length; give the frequency [Hz] of a mass "
+                "on springs, or the length [m] of a pendulum"
+            )
+        ratio = number(f"damping of {what}", self.damping)
+        if not 0.0 <= ratio <= 1.0:
+            raise InputError(f"damping of {what} is {ratio:g}, expected a ratio from 0 to 1")
+        if ratio and self.frequency is None:
+            raise InputError(
+                f"{what} has the damping ratio {ratio:g}, but a pendulum has a frequency only "
+                "under an acceleration; give the frequency [Hz] to which the ratio refers"
+            )
+        object.__setattr__(self, "damping", ratio)
+        position = three_numbers(f"position of {what}", self.position)
+        object.__setattr__(self, "position", position)
+        axis = unit_vector(f"axis of {what}", self.axis, "the axis of the tank")
+        object.__setattr__(self, "axis", axis)
+
+    @classmethod
+    def cylinder(
+        cls,
+        frame: str,
+        radius: float,
+        height: float,
+        density: float,
+        acceleration: float,
+        *,
+        bottom: Vector3 = (0.0, 0.0, 0.0),
+        axis: Vector3 = (0.0, 0.0, 1.0),
+        pendulum: bool = True,
+        damping: float = 0.0,
+        name: str | None = None,
+    ) -> Slosh:
+        r"""Return the first lateral mode of the liquid in an upright circular cylinder.
+
+        With the liquid's mass m, k = 1.8412 / R, filled to the height h under the acceleration a:
+
+        .. math::
+            \omega^2 = a k \tanh k h, \qquad
+            \frac{m_1}{m} = \frac{2 \tanh k h}{k h\,(k^2 R^2 - 1)}, \qquad
+            l = \frac{a}{\omega^2}.
+
+        The mass m1 is :math:`\tfrac{2}{k} \tanh \tfrac{k h}{2}` below the surface, both as a
+        pendulum and on springs (Dodge, The new dynamic behavior of liquids in moving containers,
+        Southwest Research Institute 2000, chapter 3; NASA SP-106, chapter 6).
+
+        Parameters
+        ----------
+        frame : str
+            Frame of the model, on the base or on any link.
+        radius, height : float
+            Radius R of the tank and height h of the liquid [m].
+        density : float
+            Density of the liquid [kg/m^3].
+        acceleration : float
+            Acceleration a along the axis [m/s^2], such as thrust divided by mass.
+        bottom : sequence of float (3,)
+            Centre of the tank's bottom [m], in the frame.
+        axis : sequence of float (3,)
+            Axis of the tank, from its bottom up, in the frame's axes.
+        pendulum : bool
+            Whether the mass is a pendulum, whose frequency follows the acceleration at which the
+            robot is linearised; otherwise it is on springs of the given acceleration's frequency.
+        damping, name
+            As in `Slosh`; the damping ratio refers to the given acceleration.
+
+        Returns
+        -------
+        Slosh
+
+        Raises
+        ------
+        InputError
+            If a number is not finite or not positive.
+        """
+        sizes = {"radius": radius, "height": height, "density": density}
+        for what, value in (sizes | {"acceleration": acceleration}).items():
+            if number(f"{what} of the tank", value) <= 0.0:
+                raise InputError(f"{what} of the tank is {value:g}, expected more than 0")
+        k = _FIRST_ROOT / radius
+        along = unit_vector("axis of the tank", axis, "the direction from its bottom up")
+        liquid = density * math.pi * radius**2 * height
+        share = 2.0 * math.tanh(k * height) / (k * height * (_FIRST_ROOT**2 - 1.0))
+        omega = math.sqrt(acceleration * k * math.tanh(k * height))
+        at = height - 2.0 / k * math.tanh(0.5 * k * height)
+        center = np.array(three_numbers("bottom of the tank", bottom)) + at * np.array(along)
+        return cls(
+            frame,
+            share * liquid,
+            tuple(center.tolist()),
+            omega / (2.0 * math.pi),
+            acceleration / omega**2 if pendulum else None,
+            along,
+            damping,
+            name,
+        )
+
+    @property
+    def title(self) -> str:
+        """Name by which the coordinates begin."""
+        return self.name or f"{self.frame}_slosh"
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Names of the two coordinates."""
+        return f"{self.title}_x", f"{self.title}_y"
+
+    @property
+    def modal_mass(self) -> float:
+        """Inertia of each coordinate with the tank clamped: a mass [kg], or [kg m^2]."""
+        return self.mass * (self.length or 1.0) ** 2
+
+    @property
+    def participation(self) -> Array:
+        """Participation L (6, 2) in the frame: translation over rotation about its origin."""
+        t = math.sqrt(self.mass) * self.axes[:, :2]
+        return np.vstack((t, np.cross(np.array(self.position), t, axisb=0, axisc=0)))
+
+    @property
+    def springs(self) -> dict[str, dict[str, float]]:
+        """{"stiffness": {mode: value}, "damping": {mode: value}} of the coordinates."""
+        omega = 2.0 * math.pi * (self.frequency or 0.0)
+        stiffness = self.modal_mass * omega**2
+        damping = 2.0 * self.damping * self.modal_mass * omega
+        return {
+            "stiffness": dict.fromkeys(self.modes, stiffness) if self.length is None else {},
+            "damping": dict.fromkeys(self.modes, damping),
+        }
+
+    @property
+    def axes(self) -> Array:
+        """Directions x, y and the axis as columns (3, 3), in the frame's axes."""
+        z = np.array(self.axis)
+        near = np.eye(3)[0 if abs(z[0]) < 0.9 else 1]
+        x = near - (near @ z) * z
+        x /= np.linalg.norm(x)
+        return np.column_stack((x, np.cross(z, x), z))
+
+
+def checked_appendages(value: Any) -> tuple[Appendage, ...]:
+    """Return flexible appendages and slosh, or raise `InputError`."""
+    if isinstance(value, Appendage):
+        value = [value]
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise InputError(
+            f"appendages is a {type(value).__name__}, expected a sequence of FlexibleAppendage "
+            "and Slosh"
+        )
+    for item in value:
+        if not isinstance(item, Appendage):
+            raise InputError(f"{item!r} is no appendage; expected FlexibleAppendage or Slosh")
+    return tuple(value)
+
+
+def rigid_inertia(M: Array) -> pin.Inertia:
+    """Return the spatial inertia of a matrix (6, 6), translation over rotation."""
+    mass = float(M[0, 0])
+    lever = np.array([M[1, 5], M[2, 3], M[0, 4]]) / mass
+    return inertia_of(
+        mass, lever, M[3:, 3:] - about_origin(inertia_of(mass, lever, 0.0 * M[3:, 3:]))
+    )
+
+
+def _text(what: str, value: Any) -> str:
+    if not isinstance(value, str) or not value.strip() or not value.isprintable():
+        raise InputError(f"{what} of an appendage is {value!r}, expected a name")
+    if what == "name" and set(value) & set("*?[]"):
+        raise InputError(f"name of an appendage is {value!r}, which is a pattern; give a name")
+    return value

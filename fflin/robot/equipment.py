@@ -1,0 +1,126 @@
+"""A robot's equipment: reaction wheels, flexible appendages and slosh, as joints of its model."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError
+from fflin.robot.appendage_bodies import mounted_appendages
+from fflin.robot.appendages import (
+    Appendage,
+    FlexibleAppendage,
+    checked_appendages,
+    rigid_inertia,
+)
+from fflin.robot.fields import checked_inputs, of_joints
+from fflin.robot.joints import find_frame
+from fflin.robot.mass_properties import LinkMass, as_inertia
+from fflin.robot.mounting import Mounted, difference, inertia_of, with_mounted
+from fflin.robot.wheels import mounted_wheels
+
+
+def with_inputs(robot: Any, inputs: Any) -> Any:
+    """Return a robot with other inputs, and with the wheels among them as joints."""
+    return _equipped(robot, inputs, robot.appendages)
+
+
+def with_appendages(robot: Any, appendages: Any) -> Any:
+    """Return a robot with other flexible appendages and slosh, whose modes are joints."""
+    checked = checked_appendages(appendages)
+    bare, taken = robot._bare, set[int]()
+    for item in checked:
+        if isinstance(item, FlexibleAppendage) and item.rigid and item.inertia is not None:
+            joint = find_frame(bare.model, item.frame).joint
+            if joint in taken:
+                raise InputError(
+                    f"flexible appendage '{item.title}' is the second of its body with rigid=True; "
+                    "the inertia of a body can be taken from one file only"
+                )
+            taken.add(joint)
+            bare = _with_rigid(bare, item)
+    if taken:
+        own = {"links": bare.links, "urdf_sha256": bare.urdf_sha256}
+        robot = replace(robot, **own, _unequipped=bare)
+        checked = tuple(
+            replace(item, rigid=False) if isinstance(item, FlexibleAppendage) else item
+            for item in checked
+        )
+    return _equipped(robot, robot.inputs, checked)
+
+
+def _with_rigid(bare: Any, item: FlexibleAppendage) -> Any:
+    """Return a robot whose link at an appendage's frame has the inertia of its file."""
+    assert item.inertia is not None
+    joint, placement = find_frame(bare.model, item.frame)
+    of_file, body = rigid_inertia(item.inertia), bare.model.inertias[joint]
+    placed = of_file.se3Action(placement)
+    of_link, links = body, dict(bare.links)
+    if link := bare.pieces.get(item.frame):
+        of_link = as_inertia(link)
+    if item.frame in links:
+        at_center = pin.SE3(np.eye(3), of_file.lever)
+        links[item.frame] = LinkMass(of_file.mass, of_file.inertia, at_center)
+    rest = difference(body, of_link)
+    negative = inertia_of(-placed.mass, placed.lever, -placed.inertia)
+    return replace(bare.with_bodies({joint: difference(rest, negative)}), links=links)
+
+
+def _equipped(robot: Any, inputs: Any, appendages: Sequence[Appendage]) -> Any:
+    bare = robot._bare
+    checked = checked_inputs(inputs, bare.joint, bare.joint_names, robot.passive)
+    model, joints, followers = bare.model, bare.joints, bare.followers
+    bodies = [pin.Inertia(body) for body in model.inertias.tolist()]
+    wheels = mounted_wheels(model, bodies, checked)
+    modes, springs = mounted_appendages(model, bodies, appendages, bare.pieces)
+    parts = [*wheels, *modes]
+    if parts:
+        _require_new_names(model, wheels, modes)
+        model = with_mounted(model, bodies, parts)
+        placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
+        joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
+        followers = tuple(
+            each._replace(joint=each.joint.within(model), leader=each.leader.within(model))
+            for each in followers
+        )
+    names = [joint.name for joint in joints]
+    own = {joint.name for joint in robot.joints if joint.mode}
+    by_joint: dict[str, Any] = {
+        field: {name: x for name, x in getattr(robot, field).items() if name in names}
+        for field in ("stiffness", "damping", "rest")
+    }
+    for field, values in springs.items():
+        if appendages is robot.appendages:  # whose springs may have been replaced since
+            break
+        by_joint[field] = {k: x for k, x in by_joint[field].items() if k not in own} | values
+    for field in ("point", "target", "start"):
+        by_joint[field] = of_joints(getattr(robot, field), names)
+    return replace(
+        robot,
+        **{"model": model, "joints": joints, "followers": followers, "inputs": checked},
+        appendages=tuple(appendages),
+        _unequipped=bare if parts else None,
+        **by_joint,
+    )
+
+
+def _require_new_names(
+    model: pin.Model, wheels: Sequence[Mounted], modes: Sequence[Mounted]
+) -> None:
+    """Raise `InputError` if two joints would have the same name."""
+    for part in wheels:
+        if model.existJointName(part.name) or model.existFrame(part.name):
+            raise InputError(
+                f"wheel '{part.name}' has the name of a joint or frame of the robot; give it "
+                "another name"
+            )
+    taken = {part.name for part in wheels}
+    for part in modes:
+        if model.existJointName(part.name) or model.existFrame(part.name) or part.name in taken:
+            raise InputError(
+                f"mode '{part.name}' has the name of a joint, frame or wheel of the robot, or of "
+                "another appendage; give its appendage another name"
+            )
+        taken.add(part.name)

@@ -1,0 +1,131 @@
+"""Bodies on joints of their own, mounted on links whose inertia in the URDF includes them."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.validation import Array
+from fflin.robot.joints import ROOT, Joint
+
+# What Pinocchio keeps of each degree of freedom, and of each entry of q, beside the joint itself.
+_OF_VELOCITY = (
+    *("armature", "damping", "rotorInertia", "rotorGearRatio"),
+    *("lowerEffortLimit", "upperEffortLimit", "lowerVelocityLimit", "upperVelocityLimit"),
+    *("lowerDryFrictionLimit", "upperDryFrictionLimit"),
+)
+_OF_POSITION = ("lowerPositionLimit", "upperPositionLimit", "positionLimitMargin")
+
+
+class Mounted(NamedTuple):
+    """A mounted body, and the joint on which it moves relative to its carrier.
+
+    `carrier` is the index of a joint of the bare model, or the name of a mounted body. `placement`
+    is the frame of the joint in the carrier's frame, and `inertia` the body in the joint's frame.
+    """
+
+    joint: Joint
+    carrier: int | str
+    placement: pin.SE3
+    motion: Any  # Pinocchio's joint model
+    inertia: pin.Inertia
+    armature: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Name of the joint."""
+        return self.joint.name
+
+
+def inertia_of(mass: float, lever: Array, inertia: Array) -> pin.Inertia:
+    """Return a spatial inertia that need not be the inertia of a real body."""
+    # The constructor of Pinocchio refuses what a real body cannot have. What remains of a link
+    # without its mounted bodies is only a summand.
+    value = pin.Inertia.Zero()
+    value.mass, value.lever, value.inertia = mass, lever, inertia
+    return value
+
+
+def difference(body: pin.Inertia, part: pin.Inertia) -> pin.Inertia:
+    """Return a body without a part of it, both in the same frame."""
+    mass = body.mass - part.mass
+    if part.mass == 0.0:
+        return inertia_of(mass, body.lever, body.inertia - part.inertia)
+    moment = body.mass * body.lever - part.mass * part.lever
+    moments = about_origin(body) - about_origin(part)
+    lever = moment / mass if mass else np.zeros(3)
+    return inertia_of(mass, lever, moments - _shift(mass, lever))
+
+
+def about_origin(body: pin.Inertia) -> Array:
+    """Return the rotational inertia (3, 3) of a body about the origin of its frame."""
+    about: Array = body.inertia + _shift(body.mass, body.lever)
+    return about
+
+
+def _shift(mass: float, lever: Array) -> Array:
+    return mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
+
+
+def with_mounted(
+    model: pin.Model, bodies: Sequence[pin.Inertia], parts: Sequence[Mounted]
+) -> pin.Model:
+    """Return a model with one more joint for each part, and other inertias of its own bodies."""
+    on: dict[int | str, list[Mounted]] = {}
+    for part in parts:
+        on.setdefault(part.carrier, []).append(part)
+    new = pin.Model()
+    new.name, new.gravity = model.name, model.gravity
+    moved, added = {0: 0}, dict[int | str, int]()
+    for item in _depth_first(model, on, ROOT):
+        if isinstance(item, Mounted):
+            index = new.addJoint(added[item.carrier], item.motion, item.placement, item.name)
+            body = item.inertia
+        else:
+            parent, placement = moved[model.parents[item]], model.jointPlacements[item]
+            index = new.addJoint(parent, model.joints[item], placement, model.names[item])
+            body, moved[item] = bodies[item], index
+        added[item.name if isinstance(item, Mounted) else item] = index
+        # Not by its argument: Pinocchio adds up inertias by dividing by their mass.
+        new.appendBodyToJoint(index, pin.Inertia.Zero(), pin.SE3.Identity())
+        new.inertias[index] = body
+    carry_over(model, new, moved)
+    armature = new.armature.copy()
+    for part in parts:
+        armature[new.idx_vs[added[part.name]]] = part.armature
+    new.armature = armature
+    # The parent of a frame is an index among frames: they stay in order, and new ones come last.
+    for frame in model.frames.tolist()[1:]:
+        copy = pin.Frame(frame)
+        copy.parentJoint = moved[frame.parentJoint]
+        new.addFrame(copy, False)
+    for part in parts:
+        new.addJointFrame(added[part.name])
+    return new
+
+
+def _depth_first(
+    model: pin.Model, on: Mapping[int | str, Sequence[Mounted]], root: int | str
+) -> Iterator[int | Mounted]:
+    """Yield the joints carried by a root, and the mounted bodies of each after all other joints."""
+    # Else the joints would not be in depth-first order, without which CRBA is wrong.
+    if isinstance(root, int):
+        yield root
+        for child in model.children[root]:
+            yield from _depth_first(model, on, child)
+    for part in on.get(root, ()):
+        yield part
+        yield from _depth_first(model, on, part.name)
+
+
+def carry_over(model: pin.Model, new: pin.Model, moved: Mapping[int, int]) -> None:
+    """Copy what a model keeps of its joints beside them; `moved` gives the new index of each."""
+    for names, begin, length in (_OF_VELOCITY, "idx_vs", "nvs"), (_OF_POSITION, "idx_qs", "nqs"):
+        sizes, old_at, new_at = getattr(model, length), getattr(model, begin), getattr(new, begin)
+        for name in names:
+            values, old = getattr(new, name).copy(), getattr(model, name)
+            for index, to in moved.items():
+                size = sizes[index]
+                values[new_at[to] : new_at[to] + size] = old[old_at[index] : old_at[index] + size]
+            setattr(new, name, values)

@@ -1,0 +1,248 @@
+"""Welding of joints at given values, and of one robot to a frame of another."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError, unknown
+from fflin.base.names import joints_by_name
+from fflin.base.validation import Array, number
+from fflin.robot.equipment import with_inputs
+from fflin.robot.inputs import ReactionWheel, named_inputs
+from fflin.robot.joints import ROOT, Follower, Joint, find_frame
+from fflin.robot.mass_properties import LinkMass
+from fflin.robot.model_checks import joint_of
+from fflin.robot.mounting import carry_over
+from fflin.robot.outputs import JointOutput
+from fflin.robot.robot import Robot
+from fflin.robot.urdf.joints import Mimic
+
+_GROUPS = ("", "q_m.", "qdot_m.", "tau_m.", "wheel.")
+
+Lock = Mapping[str, float | None] | Iterable[str]
+
+
+def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
+    """Return a robot with joints welded at values, and wheels to what carries them."""
+    bare, gone = robot._bare, {*values}
+    mimics = {f.joint.name: Mimic(f.leader.name, *f[2:]) for f in bare.followers}
+    at = {name: x for name, x in values.items() if name not in robot.wheels}
+    model, left, locked = locked_model(bare.model, [at], mimics)
+    inputs = [
+        replace(item, name=names[0]) if isinstance(item, ReactionWheel) else item
+        for item, names in named_inputs(robot.inputs)
+        if getattr(item, "joint", names[0]) not in gone
+    ]
+    if not inputs:
+        raise InputError(
+            f"without {', '.join(values)} the robot has no input; a model needs at least one"
+        )
+    outputs = [
+        replace(each, joints=tuple(x for x in each.joints if x not in gone))
+        if isinstance(each, JointOutput) and each.joints
+        else each
+        for each in robot.outputs
+    ]
+    per_joint = ("urdf_damping", "limits", "weights")
+    fields: dict[str, Any] = {name: _without(getattr(robot, name), gone) for name in per_joint}
+    whole = replace(
+        robot,
+        **{"model": model, "locked": (*robot.locked, *locked), "_unequipped": None},
+        joints=tuple(joint.within(model) for joint in bare.joints if joint.name not in gone),
+        followers=tuple(
+            f._replace(joint=f.joint.within(model), leader=f.leader.within(model))
+            for f in bare.followers
+            if f.joint.name in left
+        ),
+        passive=tuple(name for name in robot.passive if name not in gone),
+        outputs=tuple(x for x in outputs if getattr(x, "joints", None) != ()),
+        **fields,
+    )
+    return with_inputs(whole, inputs)
+
+
+def _without(of: Any, gone: set[str]) -> Any:
+    """Return a mapping, and those in it, without what is named NAME or GROUP.NAME."""
+    if not isinstance(of, Mapping):
+        return of
+    named = {f"{group}{name}" for name in gone for group in _GROUPS}
+    return {name: _without(value, gone) for name, value in of.items() if name not in named}
+
+
+def locked_model(
+    model: pin.Model, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
+) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
+    """Weld joints and what mimics them; return the model, the mimics left, and what was welded."""
+    movable = list(model.names)[ROOT + 1 :]
+
+    def found(name: str) -> str:
+        if name not in movable:
+            raise unknown("joint to lock", name, movable)
+        return name
+
+    given: dict[str, float | None] = {}
+    for lock in locks:
+        if lock is not None:
+            given |= joints_by_name("joint to lock", _asked(lock), movable, found)
+    values = {n: None if x is None else number(f"lock '{n}'", x) for n, x in given.items()}
+    for name, mimic in mimics.items():
+        leader_value = values.get(mimic.leader, 0.0) or 0.0
+        if mimic.leader in values or values.get(name, 0.0) is None:
+            values.setdefault(name, None)
+            if values[name] is None:
+                values[name] = mimic.multiplier * leader_value + mimic.offset
+    q, indices, locked = pin.neutral(model), [], []
+    for name, value in values.items():
+        index = model.getJointId(name)
+        indices.append(index)
+        locked.append(f"{name}={0.0 if value is None else value!r}")
+        if value is not None:
+            joint_of(model, index).place(q, value)
+        # Without a frame for the joint, which models built in code may lack, Pinocchio crashes.
+        if not model.existFrame(name, pin.FrameType.JOINT):
+            model.addJointFrame(index)
+    left = {name: mimic for name, mimic in mimics.items() if name not in values}
+    return _reduced(model, indices, q), left, tuple(locked)
+
+
+def _asked(lock: Any) -> dict[str, float | None]:
+    """Return {joint or pattern: value, or None at neutral} of what a caller locks."""
+    try:
+        names = [lock] if isinstance(lock, str) else list(lock)
+    except TypeError:
+        names = [None]
+    if not all(isinstance(name, str) for name in names):
+        raise InputError(
+            f"lock is a {type(lock).__name__}, expected {{joint: value}} or names of joints"
+        )
+    return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(names)
+
+
+def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
+    """Weld joints at q (nq,)."""
+    # Pinocchio looks frames up by name, which links and joints may share: joints keep theirs.
+    names = Counter(frame.name for frame in model.frames.tolist())
+    shared: dict[str, str] = {}
+    for index, frame in enumerate(model.frames):
+        if index and frame.type != pin.FrameType.JOINT and names[frame.name] > 1:
+            alias = f"{index}/{frame.name}"
+            while alias in names:
+                alias += "/"
+            shared[alias], frame.name = frame.name, alias
+    reduced = pin.buildReducedModel(model, indices, q)
+    for frame in reduced.frames:
+        frame.name = shared.get(frame.name, frame.name)
+    return reduced
+
+
+def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: str) -> Robot:
+    """Return a robot with the base of another, all PREFIX.NAME and no motors, welded to a frame."""
+    bare = robot._bare
+    joint, at = find_frame(bare.model, frame)
+    _require_new_names(robot, prefix)
+    model = _joined(bare.model, joint, other.model.copy(), at * placement, prefix)
+
+    def renamed(joint: Joint) -> Joint:
+        return joint._replace(name=f"{prefix}.{joint.name}").within(model)
+
+    own = [each.within(model) for each in bare.joints]
+    theirs = [renamed(each) for each in other.joints]
+    followers = [
+        *(
+            f._replace(joint=f.joint.within(model), leader=f.leader.within(model))
+            for f in bare.followers
+        ),
+        *(Follower(renamed(f.joint), renamed(f.leader), *f[2:]) for f in other.followers),
+    ]
+    both: dict[str, Any] = {
+        name: {**getattr(robot, name), **_prefixed(getattr(other, name), prefix)}
+        for name in ("stiffness", "damping", "rest", "urdf_damping", "links")
+    }
+    if not other.links:  # a body alone: its own parameters have its name
+        body = other.model.inertias[ROOT]
+        at_center = pin.SE3(np.eye(3), body.lever)
+        both["links"][prefix] = LinkMass(body.mass, body.inertia, at_center)
+    told = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
+    weighed = b"".join(each.toDynamicParameters().tobytes() for each in model.inertias.tolist())
+    whole = replace(
+        robot,
+        model=model,
+        _unequipped=None,
+        name=f"{robot.name}+{other.name}",
+        urdf_sha256=sha256(told.encode() + weighed).hexdigest(),
+        joints=tuple(sorted((*own, *theirs), key=lambda each: each.idx_v)),
+        followers=tuple(followers),
+        attached=(*robot.attached, (prefix, other)),
+        **both,
+    )
+    return with_inputs(whole, robot.inputs)
+
+
+def _prefixed(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    return {f"{prefix}.{name}": value for name, value in values.items()}
+
+
+def _require_new_names(robot: Robot, prefix: str) -> None:
+    if not prefix or "." in prefix:
+        raise InputError(f"prefix is {prefix!r}, expected a word without dots, such as 'payload'")
+    taken = {*robot.model.names, *(frame.name for frame in robot.model.frames.tolist())}
+    if any(name == prefix or name.startswith(f"{prefix}.") for name in taken):
+        raise InputError(
+            f"'{robot.name}' already has joints or frames named '{prefix}'; give another prefix"
+        )
+
+
+def _joined(
+    model: pin.Model, joint: int, other: pin.Model, placement: pin.SE3, prefix: str
+) -> pin.Model:
+    """Return the model, in whose tree the other's joints come after all that the joint carries."""
+    new = pin.Model()
+    new.name, new.gravity = model.name, model.gravity
+    moved, others = {0: 0}, dict[int, int]()
+    for of, index in _in_order(model, joint, other):
+        one, there = (model, moved) if of is model else (other, others)
+        on = there[one.parents[index]]
+        place, name = one.jointPlacements[index], one.names[index]
+        if of is other:
+            name = f"{prefix}.{name}"
+            place = placement * place if one.parents[index] == ROOT else place
+        there[index] = new.addJoint(on, one.joints[index], place, name)
+        new.appendBodyToJoint(there[index], one.inertias[index], pin.SE3.Identity())
+        if of is model and index == joint:
+            others[ROOT] = there[index]
+            new.appendBodyToJoint(there[index], other.inertias[ROOT], placement)
+    carry_over(model, new, moved)
+    carry_over(other, new, {index: at for index, at in others.items() if index > ROOT})
+    for frame in model.frames.tolist()[1:]:
+        copy = pin.Frame(frame)
+        copy.parentJoint = moved[frame.parentJoint]
+        new.addFrame(copy, False)
+    on = others[ROOT]
+    new.addFrame(pin.Frame(prefix, on, placement, pin.FrameType.BODY), False)
+    for frame in other.frames.tolist()[1:]:
+        if frame.parentJoint >= ROOT:
+            copy = pin.Frame(frame)
+            copy.name, copy.parentJoint = f"{prefix}.{frame.name}", others[frame.parentJoint]
+            copy.parentFrame = 0
+            if frame.parentJoint == ROOT:
+                copy.placement = placement * frame.placement
+            new.addFrame(copy, False)
+    return new
+
+
+def _in_order(
+    model: pin.Model, joint: int, other: pin.Model, root: int = ROOT
+) -> Iterator[tuple[pin.Model, int]]:
+    """Yield the joints depth first; the other model's joints follow all that hang on the joint."""
+    yield model, root
+    for child in model.children[root]:
+        yield from _in_order(model, joint, other, child)
+    if root == joint:
+        yield from ((other, index) for index in range(ROOT + 1, other.njoints))

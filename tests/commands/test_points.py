@@ -1,0 +1,138 @@
+"""Operating point, target and start of a robot file, as the commands use them."""
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.support.commands import refused, run
+
+SAT = """
+urdf = "servicer_7dof"
+[stiffness]
+"panel_*" = 100
+[point]
+rpy = [0, 0, 30]
+position = [1, 2, 3]
+joints = { joint_2 = 0.6, joint_4 = -0.8 }
+[target]
+joints = { joint_2 = 0.9 }
+[start]
+rpy = [0, 0, 40]
+"""
+
+
+@pytest.fixture
+def sat(tmp_path):
+    (tmp_path / "sat.toml").write_text(SAT)
+    return tmp_path
+
+
+def pose(robot, degrees, **joints):
+    half = np.radians(degrees) / 2.0
+    q = fflin.configuration(robot, joints)
+    q[:7] = 1.0, 2.0, 3.0, 0.0, 0.0, np.sin(half), np.cos(half)
+    return q
+
+
+def test_a_file_gives_point_target_and_start_by_full_names(sat):
+    robot = fflin.load(sat / "sat.toml")
+    assert robot.point["joints"] == {"joint_2": 0.6, "joint_4": -0.8}
+    assert robot.target == {"joints": {"joint_2": 0.9}}
+    moved = robot.replace(point={"velocity": {"joint_1": 0.1}}, target={"rpy": (1, 2, 3)})
+    assert moved.point == {"velocity": {"qdot_m.joint_1": 0.1}}
+    assert moved.target == {"rpy": (1.0, 2.0, 3.0)} and moved.start == robot.start
+    locked = fflin.load(sat / "sat.toml", lock=["joint_2"])
+    assert locked.point["joints"] == {"joint_4": -0.8} and locked.target["joints"] == {}
+    for field in ("point", "target"):
+        with pytest.raises(fflin.InputError, match=f"{field} rpy"):
+            robot.replace(**{field: {"rpy": [1, 2]}})
+        with pytest.raises(fflin.UnknownNameError, match=f"part of {field}"):
+            robot.replace(**{field: {"joint": {}}})
+    assert not fflin.linearize(robot).q[7:][::2][0]  # functions are about their arguments
+
+
+@pytest.mark.parametrize("command", ["linearize", "lqr"])
+def test_commands_are_about_the_point(sat, command):
+    kind = {"linearize": fflin.LinearModel, "lqr": fflin.Gain}[command]
+    code, _, err = run(command, "sat.toml", "-o", "m.npz", cwd=sat)
+    assert code == 0, err
+    made, robot = kind.load(sat / "m.npz"), fflin.load(sat / "sat.toml")
+    lin = fflin.linearize(robot, pose(robot, 30, joint_2=0.6, joint_4=-0.8))
+    np.testing.assert_array_equal(made.A, lin.A)
+    code, _, err = run(command, "sat.toml", "--joint", "joint_2=0.1", "-o", "m.npz", cwd=sat)
+    lin = fflin.linearize(robot, pose(robot, 30, joint_2=0.1, joint_4=-0.8))
+    np.testing.assert_array_equal(kind.load(sat / "m.npz").A, lin.A)
+
+
+def simulated(folder, *options):
+    code, _, err = run("simulate", "sat.toml", "--duration", 1, "-o", "m.npz", *options, cwd=folder)
+    assert code in (0, 1), err
+    return fflin.Motion.load(folder / "m.npz")
+
+
+def goal_of(motion):
+    """Return q (nq,) of the motion's target."""
+    state = fflin.StateMap(motion.robot, reference=motion.reference, frame=motion.frame)
+    return state.to_pinocchio(motion.target)[0]
+
+
+def test_simulate_goes_from_start_to_target(sat):
+    robot = fflin.load(sat / "sat.toml")
+    motion = simulated(sat)
+    start = pose(robot, 40, joint_2=0.6, joint_4=-0.8)
+    np.testing.assert_allclose(motion.q[0], start, atol=1e-12)
+    np.testing.assert_array_equal(fflin.simulate(robot, duration=0.1).q[0], motion.q[0])
+    assert motion.attitude_error[0] == pytest.approx(10.0)
+    state = fflin.StateMap(robot, reference=motion.reference)
+    goal = pose(robot, 30, joint_2=0.9, joint_4=-0.8)
+    np.testing.assert_allclose(state.to_pinocchio(motion.target)[0], goal, atol=1e-12)
+
+
+def test_target_options_override_the_file(sat):
+    options = ("--target-rpy", 0, 0, 35, "--target-position", 1, 2, 3.5)
+    motion = simulated(sat, *options, "--target-joint", "joint_4=-0.7")
+    assert motion.attitude_error[0] == pytest.approx(5.0)
+    x = dict(zip(motion.state_names, motion.x[0] - motion.target, strict=True))
+    assert x["r_b.z"] == pytest.approx(-0.5) and x["q_m.joint_4"] == pytest.approx(-0.1)
+    assert x["q_m.joint_2"] == pytest.approx(-0.3)
+    assert "--target-rpy" in refused(
+        *("simulate", "sat.toml", "--orbit", 5e5, "--relative-equilibrium"),
+        *("--target-rpy", 0, 0, 1),
+        cwd=sat,
+    )
+    assert "--target-rpy" in refused("simulate", "sat.toml", "--free", *options[:4], cwd=sat)
+
+
+def test_a_gain_holds_the_base_at_the_target(sat):
+    assert run("lqr", "sat.toml", "-o", "gain.npz", cwd=sat)[0] == 0
+    motion = simulated(sat, "--gain", "gain.npz")
+    assert motion.attitude_error[0] == pytest.approx(10.0)
+    x = dict(zip(motion.state_names, motion.x[0] - motion.target, strict=True))
+    assert abs(x["r_b.z"]) < 1e-12 and x["q_m.joint_2"] == 0.0
+    world = ("--reference", "world", "-o", "gain.npz", "--force")
+    assert run("lqr", "sat.toml", *world, cwd=sat)[0] == 0
+    assert simulated(sat, "--gain", "gain.npz").attitude_error[0] == pytest.approx(10.0)
+    options = ("--gain", "gain.npz", "--target-rpy", 0, 0, 1)
+    assert "--target-rpy" in refused("simulate", "sat.toml", *options, cwd=sat)
+
+
+def test_sweep_is_about_the_point(sat):
+    for points in (("--grid", "joint_2=0:1:2"), ("--random", 2)):
+        code, _, err = run("sweep", "sat.toml", *points, "-o", "s.npz", cwd=sat)
+        assert code == 0, err
+        batch = fflin.LinearBatch.load(sat / "s.npz")
+        robot = fflin.load(sat / "sat.toml")
+        np.testing.assert_allclose(batch.q[:, :7], [pose(robot, 30)[:7]] * 2, atol=1e-12)
+        if points[0] == "--grid":
+            ends = [pose(robot, 30, joint_2=x, joint_4=-0.8) for x in (0.0, 1.0)]
+            np.testing.assert_allclose(batch.q, ends, atol=1e-12)
+
+
+def test_uncertain_is_about_the_point_at_rest(sat):
+    path = sat / "sat.toml"
+    path.write_text(path.read_text().replace("[target]", "velocity = { joint_1 = 0.1 }\n[target]"))
+    code, _, err = run("uncertain", "sat.toml", "--vary", "base.mass=0.1", "-o", "u.npz", cwd=sat)
+    assert code == 0, err
+    robot = fflin.load(path)
+    lft = fflin.uncertain(robot, {"base.mass": 0.1}).lft(pose(robot, 30, joint_2=0.6, joint_4=-0.8))
+    np.testing.assert_allclose(fflin.LFT.load(sat / "u.npz").A, lft.A, atol=1e-14)

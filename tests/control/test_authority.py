@@ -1,0 +1,124 @@
+"""Mass properties, wheels and thrusters at a point, against closed forms and linear programs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.optimize import linprog
+
+import fflin
+from fflin.control.authority import (
+    least_reach,
+    mass_properties,
+    point_report,
+    thruster_report,
+    unreachable,
+    wheel_momenta,
+    wheel_report,
+)
+
+
+def tilted(robot, **joints):
+    return fflin.configuration(robot, joints, pin.SE3.Random())
+
+
+def test_mass_properties_are_those_of_the_bodies_in_base_axes():
+    robot = fflin.load("servicer_7dof")
+    q = tilted(robot, joint_2=0.7, joint_4=-1.1)
+    data = robot.create_data()
+    pin.forwardKinematics(robot.model, data, q)
+    base = data.oMi[1]
+    total = pin.Inertia.Zero()
+    for place, body in zip(data.oMi.tolist()[1:], robot.model.inertias.tolist()[1:], strict=True):
+        total += base.actInv(place).act(body)
+    center, inertia = mass_properties(robot, q)
+    np.testing.assert_allclose(center, total.lever, atol=1e-12)
+    np.testing.assert_allclose(inertia, total.inertia, rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_the_least_reach_is_that_of_linear_programs(m):
+    rng = np.random.default_rng(m)
+    W = rng.normal(size=(m, 3 * m)) * np.logspace(-1, 2, m)[:, None]
+    W = np.hstack((W, -W.sum(axis=1, keepdims=True)))  # so that thrusts can cancel one another
+    low, high = np.zeros(W.shape[1]), rng.uniform(0.5, 2.0, W.shape[1])
+    kept = np.eye(m)[:, -3:]
+    least = least_reach(W, low, high, kept)
+    assert least > 0.0
+
+    def reach(direction):
+        equal = np.column_stack((W, -kept @ direction))
+        bounds = [*zip(low, high, strict=True), (0, None)]
+        cost = -np.eye(W.shape[1] + 1)[-1]
+        return -linprog(cost, A_eq=equal, b_eq=np.zeros(m), bounds=bounds).fun
+
+    directions = rng.normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    found = np.array([reach(each) for each in directions])
+    assert found.min() >= least * (1.0 - 1e-7)
+    # Towards the nearest facet the reach is the least itself.
+    nearest = directions[found.argmin()]
+    for step in np.logspace(-0.5, -6, 60):
+        tried = nearest + step * rng.normal(size=(6, 3))
+        for each in tried / np.linalg.norm(tried, axis=1, keepdims=True):
+            if (value := reach(each)) < found.min():
+                found, nearest = np.array([value]), each
+    assert found.min() == pytest.approx(least, rel=1e-3)
+
+
+def test_a_box_of_thrusters_has_the_force_and_torque_of_its_pairs():
+    """Two thrusters along each axis both ways, at a lever of 0.5 m, of 2 N each."""
+    nozzles = []
+    for axis in range(3):
+        lever, along = np.eye(3)[(axis + 1) % 3], np.eye(3)[axis]
+        nozzles += [
+            fflin.Thruster("base", tuple(side * 0.5 * lever), tuple(way * along), max=2.0)
+            for side in (1, -1)
+            for way in (1, -1)
+        ]
+    robot = fflin.load("cubesat", inputs=nozzles)
+    # A force needs one pair, which gives 4 N; so does a torque, of 2 N m.
+    report = thruster_report(robot, tilted(robot), np.zeros(3))
+    assert "least 4 N without" in report and "2 N m without" in report
+    # It is the centre of mass that counts.
+    center = np.array([0.2, -0.3, 0.1])
+    moved = [replace(each, position=tuple(each.position + center)) for each in nozzles]
+    moved = robot.replace(inputs=moved)
+    assert thruster_report(moved, moved.neutral(), center) == report
+    assert thruster_report(moved, moved.neutral(), np.zeros(3)) != report
+    few = robot.replace(inputs=nozzles[:-1])
+    assert "not push every way" in thruster_report(few, few.neutral(), np.zeros(3))
+    free = robot.replace(inputs=[fflin.Thruster("base", x.position, x.direction) for x in nozzles])
+    assert "limit" in thruster_report(free, free.neutral(), np.zeros(3))
+    W = np.array([nozzle.wrench for nozzle in nozzles]).T[[3, 4, 5, 0, 1, 2]]
+    assert unreachable(W) == {"torque": [], "force": []}
+    assert unreachable(W[:, :4])["force"] == ["+y", "-y", "+z", "-z"]
+    assert unreachable(W[:, [0, 2]])["force"] == ["-x", "+y", "-y", "+z", "-z"]
+
+
+def test_wheels_add_up_in_base_axes():
+    wheels = [
+        fflin.ReactionWheel((1, 0, 0), inertia=0.01, name="a", max_speed=100.0),
+        fflin.ReactionWheel((0, 0, 1), "link_1", name="b", momentum=3.0),
+    ]
+    robot = fflin.load("ets_vii", inputs=[fflin.BaseTorque(), *wheels])
+    q, v = tilted(robot, joint_1=0.3), fflin.velocity(robot, {"a": 50.0})
+    data = robot.create_data()
+    pin.framesForwardKinematics(robot.model, data, q)
+    frame = data.oMf[robot.model.getFrameId("link_1")].rotation
+    expected = [0.5, 0, 0] + data.oMi[1].rotation.T @ frame @ [0, 0, 3.0]
+    axes, stored, largest = wheel_momenta(robot, q, v)
+    np.testing.assert_allclose(axes @ stored, expected, atol=1e-12)
+    assert largest.tolist() == [1.0, np.inf]
+    assert "only two" in wheel_report(robot, q, v)
+    three = [fflin.ReactionWheel(x, inertia=1e-5, max_speed=300.0) for x in np.eye(3).tolist()]
+    report = wheel_report(fflin.load("cubesat", inputs=three), *2 * [np.zeros(13)])
+    assert "three axes" in report and "least 0.003 N m s" in report
+
+
+@pytest.mark.parametrize("name", ["cubesat", "planar_detumble", "dual_arm"])
+def test_the_report_fits_a_page(name):
+    robot = fflin.load(name)
+    report = point_report(robot, robot.neutral(), np.zeros(robot.nv))
+    assert max(map(len, report.splitlines())) <= 80 and "wheel" not in report

@@ -1,0 +1,266 @@
+"""C code of every kind of law, compared with the policies that simulations use."""
+
+import json
+import re
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from tests.support.c_code import COMPILERS, needs_compiler, outcome
+from tests.support.policies import between_gains, compensated
+
+pytestmark = needs_compiler
+
+POSE = pin.SE3(pin.rpy.rpyToMatrix(1.3, 0.4, -2.0), np.array([0.1, -0.2, 0.3]))
+
+
+def about(robot, frame="hybrid", dt=0.0):
+    """A regulator about a displaced pose, so that the reference is not the world."""
+    joints = dict.fromkeys(robot.joint_names[:1], 0.3)
+    lin = fflin.linearize(robot, fflin.configuration(robot, joints, POSE), frame=frame)
+    lin = lin.discretize(dt) if dt else lin
+    return fflin.StateFeedback(lin, fflin.lqr(lin).K)
+
+
+def tracking():
+    robot = fflin.load("planar_detumble")
+    v0 = fflin.velocity(robot, {"joint_1": 0.1, "omega_b.z": 0.2})
+    motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    along = fflin.linearize_trajectory(robot, motion.trajectory())
+    return robot, along, fflin.tvlqr(along, sample=0.1)
+
+
+def mixed():
+    """A compensator with a direct term, and outputs among which are continuous joints."""
+    robot, lin, by = compensated(fflin.load("cubesat", inputs=fflin.load_inputs("cubesat")))
+    D = np.random.default_rng(1).normal(size=lin.D.T.shape) * ~lin.D.any(axis=1)
+    return robot, fflin.LinearController((by.A, by.B, by.C, D, lin.dt), lin)
+
+
+def law(kind):
+    if kind in ("hybrid", "local", "world"):
+        robot = fflin.load("servicer_7dof")
+        return robot, about(robot, kind)
+    if kind == "wheels":  # continuous joints
+        robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+        lin = fflin.linearize(robot)
+        return robot, fflin.StateFeedback(lin, np.ones(lin.B.T.shape))
+    if kind == "no joints":
+        robot = fflin.load("cubesat")
+        return robot, about(robot)
+    if kind == "orbit":
+        robot = fflin.load("planar_detumble", orbit=fflin.CircularOrbit(500e3))
+        lin = fflin.linearize(robot)
+        return robot, fflin.StateFeedback(lin, np.ones(lin.B.T.shape))
+    if kind == "grid":
+        robot, policy, _ = between_gains(fflin.load("servicer_7dof"))
+        return robot, policy
+    if kind == "lqg":
+        robot, lin, by = compensated(fflin.load("servicer_7dof"))
+        return robot, fflin.OutputFeedback(lin, by)
+    if kind == "mixed":
+        return mixed()
+    robot, _, schedule = tracking()
+    return robot, schedule
+
+
+KINDS = (
+    *("hybrid", "local", "world", "wheels", "no joints", "orbit"),
+    *("grid", "lqg", "mixed", "schedule"),
+)
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_code_compiles_and_agrees(kind, real, compiler, tmp_path):
+    robot, by = law(kind)
+    folder = fflin.write_c(by, tmp_path, robot=robot, real=real)
+    code, said = outcome(folder, compiler)
+    assert (code, said) == (0, "all cases agree, 0 differences\n")
+
+
+@pytest.mark.parametrize("kind", ["hybrid", "lqg", "schedule"])
+def test_limits_are_reached_and_told(kind, tmp_path):
+    robot, by = law(kind)
+    folder = fflin.write_c(by, tmp_path, robot=robot, limits=0.05)
+    assert outcome(folder, COMPILERS[0])[0] == 0
+    source = (folder / "controller_test.c").read_text()
+    statuses = re.findall(r", ([01])\}", source)
+    assert len(statuses) == 200
+    assert "1" in statuses
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("hybrid", ("< 0 ? -1 : 1", "< 0 ? 1 : -1")),
+        ("hybrid", ("r[0] * q[3] -", "r[0] * q[3] +")),
+        ("hybrid", ("const controller_real x = two *", "const controller_real x = -two *")),
+        ("local", ("? r : q, -1", "? r : q, 1")),
+        ("world", ("rotate(q, 1", "rotate(q, -1")),
+        ("wheels", ("*angle -=", "*angle +=")),
+        ("hybrid", ("u[i] -= weight", "u[i] += weight")),
+        ("grid", ("upper ? share[a]", "!upper ? share[a]")),
+        ("mixed", ("D[i][j] * dy", "-D[i][j] * dy")),
+        ("lqg", ("A[i][j] * memory", "-A[i][j] * memory")),
+        ("lqg", ("memory->z[i] = next[i]", "memory->z[i] = -next[i]")),
+        ("schedule", ("feed_back((int)row", "feed_back(0")),
+    ],
+)
+def test_the_test_program_finds_a_changed_line(kind, change, tmp_path):
+    robot, by = law(kind)
+    folder = fflin.write_c(by, tmp_path, robot=robot)
+    source = (folder / "controller.c").read_text()
+    assert source.count(change[0]) >= 1
+    (folder / "controller.c").write_text(source.replace(*change))
+    code, said = outcome(folder, COMPILERS[0])
+    assert code == 1
+    assert re.search(r"case \d+: .+ is \S+, expected ", said)
+
+
+def test_the_header_names_every_entry(tmp_path):
+    robot, by = law("hybrid")
+    fflin.write_c(by, tmp_path, name="arm", real="float")  # which is replaced
+    header = (fflin.write_c(by, tmp_path, name="arm") / "arm.h").read_text()
+    for name in (*by.lin.state_names, *by.lin.input_names, robot.urdf_sha256, fflin.__version__):
+        assert name in header
+    assert "typedef double arm_real;" in header
+
+
+def test_the_code_has_no_state_and_calls_sqrt_alone(tmp_path):
+    source = (fflin.write_c(law("grid")[1], tmp_path) / "controller.c").read_text()
+    assert not re.search(r"^static (?!const|int|void)", source, re.MULTILINE)
+    called = set(re.findall(r"\b(\w+)\(", re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)))
+    own = set(re.findall(r"^(?:static )?(?:int|void) (\w+)\(", source, re.MULTILINE))
+    assert called - own <= {"sqrt", "if", "for"}
+
+
+FLIGHTS = {
+    "hybrid": {},
+    "local": {},
+    "world": {"limits": "urdf"},
+    "wheels": {"duration": 0.5},
+    "no joints": {},
+    "grid": {},
+    "lqg": {},
+    "schedule": {"duration": 2.5},
+}
+
+
+@pytest.mark.parametrize("kind", FLIGHTS)
+def test_a_simulation_with_the_code_is_the_simulation_without(kind, tmp_path):
+    if kind in ("hybrid", "local", "world"):  # sampled
+        robot = fflin.load("servicer_7dof")
+        by = about(robot, kind, dt=0.1)
+    elif kind == "wheels":
+        robot, _ = law(kind)
+        lin = fflin.linearize(robot)
+        by = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    else:
+        robot, by = law(kind)
+    code = fflin.CLaw(fflin.write_c(by, tmp_path, robot=robot))
+    joints = dict.fromkeys(robot.joint_names[-1:], 0.2)
+    turned = POSE * pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.array([0.02, 0.0, 0.1]))
+    q0 = robot.neutral() if kind == "schedule" else fflin.configuration(robot, joints, turned)
+    options = {"q0": q0, "duration": 1.0, "dt": 0.01, "engine": "python"} | FLIGHTS[kind]
+    one, other = (fflin.simulate(robot, each, **options) for each in (by, code))
+    scale = 1.0 + np.abs(one.u).max()
+    assert np.abs(one.q - other.q).max() < 1e-12
+    assert np.abs(one.v - other.v).max() < 1e-12
+    assert np.abs(one.u - other.u).max() < 1e-12 * scale
+
+
+def test_a_law_from_a_file_needs_its_robot(tmp_path):
+    robot = fflin.load("planar_detumble")
+    gain = fflin.lqr(fflin.linearize(robot))
+    gain.save(tmp_path / "gain.npz")
+    loaded = fflin.Gain.load(tmp_path / "gain.npz")
+    one, other = (fflin.write_c(x, tmp_path / f"{k}") for k, x in enumerate((gain, loaded)))
+    assert (one / "controller.c").read_bytes() == (other / "controller.c").read_bytes()
+    from dataclasses import replace
+
+    unknown = replace(loaded, robot="of my own")
+    with pytest.raises(fflin.InputError, match="robot="):
+        fflin.write_c(unknown, tmp_path / "none")
+    fflin.write_c(unknown, tmp_path / "given", robot=robot)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"name": "3d"}, "a letter"),
+        ({"real": "half"}, "'double' or 'float'"),
+        ({"law": 3}, "Gain, StateFeedback"),
+        ({"robot": "cubesat"}, "a Robot"),
+        ({"law": "continuous"}, "samples"),
+        ({"law": "compensator"}, "continuous, expected a sampled"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(change, match, tmp_path):
+    robot, by = law("hybrid")
+    if change.get("law") == "continuous":
+        robot, along, _ = tracking()
+        change = {"law": fflin.tvlqr(along), "robot": robot}
+    if change.get("law") == "compensator":
+        change = {"law": fflin.lqg(fflin.lqr(by.lin), fflin.kalman(by.lin, 1e-3, 1e-4))}
+    options = {"law": by} | change
+    with pytest.raises(fflin.InputError, match=match):
+        fflin.write_c(options.pop("law"), tmp_path / "none", **options)
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_code_is_not_flown_with_another_robot(tmp_path):
+    code = fflin.CLaw(fflin.write_c(law("hybrid")[1], tmp_path))
+    with pytest.raises(fflin.InputError, match="has other"):
+        code.bind(fflin.load("planar_detumble"))
+    with pytest.raises(fflin.FileError, match="holds 0"):
+        fflin.CLaw(tmp_path / "nowhere")
+    with pytest.raises(fflin.MissingPackageError, match="no C compiler"):
+        fflin.CLaw(tmp_path, compiler="no_such_compiler")
+
+
+@pytest.mark.parametrize("ending", ["npz", "mat", "json"])
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_a_gain_from_a_file_keeps_its_pose_and_sample_time(ending, dt, tmp_path):
+    robot = fflin.load("servicer_7dof")
+    lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}, POSE))
+    gain = fflin.lqr(lin.discretize(dt) if dt else lin)
+    gain.save(tmp_path / f"gain.{ending}")
+    loaded = fflin.Gain.load(tmp_path / f"gain.{ending}")
+    one, other = (fflin.write_c(x, tmp_path / f"{k}") for k, x in enumerate((gain, loaded)))
+    assert fflin.CLaw(other).dt == dt
+    in_memory, from_file = (fflin.CLaw(x).bind(robot) for x in (one, other))
+    random = np.random.default_rng(4)
+    for _ in range(5):
+        turn = pin.SE3(pin.exp3(random.normal(size=3)), random.normal(size=3))
+        q = fflin.configuration(robot, {"joint_3": random.normal()}, POSE * turn)
+        v = random.normal(size=robot.nv)
+        u = in_memory(0.0, q, v)
+        assert from_file(0.0, q, v) == pytest.approx(u, rel=1e-11, abs=1e-11 * np.abs(u).max())
+
+
+def test_a_gain_from_a_file_is_not_written_for_another_robot(tmp_path):
+    robot = fflin.load("planar_detumble")
+    gain = fflin.lqr(fflin.linearize(robot.with_mass_properties({"base": {"mass": 900.0}})))
+    gain.save(tmp_path / "gain.npz")
+    loaded = fflin.Gain.load(tmp_path / "gain.npz")
+    with pytest.raises(fflin.InputError, match="designed for another 'planar_detumble'"):
+        fflin.write_c(loaded, tmp_path / "none")
+    old = fflin.Gain(**{**vars(loaded), "placement": np.zeros(0)})
+    with pytest.raises(fflin.InputError, match="does not contain the reference pose"):
+        fflin.write_c(old, tmp_path / "none", robot=robot)
+
+
+@pytest.mark.parametrize(
+    "change", [[], {"reference": [1, 2]}, {"dt": "x"}, {"kind": "zz"}, {"real": "half"}]
+)
+def test_a_damaged_folder_is_one_line(change, tmp_path):
+    fflin.write_c(law("no joints")[1], tmp_path)
+    path = tmp_path / "controller.json"
+    about_law = json.loads(path.read_text())
+    path.write_text(json.dumps({**about_law, **change} if change else []))
+    with pytest.raises(fflin.FflinError, match="not a file of"):
+        fflin.CLaw(tmp_path)

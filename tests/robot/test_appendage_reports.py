@@ -1,0 +1,142 @@
+"""Modes of flexible appendages and slosh in reports: of motions, campaigns, robots and modes."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.campaign.statistics import KINDS, kinds_of
+from fflin.dynamics.state import StateMap
+from tests.robot.test_appendages import beam, full, hub_with_rod, servicer
+
+
+def row(text, name):
+    """Cells of the first line of a text that begins with a name."""
+    line = next(line for line in text.splitlines() if line.strip().startswith(f"{name} "))
+    return line.strip().removeprefix(name).split()
+
+
+def swinging(amplitude=0.05, **options):
+    """Hub with a beam whose first mode swings freely, damped."""
+    robot = hub_with_rod(10.0, 2.0, 1.0, 2.0).replace(appendages=[beam(1.0, 2.0, 5.0, 2)])
+    robot = robot.replace(damping={"beam_mode_1": 1.0, "beam_mode_2": 2.0})
+    q0 = fflin.configuration(robot, {"beam_mode_1": amplitude})
+    return fflin.simulate(robot, q0=q0, duration=5.0, dt=0.01, **options)
+
+
+def test_a_motion_reports_its_modes_apart_from_joints(tmp_path):
+    robot = hub_with_rod(10.0, 2.0, 1.0, 2.0).replace(appendages=[beam(1.0, 2.0, 5.0, 2)])
+    motion = swinging()
+    assert motion.modes == ("beam_mode_1", "beam_mode_2")
+    path = tmp_path / "motion.npz"
+    motion.save(path)
+    again = fflin.Motion.load(path)
+    np.testing.assert_array_equal(again.mode_rotations, motion.mode_rotations)
+    assert str(again) == str(motion)
+    target = replace(motion, target=np.zeros(motion.x.shape[1]))
+    for text in (str(motion), str(target)):
+        largest = np.abs(motion.x[:, motion.state_names.index("q_m.beam_mode_1")]).max()
+        unit, size, rotation = " ".join(row(text, "modes")[:2]), *row(text, "beam_mode_1")[2:4]
+        assert unit == "kg^0.5 m"
+        assert float(size) == pytest.approx(largest, rel=1e-2)
+        degrees = math.degrees(robot.joint("beam_mode_1").rotation * largest)
+        assert float(rotation) == pytest.approx(degrees, rel=1e-2)
+        assert not any(line.startswith("joints ") for line in text.splitlines())
+    assert "mode rates" in str(target)
+
+
+def test_rotation_of_a_mode_is_about_the_frame_of_its_appendage():
+    # The ball of a beam's mode is at |r| / |t|, and moves by 1 / |t| for a unit of the amplitude.
+    appendage = beam(1.0, 2.0, 5.0, 2)
+    robot = hub_with_rod(10.0, 2.0, 1.0, 2.0).replace(appendages=[appendage])
+    t, r = appendage.translation[2], -appendage.rotation[1]
+    found = [joint.rotation for joint in robot.modes]
+    # The second ball is within the body's radius of gyration, the first is as far out as that and
+    # turns in addition.
+    assert (r / t > 0.05).all()
+    assert found[1] == pytest.approx(1.0 / r[1], rel=1e-9)
+    assert 1.0 / r[0] < found[0] < 2.0 / r[0]
+    # A torsion has no ball that moves: |w| is 1 / |r|.
+    torsion = fflin.FlexibleAppendage("root_joint", 1.0, np.zeros((3, 1)), [[0], [0], [0.5]])
+    turning = hub_with_rod(10.0, 2.0, 1.0, 2.0).replace(appendages=[torsion]).modes[0]
+    assert turning.rotation * 0.5 == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_large_amplitude_warns_that_the_model_is_linear_in_it():
+    small, large = swinging(0.02), swinging(0.5)
+    assert "linear" not in str(small)
+    said = " ".join(str(large).split())
+    assert "warning: the model is linear in modal amplitudes" in said
+    assert "more than 5 deg: beam_mode_1" in said
+
+
+def test_settling_and_campaigns_do_not_take_modes_for_joints():
+    robot = full()
+    state = StateMap(robot)
+    kinds = dict(zip(state.names, kinds_of(state).tolist(), strict=True))
+    joint = list(KINDS).index("joints")
+    for name in robot.joint_names:
+        mode = robot.joint(name).mode
+        expected = -1 if name == "wheel" else 0 if mode else joint
+        assert kinds[f"q_m.{name}"] == expected
+        assert (kinds[f"qdot_m.{name}"] == 0) == (mode or name == "wheel")
+
+
+def test_a_campaign_judges_the_base_of_a_robot_whose_joints_are_modes():
+    robot = hub_with_rod(10.0, 2.0, 1.0, 2.0).replace(appendages=[beam(1.0, 2.0, 5.0, 1)])
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    made = fflin.monte_carlo(
+        robot, policy, {"q_b": 0.01, "q_m.beam_mode_1": 0.01}, runs=8, duration=2.0, dt=0.02
+    )
+    assert made.judged == ("attitude", "position")
+    joints = list(KINDS).index("joints")
+    assert not made.largest[:, joints].any()
+    assert made.largest_x[:, made.state_names.index("q_m.beam_mode_1")].all()
+
+
+def test_modes_of_appendages_are_listed_free_and_clamped():
+    robot = full().replace(gravity=(0, 0, 0))
+    found = fflin.modes(fflin.linearize(robot))
+    of_boom = next(mode for mode in found.vibrations if next(iter(mode.strain)) == "boom_mode_2")
+    assert sum(of_boom.strain.values()) == pytest.approx(1.0)
+    assert of_boom.frequency > 2.0 * math.pi * 0.8
+    text = str(found)
+    line = next(line for line in text.splitlines() if " boom_mode_2  boom_mode_2 " in line)
+    free, clamped, name = line.split()[:3]
+    assert (float(free), name) == (pytest.approx(of_boom.frequency, rel=1e-5), "boom_mode_2")
+    assert float(clamped) == pytest.approx(2.0 * math.pi * 0.8, rel=1e-5)
+    # 6^2 kg along x.
+    mass = robot._bare.model.inertias[1].mass
+    shares = row(text[text.index("effective masses") :], "boom_mode_2")
+    assert float(shares[1]) == pytest.approx(100.0 * 36.0 / mass, abs=0.06)
+
+
+def test_a_summary_lists_the_appendages():
+    from fflin.robot.summary import robot_info
+
+    text = robot_info(full())
+    assert row(text, "boom       base             boom_mode_2") == ["0.8", "0.005"]
+    assert row(text, "swing      base             swing_x") == [".", "."]
+
+
+def test_default_weights_leave_modes_to_their_damping_and_name_them():
+    rigid, appendages = servicer()
+    gain = fflin.lqr(fflin.linearize(rigid))
+    flexible = fflin.lqr(fflin.linearize(rigid.replace(appendages=appendages)))
+    # The rigid part is as fast as it was: the modes are those that swing.
+    decays = [
+        min(-p.real for p in each.poles if abs(p.imag) < 2.0 * abs(p.real))
+        for each in (gain, flexible)
+    ]
+    assert decays[1] == pytest.approx(decays[0], rel=0.01)
+    said = " ".join(str(flexible).split())
+    assert "left to their damping: " in said and "kg^0.5 m of the joints" not in said
+    assert "boom_mode_2" in said[said.index("left to their damping") :]
+
+
+def test_a_pendulum_without_gravity_is_named():
+    with pytest.raises(fflin.StabilizabilityError, match=r"'swing_x'.*is a pendulum"):
+        fflin.lqr(fflin.linearize(full().replace(gravity=(0, 0, 0))))

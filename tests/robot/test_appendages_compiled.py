@@ -1,0 +1,50 @@
+"""Flexible appendages and slosh in the compiled engine: the same motion and the same points."""
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.robot.test_appendages import displaced, full
+
+pytestmark = pytest.mark.compiled
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return full()
+
+
+def test_both_engines_fly_the_same_motion(robot):
+    q, v = displaced(robot, size=0.02)
+    motions = [
+        fflin.simulate(robot, q0=q, v0=v, duration=50.0, dt=0.05, engine=engine)
+        for engine in ("python", "compiled")
+    ]
+    scale = np.abs(motions[0].x).max(axis=0) + 1e-3
+    assert (np.abs(motions[0].x - motions[1].x) / scale).max() < 1e-11
+
+
+def test_feedback_reads_modal_amplitudes_alike(robot):
+    # A pendulum without gravity cannot be stabilised.
+    robot = robot.replace(gravity=(0, 0, 0), appendages=robot.appendages[:-1])
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    q, v = displaced(robot, size=0.01)
+    motions = [
+        fflin.simulate(robot, policy, q0=q, v0=v, duration=10.0, dt=0.05, engine=engine)
+        for engine in ("python", "compiled")
+    ]
+    assert np.abs(motions[0].u - motions[1].u).max() < 1e-10 * np.abs(motions[0].u).max()
+
+
+def test_a_sweep_is_the_models_one_by_one(robot):
+    q = np.array([displaced(robot, seed)[0] for seed in range(3)])
+    v = np.array([displaced(robot, seed)[1] for seed in range(3)])
+    batch = fflin.sweep(robot, q, v=v)
+    for index in range(3):
+        lin = fflin.linearize(robot, q=q[index], v=v[index])
+        assert np.abs(batch.A[index] - lin.A).max() < 1e-12 * np.abs(lin.A).max()
+        assert np.abs(batch.B[index] - lin.B).max() < 1e-12 * np.abs(lin.B).max()
+        assert batch.joint_positions[index] == pytest.approx(
+            lin.x0[6 : 6 + robot.n], rel=1e-13, abs=1e-15
+        )
