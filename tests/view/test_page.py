@@ -232,9 +232,9 @@ def test_a_camera_that_was_taken_stays_where_it_was_put(settled, watch):
     framed = watched.do(at)
     watched.resize(500, 600)
     assert not np.allclose(watched.do(at), framed)
-    watched.page.mouse.move(150, 300)
+    watched.page.mouse.move(250, 130)  # on the scene, above the panel
     watched.page.mouse.down()
-    watched.page.mouse.move(220, 320, steps=3)
+    watched.page.mouse.move(320, 150, steps=3)
     watched.page.mouse.up()
     put = watched.do(at)
     watched.resize(960, 600)
