@@ -132,30 +132,30 @@ def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
     return total
 
 
-def held_cost(F: Array, W: Array, h: float) -> Array:
-    """Return the integral of e^(F' t) W e^(F t) over [0, h]."""
+def held_cost(F: Array, W: Array, h: float | Array) -> Array:
+    """Return the integral of e^(F' t) W e^(F t) over [0, h]; of rows (.., n, n) for times (..)."""
     # The exponential rounds relative to its largest block, so that W is scaled to the size of F.
-    square = F @ F
+    square, h, n = F @ F, np.asarray(h)[..., None, None], F.shape[-1]
     if not (square @ F).any():
-        total, step = np.zeros_like(W), np.float64(h)
-        terms = (np.eye(len(F)), F, 0.5 * square)
+        total = np.zeros(F.shape)
+        terms = (np.eye(n), F, 0.5 * square)
         with np.errstate(over="ignore", invalid="ignore"):
             for i, left in enumerate(terms):
                 for j, right in enumerate(terms):
-                    total += left.T @ W @ right * (step ** (i + j + 1) / (i + j + 1))
-            return 0.5 * (total + total.T)
+                    total += left.mT @ W @ right * (h ** (i + j + 1) / (i + j + 1))
+            return 0.5 * (total + total.mT)
     from scipy.linalg import expm
 
-    n = len(F)
-    doublings = math.ceil(math.log2(max(2.0 * h * float(np.linalg.norm(F, 1)), 1.0)))
-    block = np.zeros((2 * n, 2 * n))
-    size = float(np.linalg.norm(W, 1)) / float(np.linalg.norm(F, 1)) or 1.0
-    block[:n, :n], block[:n, n:], block[n:, n:] = -F.T, W / size, F
+    rate, weight = (float(np.abs(X).sum(axis=-2).max()) for X in (F, W))
+    doublings = math.ceil(math.log2(max(2.0 * float(h.max()) * rate, 1.0)))
+    block = np.zeros((*F.shape[:-2], 2 * n, 2 * n))
+    size = weight / rate or 1.0
+    block[..., :n, :n], block[..., :n, n:], block[..., n:, n:] = -F.mT, W / size, F
     with np.errstate(over="ignore", invalid="ignore"):
         exponential = expm(block * (h / 2**doublings))
-        step = exponential[n:, n:]
-        total = step.T @ exponential[:n, n:]
+        step = exponential[..., n:, n:]
+        total = step.mT @ exponential[..., :n, n:]
         for _ in range(doublings):
-            total = total + step.T @ total @ step
+            total = total + step.mT @ total @ step
             step = step @ step
-        return 0.5 * size * (total + total.T)
+        return 0.5 * size * (total + total.mT)

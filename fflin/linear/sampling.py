@@ -10,18 +10,22 @@ GAUSS = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 HEAVY, LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
 
 
-def held_exponential(A: Array, driven: Array, h: float) -> tuple[Array, Array]:
-    r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) of B = `driven`."""
-    n, k = driven.shape
+def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, Array]:
+    r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) of B = `driven`.
+
+    Rows of matrices (.., n, n) and (.., n, k) may be given, with the times h (..) of each.
+    """
+    n, k = driven.shape[-2:]
+    h = np.asarray(h)[..., None, None]
     with np.errstate(over="ignore", invalid="ignore"):
         if not (A @ A).any():
             return np.eye(n) + A * h, driven * h + A @ driven * (h * h / 2.0)
         from scipy.linalg import expm
 
-        block = np.zeros((n + k, n + k))
-        block[:n, :n], block[:n, n:] = A, driven
+        block = np.zeros((*A.shape[:-2], n + k, n + k))
+        block[..., :n, :n], block[..., :n, n:] = A, driven
         exponential = expm(block * h)
-        return exponential[:n, :n], exponential[:n, n:]
+        return exponential[..., :n, :n], exponential[..., :n, n:]
 
 
 def held_slopes(A: Array, driven: Array, h: float, dA: Array, d_driven: Array) -> tuple[Array, ...]:
