@@ -55,8 +55,29 @@ class Certificate:
     f0: float
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class StateSpace(FrozenArrays):
+    """Matrices of a linear model about a point, with names and units of its signals."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    f0: Array
+    x0: Array
+    u0: Array
+    y0: Array
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False, repr=False, init=False)
-class LinearModel(FrozenArrays):
+class LinearModel(StateSpace):
     r"""Linear model about a point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The output is ``y = y0 + C (x - x0) + D (u - u0)``. If ``dt > 0``, the left side is ``x - x0``
@@ -117,21 +138,6 @@ class LinearModel(FrozenArrays):
     (0.0, 0.1)
     """
 
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    f0: Array
-    x0: Array
-    u0: Array
-    y0: Array
-    dt: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    output_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    input_units: tuple[str, ...]
-    output_units: tuple[str, ...]
     frame: Frame
     moving: bool
     q: Array
@@ -401,8 +407,8 @@ class LinearModel(FrozenArrays):
         from fflin.base.writing import as_path
         from fflin.linear.files import given, read_model
 
-        values, certificate = read_model(as_path(path))
-        lin = LinearModel(**values, _certify=partial(given, Certificate(**certificate)))
+        values, certificate = read_model(as_path(path), Certificate)
+        lin = LinearModel(**values, _certify=partial(given, certificate))
         return replace(lin, _certify=partial(same_certificate, lin, lin.fingerprint))
 
 
