@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
-from tests.robot.test_appendages import displaced, full
+from tests.robot.test_appendages import displaced, full, servicer
 
 pytestmark = pytest.mark.compiled
 
@@ -48,3 +48,40 @@ def test_a_sweep_is_the_models_one_by_one(robot):
         assert batch.joint_positions[index] == pytest.approx(
             lin.x0[6 : 6 + robot.n], rel=1e-13, abs=1e-15
         )
+
+
+@pytest.fixture(scope="module")
+def undamped():
+    """Servicer with two flexible appendages and a tank on springs, all without damping."""
+    rigid, appendages = servicer()
+    tank = fflin.Slosh("base", 30.0, (0.1, 0.0, 0.3), frequency=0.2, name="tank")
+    robot = rigid.replace(appendages=[*appendages, tank])
+    return robot.replace(damping=dict.fromkeys(robot.joint_names, 0.0))
+
+
+@pytest.mark.exhaustive
+def test_momentum_and_energy_are_kept_over_a_thousand_seconds(undamped):
+    q, v = displaced(undamped, size=0.01)
+    steps = (0.1, 0.05)
+    motions = [
+        fflin.simulate(undamped, q0=q, v0=v, duration=1000.0, dt=dt, engine="compiled")
+        for dt in steps
+    ]
+    for motion in motions:
+        scale = np.abs(motion.momentum).max() + 1.0
+        assert np.abs(motion.momentum - motion.momentum[0]).max() < 1e-13 * scale
+    drifts = [np.abs(motion.energy - motion.energy[0]).max() for motion in motions]
+    # The integrator is of fourth order: its energy drifts by h^5 a step, or h^4 over a time.
+    assert drifts[0] / drifts[1] > 12.0
+    assert drifts[1] < 1e-5 * np.ptp(motions[1].kinetic_energy)
+
+
+@pytest.mark.exhaustive
+def test_both_engines_fly_the_same_thousand_seconds(undamped):
+    q, v = displaced(undamped, size=0.01)
+    motions = [
+        fflin.simulate(undamped, q0=q, v0=v, duration=1000.0, dt=0.1, engine=engine)
+        for engine in ("python", "compiled")
+    ]
+    scale = np.abs(motions[0].x).max(axis=0) + 1e-3
+    assert (np.abs(motions[0].x - motions[1].x) / scale).max() < 1e-11
