@@ -289,12 +289,13 @@ class Dispersions:
             except ChartError as error:
                 said = f"an invalid initial attitude is drawn in the runs from {start} on"
                 raise InputError(f"{said}: {error}; take a smaller spread") from None
-            run = first_impossible(self._model, self._plant.robot.appendages, self.bodies(drawn))
-            if run is not None:
+            appendages = self._plant.robot.appendages
+            refused = first_impossible(self._model, appendages, self.bodies(drawn))
+            if refused is not None:
                 try:
-                    self.one(drawn[run])
+                    self.one(drawn[refused])
                 except InputError as error:
-                    said = f"run {start + run} draws an invalid mass or inertia"
+                    said = f"run {start + refused} draws an invalid mass or inertia"
                     raise InputError(f"{said}: {error}; take a smaller spread") from None
 
     def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:

@@ -52,8 +52,11 @@ def test_a_sweep_is_the_models_one_by_one(robot):
 
 @pytest.fixture(scope="module")
 def undamped():
-    """Servicer with two flexible appendages and a tank on springs, all without damping."""
+    """Servicer whose joints have springs, with two appendages and a tank, all without damping."""
+    # Without springs the arm tumbles, and a rounding error grows to the size of the motion.
     rigid, appendages = servicer()
+    inertia = fflin.linearize(rigid).M.diagonal()[6:]
+    rigid = rigid.replace(stiffness=dict(zip(rigid.joint_names, inertia, strict=True)))
     tank = fflin.Slosh("base", 30.0, (0.1, 0.0, 0.3), frequency=0.2, name="tank")
     robot = rigid.replace(appendages=[*appendages, tank])
     return robot.replace(damping=dict.fromkeys(robot.joint_names, 0.0))
@@ -62,25 +65,24 @@ def undamped():
 @pytest.mark.exhaustive
 def test_momentum_and_energy_are_kept_over_a_thousand_seconds(undamped):
     q, v = displaced(undamped, size=0.01)
-    steps = (0.1, 0.05)
     motions = [
         fflin.simulate(undamped, q0=q, v0=v, duration=1000.0, dt=dt, engine="compiled")
-        for dt in steps
+        for dt in (0.02, 0.01)
     ]
     for motion in motions:
-        scale = np.abs(motion.momentum).max() + 1.0
-        assert np.abs(motion.momentum - motion.momentum[0]).max() < 1e-13 * scale
+        largest = np.abs(motion.momentum).max()
+        assert np.abs(motion.momentum - motion.momentum[0]).max() < 1e-13 * largest
     drifts = [np.abs(motion.energy - motion.energy[0]).max() for motion in motions]
-    # The integrator is of fourth order: its energy drifts by h^5 a step, or h^4 over a time.
-    assert drifts[0] / drifts[1] > 12.0
-    assert drifts[1] < 1e-5 * np.ptp(motions[1].kinetic_energy)
+    # Of fourth order: halving the step divides the energy's periodic error by 16, its loss by 32.
+    assert 16.0 < drifts[0] / drifts[1] < 32.0
+    assert drifts[1] < 1e-4 * motions[1].energy[0]
 
 
 @pytest.mark.exhaustive
 def test_both_engines_fly_the_same_thousand_seconds(undamped):
     q, v = displaced(undamped, size=0.01)
     motions = [
-        fflin.simulate(undamped, q0=q, v0=v, duration=1000.0, dt=0.1, engine=engine)
+        fflin.simulate(undamped, q0=q, v0=v, duration=1000.0, dt=0.05, engine=engine)
         for engine in ("python", "compiled")
     ]
     scale = np.abs(motions[0].x).max(axis=0) + 1e-3
