@@ -377,15 +377,14 @@ def strain_by_joint(
     if robot is None:
         return [{} for _ in shapes]
     chart = StateMap(robot, reference=lin.reference, frame=lin.frame).chart(lin.q)
+    names = robot.joint_names
     found: list[Mapping[str, float]] = []
     for shape in shapes:
         moved = np.abs(displacement(lin, chart, shape)[6:])
         energies = robot.springs.stiffness * moved**2
         order = np.argsort(-energies, kind="stable").tolist()
         total = energies.sum()
-        found.append(
-            {robot.joint_names[i]: float(energies[i] / total) for i in order if energies[i] > 0.0}
-        )
+        found.append({names[i]: float(energies[i] / total) for i in order if energies[i] > 0.0})
     return found
 
 
