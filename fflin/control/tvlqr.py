@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from fflin.analysis.gramians import held_cost
 from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import DetectabilityError, EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
@@ -27,7 +26,7 @@ from fflin.linear.equilibrium import equilibrium
 from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import HEAVY, LIGHT
+from fflin.linear.sampling import HEAVY, LIGHT, held_cost
 from fflin.linear.trajectory import Trajectory
 
 
@@ -50,10 +49,11 @@ def tvlqr(
 
     The differential Riccati equation is :math:`-\dot P = A^T P + P A - P B R^{-1} B^T P + Q`, with
     :math:`P(T) = Q_f`. It is solved backwards from knot to knot by maps
-    :math:`P_0 = W + T^T P_1 (I + G P_1)^{-1} T` with positive semidefinite W and G. Each map is computed from a short matrix exponential by doubling, so P stays
-    positive semidefinite over any horizon. The method is of fourth order along a changing
-    trajectory and exact along a constant one. Knots are added until the estimated
-    errors of the steps and of the interpolation of P are below 1e-7.
+    :math:`P_0 = W + T^T P_1 (I + G P_1)^{-1} T` with positive semidefinite W and G. Each map is
+    computed from a short matrix exponential by doubling, so P stays positive semidefinite over any
+    horizon. The method is of fourth order along a changing trajectory and exact along a constant
+    one. Knots are added until the estimated errors of the steps and of the interpolation of P are
+    below 1e-7.
 
     With `sample`, the regulator is sampled: a computer measures e at the samples and holds
     :math:`\delta u` between them. The cost remains the integral above, evaluated by (10.1) and

@@ -1,5 +1,7 @@
 """Exact solution of a linear model over a sample, with its input held constant."""
 
+import math
+
 import numpy as np
 
 from fflin.base.validation import Array
@@ -39,3 +41,32 @@ def held_slopes(A: Array, driven: Array, h: float, dA: Array, d_driven: Array) -
     block[:n], along[:n] = np.hstack((A, driven)) * h, np.hstack((dA, d_driven)) * h
     slope = expm_frechet(block, along, compute_expm=False)
     return slope[:n, :n], slope[:n, n:]
+
+
+def held_cost(F: Array, W: Array, h: float | Array) -> Array:
+    """Return the integral of e^(F' t) W e^(F t) over [0, h]; of rows (.., n, n) for times (..)."""
+    # The exponential rounds relative to its largest block, so that W is scaled to the size of F.
+    square, h, n = F @ F, np.asarray(h)[..., None, None], F.shape[-1]
+    if not (square @ F).any():
+        total = np.zeros(F.shape)
+        terms = (np.eye(n), F, 0.5 * square)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, left in enumerate(terms):
+                for j, right in enumerate(terms):
+                    total += left.mT @ W @ right * (h ** (i + j + 1) / (i + j + 1))
+            return 0.5 * (total + total.mT)
+    from scipy.linalg import expm
+
+    rate, weight = (float(np.abs(X).sum(axis=-2).max()) for X in (F, W))
+    doublings = math.ceil(math.log2(max(2.0 * float(h.max()) * rate, 1.0)))
+    block = np.zeros((*F.shape[:-2], 2 * n, 2 * n))
+    size = weight / rate or 1.0
+    block[..., :n, :n], block[..., :n, n:], block[..., n:, n:] = -F.mT, W / size, F
+    with np.errstate(over="ignore", invalid="ignore"):
+        exponential = expm(block * (h / 2**doublings))
+        step = exponential[..., n:, n:]
+        total = step.mT @ exponential[..., :n, n:]
+        for _ in range(doublings):
+            total = total + step.mT @ total @ step
+            step = step @ step
+        return 0.5 * size * (total + total.mT)
