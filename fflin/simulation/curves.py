@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fflin.base.names import input_keys
 from fflin.base.validation import Array
-
-if TYPE_CHECKING:
-    from fflin.simulation.motion import Motion
 
 # A limit is drawn where a curve comes to this fraction of it.
 _NEAR = 1.0 / 3.0
@@ -50,7 +47,7 @@ class Curve(NamedTuple):
         return Curve(self.key, "momentum", self.name, "N m s", *scaled)
 
 
-def curves(motion: Motion, wheels: Mapping[str, float]) -> Iterator[Curve]:
+def curves(motion: Any, wheels: Mapping[str, float]) -> Iterator[Curve]:
     """Yield states and inputs, and speed and momentum of wheels {name: inertia, 0 if unknown}."""
     limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     unlimited = np.full(2, np.inf)
@@ -75,7 +72,7 @@ def curves(motion: Motion, wheels: Mapping[str, float]) -> Iterator[Curve]:
         yield Curve(key, key.partition(".")[0], name, unit, column, limits.get(name, unlimited))
 
 
-def resting_from(motion: Motion) -> float | None:
+def resting_from(motion: Any) -> float | None:
     """Return the time [s] from which a target that moved stands still; None where none does."""
     places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
