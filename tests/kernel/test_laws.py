@@ -134,7 +134,9 @@ def test_an_allocation_meets_the_conditions_of_karush_kuhn_and_tucker(seed):
     assert (u >= least).all() and (u <= most).all()
     # The gradient, in the scale of the solver, with columns and force divided by their norms.
     slope = (A / unit).T @ (A @ u - b) / force + LEAST**2 * u * unit / force
-    low, high = u <= least + 1e-12, u >= most - 1e-12
+    # Rounding of 1e-16 moves an input by 1e-16 / LEAST.
+    near = 1e-16 / LEAST
+    low, high = u <= least + near, u >= most - near
     free = ~(low | high)
     assert np.abs(slope[free]).max(initial=0.0) < 1e-12
     assert (slope[low] > -1e-12).all() and (slope[high] < 1e-12).all()
