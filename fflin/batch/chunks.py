@@ -158,13 +158,13 @@ class BatchEquations:
         """Write A, B, f0 and x0 about any points, and return where they are sound."""
         ready, (q, v, u), A, B = self._prepared, points, out["A"], out["B_lower"]
         state, actuation, count = ready.map, ready.actuation, len(q)
-        v = np.zeros((count, state.robot.nv)) if v is None else v
-        u = np.zeros((count, len(actuation.names))) if u is None else u
         own = ready.own_reference
         chart: Chart = Standing(count) if own else state.charts(q)
+        v = np.zeros((count, state.robot.nv)) if v is None else v
+        no_inputs: Array = np.zeros((count, len(actuation.names)))
+        u = no_inputs if u is None else actuation.in_base_axes(chart, u)
         r_b: Array = np.zeros((count, 3)) if own else state.positions(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
-        u = actuation.in_base_axes(chart, u)
         nv = nu.shape[1]
         A[:, :nv] = ready.rest["A"][:nv]
         c, judged = self._kernel.write(q, nu, q_m, u, A, B)
@@ -174,11 +174,10 @@ class BatchEquations:
         out["f0"][:] = 0.0 if ready.moving else f0
         if ready.moving:
             out["_drift"][:] = drift(state, f0, rates.gravity)
-        # NaN compares false.
+        # NaN compares false. The upper half of A is finite where q0 and f0 are sound.
         good = self._kernel.sound(q, judged) & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
-        for array in (A, B, f0):
-            flat = array.reshape(count, -1)
-            good &= np.vecdot(flat, flat) < LARGEST
+        for rows in (A.reshape(count, -1)[:, A[0].size // 2 :], B.reshape(count, -1), f0):
+            good &= np.vecdot(rows, rows) < LARGEST
         return good
 
 

@@ -71,7 +71,8 @@ def assemble(
     # Accelerations, still in base axes.
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
-        chart.turn_columns(state.in_reference, lower[..., nv:])
+        # The columns of the base's linear velocity are zeros.
+        chart.turn_columns((ANGULAR,) if omega_in_reference else (), rates.by_nu)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
         actuation.turn_columns(chart, rates.by_u)
     if state.falls:
@@ -101,7 +102,7 @@ def _over_rotations(
     omega_in_reference, v_in_reference = state.axes
     # Derivatives of the accelerations alone are zero here without an orbit.
     theta, c = rates.by_turn, rates.c
-    for columns in actuation.held:
+    for columns in actuation.held if u.any() else ():
         theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
     if omega_in_reference:
         theta = theta + product(rates.by_nu[..., ANGULAR], W)
