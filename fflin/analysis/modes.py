@@ -14,7 +14,7 @@ from fflin.analysis.eigenpairs import natural_modes
 from fflin.analysis.reduction import ReducedModel
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, grid, width
-from fflin.base.validation import Array, FrozenArrays
+from fflin.base.validation import Array, FrozenArrays, instance
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
@@ -294,8 +294,7 @@ def modes(lin: LinearModel) -> Modes:
     >>> found.rigid_body, found.frequencies.round(1)
     (13, array([0.9, 1.2]))
     """
-    if not isinstance(lin, LinearModel):
-        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     lin.require_unchanged()
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous model")
@@ -377,15 +376,14 @@ def strain_by_joint(
     if robot is None:
         return [{} for _ in shapes]
     chart = StateMap(robot, reference=lin.reference, frame=lin.frame).chart(lin.q)
+    names = robot.joint_names
     found: list[Mapping[str, float]] = []
     for shape in shapes:
         moved = np.abs(displacement(lin, chart, shape)[6:])
         energies = robot.springs.stiffness * moved**2
         order = np.argsort(-energies, kind="stable").tolist()
         total = energies.sum()
-        found.append(
-            {robot.joint_names[i]: float(energies[i] / total) for i in order if energies[i] > 0.0}
-        )
+        found.append({names[i]: float(energies[i] / total) for i in order if energies[i] > 0.0})
     return found
 
 

@@ -1,5 +1,6 @@
 """Messages about states that inputs cannot stabilise or outputs cannot observe."""
 
+import re
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -53,14 +54,16 @@ def _pendulums(lin: LinearModel, lost: str) -> str:
     hanging = [
         f"'{joint.name}'"
         for joint in (robot.modes if robot else ())
-        if not joint.prismatic and joint.kind == "slosh" and f".{joint.name}" in lost
+        if not joint.prismatic
+        and joint.kind == "slosh"
+        and re.search(rf"(?<!\w){re.escape(joint.name)}(?!\w)", lost)
     ]
     if not hanging:
         return ""
     return (
-        f"; slosh {', '.join(hanging)} is a pendulum, which does not swing back without gravity or "
-        "thrust: linearise it under the thrust (u=, moving=True), or give the slosh a frequency "
-        "and no length"
+        f"; slosh {', '.join(hanging)} is a pendulum, which has no stiffness without gravity or "
+        "thrust: linearise it under the thrust (u=, moving=True), or put the mass on springs (give "
+        "Slosh a frequency and no length, or Slosh.cylinder pendulum=False)"
     )
 
 

@@ -27,6 +27,7 @@ from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, loads_of
+from fflin.robot.appendage_bodies import first_impossible
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import Piece, varied, with_changed
 from fflin.robot.robot import Robot
@@ -288,6 +289,14 @@ class Dispersions:
             except ChartError as error:
                 said = f"an invalid initial attitude is drawn in the runs from {start} on"
                 raise InputError(f"{said}: {error}; take a smaller spread") from None
+            appendages = self._plant.robot.appendages
+            refused = first_impossible(self._model, appendages, self.bodies(drawn))
+            if refused is not None:
+                try:
+                    self.one(drawn[refused])
+                except InputError as error:
+                    said = f"run {start + refused} draws an invalid mass or inertia"
+                    raise InputError(f"{said}: {error}; take a smaller spread") from None
 
     def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
         """Return the draws (N, size, axes) of a kind; zero if not dispersed."""

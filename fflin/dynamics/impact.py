@@ -108,7 +108,8 @@ def jam(
     UnknownNameError
         If there is no such joint.
     InputError
-        If a size or value is wrong, no joint is named, or the robot would have no input left.
+        If a size or value is wrong, no joint is named, a mode of a flexible appendage is named, or
+        the robot would have no input left.
     ModelError
         If the robot was changed after it was made.
 
@@ -124,7 +125,14 @@ def jam(
     keys = [joints] if isinstance(joints, str) else joints
     if not isinstance(keys, Sequence) or not keys or not all(isinstance(k, str) for k in keys):
         raise InputError(f"joints is {joints!r}, expected names of joints")
-    named = by_joint(dict.fromkeys(keys), robot.joint_names, robot.joint)
+    modes = {joint.name for joint in robot.modes}
+    stoppable = [name for name in robot.joint_names if name not in modes]
+    named = by_joint(dict.fromkeys(keys), stoppable, robot.joint)
+    if mode := next((name for name in named if name in modes), None):
+        raise InputError(
+            f"'{mode}' is a mode of a flexible appendage or of slosh, which cannot jam; name "
+            "joints or wheels"
+        )
     q = robot.neutral() if q is None else robot.checked_configuration(q)
     v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
     at = {name: robot.joint(name).value(q) for name in named}

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,17 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FileError, InputError, MissingPackageError
+from fflin.base.record import reading
 from fflin.base.validation import Array
-from fflin.base.writing import as_path
+from fflin.base.writing import as_path, read_file
 from fflin.control.linear_controller import Loop, Sample
 from fflin.control.policies import Policy
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.export.laws import measured
-from fflin.linear.fit import sensed
+from fflin.export.writing import digest_of
+from fflin.linear.fit import require_same, require_turns, sensed
 from fflin.robot.robot import Robot
 
 _INVALID = 2  # status of a step
@@ -38,6 +41,8 @@ class CLaw:
     ----------
     folder : path
         Folder that `write_c` wrote.
+    name : str, optional
+        Name that `write_c` was given. Necessary only if the folder contains several laws.
     compiler : str
         Command of the C compiler.
 
@@ -55,7 +60,7 @@ class CLaw:
     Raises
     ------
     FileError
-        If the folder does not hold the files of one law.
+        If the folder does not contain the files of one law, or they were edited.
     MissingPackageError
         If there is no C compiler.
     InputError
@@ -71,44 +76,46 @@ class CLaw:
     9
     """
 
-    def __init__(self, folder: str | Path, *, compiler: str = "cc") -> None:
-        source = as_path(folder)
-        found = [x for x in source.glob("*.json") if x.with_suffix(".c").is_file()]
+    def __init__(
+        self, folder: str | Path, *, name: str | None = None, compiler: str = "cc"
+    ) -> None:
+        source = as_path(folder).resolve()
+        self._made = partial(CLaw, source, name=name, compiler=compiler)
+        found = [
+            path.stem
+            for path in source.glob("*.json")
+            if path.with_suffix(".c").is_file() and name in (None, path.stem)
+        ]
         if len(found) != 1:
             raise FileError(
-                f"{source}: holds {len(found)} pairs of .json and .c, expected the files of one "
-                "law, written by fflin.write_c"
+                f"{source}: holds {len(found)} pairs of .json and .c, expected the files that "
+                "fflin.write_c wrote; give name= if there are several laws"
             )
-        try:
-            self._about: dict[str, Any] = json.loads(found[0].read_text("utf-8"))
-            self.name: str = self._about["name"]
-            self.dt: float = self._about["dt"]
-            self.frame: Any = self._about["frame"]
-            kind, real = self._about["kind"], self._about["real"]
-            placement = self._about["reference"]
-            self.origin = None if placement is None else pin.XYZQUATToSE3(np.array(placement))
-            if (
-                kind not in ("state", "output", "samples")
-                or real not in ("double", "float")
-                or self.dt < 0.0
-            ):
-                raise ValueError("kind, real or dt")
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise FileError(f"{found[0]}: not a file of fflin.write_c ({error!r})") from None
-        if kind == "output" and placement is None:
+        [self.name] = found
+        about, header, code = (source / f"{self.name}.{end}" for end in ("json", "h", "c"))
+        with reading(about, "description of C code"):
+            self._about: dict[str, Any] = json.loads(read_file(about, ".json"))
+            digest = self._about.pop("sha256")
+            texts = read_file(header, ".h"), read_file(code, ".c")
+        if digest != digest_of(self._about, *texts):
+            raise FileError(
+                f"{about}: does not belong to {code.name} and {header.name}, or one of these files "
+                "was edited; write them again with fflin.write_c"
+            )
+        self.dt: float = self._about["dt"]
+        self.frame: Any = self._about["frame"]
+        placement = self._about["reference"]
+        self.origin = None if placement is None else pin.XYZQUATToSE3(np.array(placement))
+        if self._about["kind"] == "output" and placement is None:
             raise InputError(
                 "the C code was written from a Compensator alone, without the model about which "
                 "outputs are measured; write it from an OutputFeedback"
             )
-        self._real = ctypes.c_double if real == "double" else ctypes.c_float
-        self._library = _compiled(source / f"{self.name}.c", compiler)
-        try:
-            self._step = getattr(self._library, f"{self.name}_step")
-        except AttributeError:
-            raise FileError(
-                f"{source}: the code has no function {self.name}_step; write it again with "
-                "fflin.write_c"
-            ) from None
+        self._real = ctypes.c_double if self._about["real"] == "double" else ctypes.c_float
+        self._step = getattr(_compiled(code, compiler), f"{self.name}_step")
+
+    def __reduce__(self) -> tuple[Callable[[], CLaw], tuple[()]]:
+        return self._made, ()  # compiled again, since a loaded library cannot be copied
 
     def __repr__(self) -> str:
         about = self._about
@@ -122,14 +129,17 @@ class CLaw:
         InputError
             If states, inputs or outputs of the robot differ from those of the C code.
         """
+        made = f"the C code '{self.name}' was made from the {self._about['title']}"
         state = StateMap(robot, reference=self.origin, frame=self.frame)
-        there = {"input": Actuation(state).names, "state": state.names}
-        for kind, names in self._about["names"].items():
-            if names != list(there[kind] if kind in there else sensed(state)[0]):
-                raise InputError(
-                    f"the C code of '{self.name}' has other {kind}s than '{robot.name}'; write it "
-                    "again for this robot"
-                )
+        actuation = Actuation(state)
+        there = {
+            "input": (actuation.names, actuation.units),
+            "state": (state.names, state.units),
+            "output": sensed(state),
+        }
+        for kind, (names, units) in self._about["signals"].items():
+            require_same(made, robot, kind, (tuple(names), tuple(units)), there[kind])
+        require_turns(made, self._about["nq"], robot)
         of_outputs = self._about["kind"] == "output"
         return _OutputLoop(self, state) if of_outputs else self._state_policy(robot)
 

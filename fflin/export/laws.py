@@ -22,6 +22,7 @@ from fflin.control.saturation import input_limits
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
+from fflin.linear.fit import sensed
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.inputs import named_inputs
@@ -79,6 +80,11 @@ class StateLaw(Law):
     def names(self) -> tuple[str, ...]:
         """Names of the states."""
         return self.state.names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the states."""
+        return self.state.units
 
     @property
     def follows(self) -> bool:
@@ -140,7 +146,7 @@ class OutputLaw(Law):
 
     terms: Sample
     names: tuple[str, ...]  # of the outputs
-    output_units: tuple[str, ...]
+    units: tuple[str, ...]
 
     @property
     def continuous(self) -> list[bool]:
@@ -337,10 +343,10 @@ def _output_law(
         none = np.zeros((len(given.u0), len(given.y0)))
         terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0, none.T, none)
         inputs, outputs = given.output_names, given.input_names
-        units = ("",) * len(inputs), ("",) * len(outputs)
+        units = _units_of(robot, inputs, outputs)
     else:
         terms, inputs, outputs = given.terms, lin.input_names, lin.output_names
-        units = lin.input_units, lin.output_units
+        units = [lin.input_units, lin.output_units]
     if not given.dt and len(terms.A):
         raise InputError(
             "the controller is continuous, expected a sampled one; use "
@@ -354,5 +360,16 @@ def _output_law(
         lin=lin,
         terms=terms,
         names=outputs,
-        output_units=units[1],
+        units=units[1],
     )
+
+
+def _units_of(robot: Robot | None, *names: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Return the units of inputs and outputs of a robot, by name; "unknown" for others."""
+    known: dict[str, str] = {}
+    if robot is not None:
+        state = StateMap(robot)
+        actuation = Actuation(state)
+        for signals in (sensed(state), (actuation.names, actuation.units)):
+            known |= dict(zip(*signals, strict=True))
+    return [tuple(known.get(name, "unknown") for name in each) for each in names]

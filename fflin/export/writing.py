@@ -15,6 +15,7 @@ import pinocchio as pin
 
 from fflin.base import __version__
 from fflin.base.errors import InputError
+from fflin.base.record import content_digest
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, write_whole
 from fflin.export.laws import CASES, OutputLaw, StateLaw, law_of
@@ -53,7 +54,8 @@ def write_c(
         Or a `Compensator` or `TrajectoryFeedback`. Controllers and gains along a trajectory must be
         sampled.
     folder : path
-        Folder of the files; it is made if necessary.
+        Folder of the files; it is made if necessary. Files of the same name are replaced if they
+        are of the same type of law and the same robot.
     robot : Robot, optional
         Robot of the law. Necessary only if the law is from a file, and the name of its robot is not
         the name of a robot that `load` takes.
@@ -72,7 +74,8 @@ def write_c(
     Raises
     ------
     InputError
-        If the law cannot be written in C, its robot is not known, or an argument is invalid.
+        If the law cannot be written in C, its robot is not known, the folder contains other files
+        of this name, or an argument is invalid.
     FileError
         If a file cannot be written.
 
@@ -92,14 +95,34 @@ def write_c(
         raise InputError(f"real is {real!r}, expected 'double' or 'float'")
     target = as_path(folder)
     tables = law_of(law, robot, limits)
-    contents = _Texts(tables, name, real).files()
+    texts = _Texts(tables, name, real)
+    contents = {target / file: text.encode() for file, text in texts.files().items()}
+    old = next((path for path in contents if path.exists()), None)
+    if old and _title(target / f"{name}.json") != texts.title:
+        raise InputError(
+            f"{old} exists and does not belong to the {texts.title}; give another name= (--name) "
+            "or another folder, or delete the file"
+        )
     try:
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{target}: cannot be made: {error.strerror}") from None
-    paths = {target / file: text.encode() for file, text in contents.items()}
-    write_whole(paths)
+    write_whole(contents)
     return target
+
+
+def digest_of(about: dict[str, Any], header: bytes, source: bytes) -> str:
+    """Return the digest that ties the description of a law to its code."""
+    parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
+    return content_digest(parts)
+
+
+def _title(path: Path) -> str | None:
+    """Return the title of the law that a file of `write_c` describes, or None."""
+    try:
+        return json.loads(path.read_bytes())["title"]
+    except (OSError, ValueError, TypeError, LookupError):
+        return None
 
 
 class _Texts:
@@ -113,6 +136,7 @@ class _Texts:
         sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, law.input_units, strict=False)]
         inputs, robot = (law.input_names, law.input_units), law.robot
         self.kind = "state" if isinstance(law, StateLaw) else "output"
+        self.title = f"{law.title} of '{robot.name if robot else 'unknown'}'"
         self.words = {
             **(_DOUBLE if real == "double" else _FLOAT),
             **{"name": name, "NAME": name.upper(), "real": real, "count": f"{CASES}"},
@@ -141,18 +165,24 @@ class _Texts:
         self.words["run"] = self._filled(f"{self.kind}_run.c")
         law, lin = self.law, self.law.lin
         follows = isinstance(law, StateLaw) and law.follows
-        about = {
-            **{"name": self.name, "real": self.real, "frame": law.frame, "dt": law.dt},
+        header, source = self._filled("header.h"), self._filled(f"{self.kind}_law.c")
+        about: dict[str, Any] = {
+            **{"title": self.title, "real": self.real, "frame": law.frame, "dt": law.dt},
             "kind": "samples" if follows else self.kind,
-            "names": {"input": law.input_names, self.kind: law.names},
+            "signals": {
+                "input": (law.input_names, law.input_units),
+                self.kind: (law.names, law.units),
+            },
+            "nq": len(lin.q) if lin else law.robot.nq if law.robot else 0,
             "u0": law.u0[0].tolist(),
             "memory": len(law.terms.A) if isinstance(law, OutputLaw) else 0,
             "reference": None if lin is None else lin.placement.tolist(),
             "point": None if lin is None else [lin.q.tolist(), lin.v.tolist()],
         }
+        about["sha256"] = digest_of(about, header.encode(), source.encode())
         return {
-            f"{self.name}.h": self._filled("header.h"),
-            f"{self.name}.c": self._filled(f"{self.kind}_law.c"),
+            f"{self.name}.h": header,
+            f"{self.name}.c": source,
             f"{self.name}_test.c": self._filled("test.c"),
             f"{self.name}.json": json.dumps(about, indent=1) + "\n",
         }
@@ -223,8 +253,8 @@ class _Texts:
         by, ny = law.terms, len(law.names)
         return {
             **{"states": f"{len(by.A)}", "states_max": f"{max(len(by.A), 1)}", "outputs": f"{ny}"},
-            "output_columns": _listed(law.names, law.output_units, ""),
-            "output_list": _listed(law.names, law.output_units, "y"),
+            "output_columns": _listed(law.names, law.units, ""),
+            "output_list": _listed(law.names, law.units, "y"),
             **{key: self.array(_at_least_one(getattr(by, key))) for key in "ABCD"},
             "y0": self.array(by.y0),
             "continuous": _whole(law.continuous),

@@ -154,26 +154,62 @@ def _point(values: Array) -> str:
 
 def _require_inertia(body: pin.Inertia, of: str, found: Sequence[_Modes]) -> None:
     """Raise `InputError` if M_rr - L L^T of a body has a negative eigenvalue."""
+    names = [name for item in found for name in item.appendage.modes]
+    L = np.hstack([item.L for item in found])
+    rows = np.array([body.mass]), body.lever[None], body.inertia[None]
+    if _least_eigenvalue(*rows, L)[0] >= -_NEGATIVE:
+        return
+    leasts = [float(_least_eigenvalue(*rows, L[:, : k + 1])[0]) for k in range(len(names))]
+    first = next(k for k, least in enumerate(leasts) if not least >= -_NEGATIVE)
+    t, r = np.split(L[:, first], 2)
+    r = r - np.cross(body.lever, t)
+    raise InputError(
+        f"mode '{names[first]}' has more participation ({np.linalg.norm(t):.3g} kg^0.5, "
+        f"{np.linalg.norm(r):.3g} kg^0.5 m about the centre of mass) than {of} with "
+        f"{body.mass:.4g} kg can have: M_rr - L L^T has the eigenvalue {leasts[first]:.2g}, "
+        "relative to the largest of M_rr; the inertia in the URDF must include the appendage as "
+        "if it were rigid"
+    )
+
+
+def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> Array:
+    """Return the least eigenvalues (N,) of M_rr - L L^T, relative to the largest of M_rr.
+
+    For masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) about them.
+    """
     # About the centre of mass, in units in which the mass and the radius of gyration are one.
-    size = _radius_of_gyration(body.mass, body.inertia)
-    left = np.zeros((6, 6))
-    left[:3, :3], left[3:, 3:] = body.mass * np.eye(3), body.inertia / size**2
-    largest = float(np.linalg.eigvalsh(left)[-1])
-    for item in found:
-        moments = item.L[3:] - np.cross(body.lever, item.L[:3], axisb=0, axisc=0)
-        for mode, t, r in zip(item.appendage.modes, item.L[:3].T, moments.T, strict=True):
-            column = np.append(t, r / size)
-            left -= np.outer(column, column)
-            finite = np.isfinite(left).all()
-            least = float(np.linalg.eigvalsh(left)[0]) if finite else -math.inf
-            if not least >= -_NEGATIVE * largest:
-                raise InputError(
-                    f"mode '{mode}' has more participation ({np.linalg.norm(t):.3g} kg^0.5, "
-                    f"{np.linalg.norm(r):.3g} kg^0.5 m about the centre of mass) than "
-                    f"{of} with {body.mass:.4g} kg can have: M_rr - L L^T "
-                    f"has the eigenvalue {least:.2g} in units of its mass and radius of gyration; "
-                    "the inertia in the URDF must include the appendage as if it were rigid"
-                )
+    trace = np.trace(inertia, axis1=1, axis2=2)
+    size = np.sqrt(np.maximum(trace, 1e-300) / np.maximum(2.0 * mass, 1e-300))[:, None, None]
+    t, r = np.split(L, 2)
+    modes = np.empty((len(mass), *L.shape))
+    modes[:, :3] = t
+    modes[:, 3:] = (r - np.cross(center[:, :, None], t[None], axis=1)) / size
+    M = np.zeros((len(mass), 6, 6))
+    M[:, :3, :3], M[:, 3:, 3:] = mass[:, None, None] * np.eye(3), inertia / size**2
+    left = M - modes @ modes.swapaxes(1, 2)
+    least = np.full(len(mass), -np.inf)
+    finite = np.isfinite(left).all(axis=(1, 2))
+    largest = np.linalg.eigvalsh(M[finite])[:, -1]
+    least[finite] = np.linalg.eigvalsh(left[finite])[:, 0] / largest
+    return least
+
+
+def first_impossible(
+    model: pin.Model,
+    appendages: Sequence[Appendage],
+    bodies: Mapping[int, tuple[Array, Array, Array]],
+) -> int | None:
+    """Return the first of N rows of bodies that cannot have the participation of their modes.
+
+    `bodies` are masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) of joints of `model`.
+    """
+    found = [_seen(model, item) for item in appendages]
+    impossible = []
+    for joint, rows in bodies.items():
+        if of_body := [item.L for item in found if item.joint == joint]:
+            least = _least_eigenvalue(*rows, np.hstack(of_body))
+            impossible += np.flatnonzero(~(least >= -_NEGATIVE)).tolist()
+    return min(impossible, default=None)
 
 
 class _Ball(NamedTuple):

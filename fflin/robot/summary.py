@@ -48,21 +48,26 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
     model = robot.model
     inputs = sum(3 if isinstance(item, BaseTorque | BaseForce) else 1 for item in robot.inputs)
     source = str(robot.urdf) if robot.urdf else "a Pinocchio model"
-    head = (
-        f"{robot.name}: {counted(robot.n, 'joint')}, {12 + 2 * robot.n} states, "
-        f"{counted(inputs, 'input')}, mass {robot.mass:.6g} kg\nfrom {source}"
-    )
+    modes = len(robot.modes)
+    counts = [
+        counted(robot.n - modes, "joint"),
+        *[counted(modes, "mode")] * bool(modes),
+        f"{12 + 2 * robot.n} states",
+        counted(inputs, "input"),
+    ]
+    head = f"{robot.name}: {', '.join(counts)}, mass {robot.mass:.6g} kg\nfrom {source}"
     if robot.orbit:
         head += f"\n{folded([str(robot.orbit)])}"
     depth = {0: -1, 1: 0}
+    masses = _masses(robot)
     rows = [["joint", "type", "mass [kg]", "lower", "upper", "effort", "velocity"]]
-    rows.append(["(base)", "free", f"{model.inertias[1].mass:.6g}", ".", ".", ".", "."])
+    rows.append(["(base)", "free", f"{masses[ROOT]:.6g}", ".", ".", ".", "."])
     kinds = {
         joint: "prismatic" if joint.prismatic else "continuous" if joint.unbounded else "revolute"
         for joint in robot.joints
+        if not joint.mode
     }
     kinds |= {joint: "wheel" for joint in robot.joints if joint.name in robot.wheels}
-    kinds |= {joint: "slosh" if joint.kind == "slosh" else "mode" for joint in robot.modes}
     for joint, leader, multiplier, offset in robot.followers:
         kinds[joint] = f"mimics {leader.name} * {multiplier:g}"
         kinds[joint] += f" {'-' if offset < 0 else '+'} {abs(offset):g}" if offset else ""
@@ -72,9 +77,14 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
         travel = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
         limits = (math.inf, math.inf) if joint.unbounded else travel
         limits += model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]
-        mass = f"{model.inertias[index].mass:.6g}"
+        mass = f"{masses[index]:.6g}"
         rows.append(["  " * depth[index] + joint.name, kinds[joint], mass, *map(_limit, limits)])
-    frames = [frame.name for frame in model.frames.tolist() if frame.parentJoint >= ROOT]
+    of_modes = {joint.name for joint in robot.modes}
+    frames = [
+        frame.name
+        for frame in model.frames.tolist()
+        if frame.parentJoint >= ROOT and frame.name not in of_modes
+    ]
     limited = any(cell != "." for row in rows[1:] for cell in row[3:])
     parts = [
         head,
@@ -90,17 +100,28 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
     return "\n\n".join(parts)
 
 
+def _masses(robot: Robot) -> list[float]:
+    """Return the mass [kg] of the body behind each joint, with what its modes move."""
+    model = robot.model
+    masses = [body.mass for body in model.inertias.tolist()]
+    for index in sorted((model.getJointId(joint.name) for joint in robot.modes), reverse=True):
+        masses[model.parents[index]] += masses[index]
+    return masses
+
+
 def _appendages(robot: Robot) -> list[str]:
     """Show flexible appendages and slosh, with their modes if the link is clamped."""
-    rows = [["appendage", "on frame", "mode", "Hz", "damping"]]
+    rows = [["appendage", "on frame", "mode", "Hz", "damping ratio", "stiffness"]]
     for item in robot.appendages:
         for name in item.modes:
             index = robot.joint_names.index(name)
+            joint = robot.joints[index]
             stiffness, damping, _ = (each[index].item() for each in robot.springs)
-            cells = [".", "."]
+            cells = [".", ".", "."]
             if stiffness:
-                omega, ratio = robot.joints[index].oscillation(stiffness, damping)
-                cells = [f"{0.5 * omega / math.pi:.6g}", f"{ratio:.4g}"]
+                omega, ratio = joint.oscillation(stiffness, damping)
+                unit = {"m": "N/m", "rad": "N m/rad"}.get(joint.unit, "1/s^2")
+                cells = [f"{0.5 * omega / math.pi:.6g}", f"{ratio:.4g}", f"{stiffness:.6g} {unit}"]
             rows.append([item.title, item.frame, name, *cells])
     return [grid(rows, "lll")] * bool(robot.appendages)
 
@@ -108,9 +129,14 @@ def _appendages(robot: Robot) -> list[str]:
 def _settings(robot: Robot) -> list[str]:
     """Show what was set beside the URDF, but inputs and orbit."""
     outputs = [":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ()))) for y in robot.outputs]
+    modes = {joint.name for joint in robot.modes}
+    stiffness, damping = (
+        {name: value for name, value in given.items() if name not in modes}
+        for given in (robot.stiffness, robot.damping)
+    )
     shown = {
-        "stiffness [N m/rad | N/m]": robot.stiffness,
-        "damping [N m s/rad | N s/m]": robot.damping,
+        "stiffness [N m/rad | N/m]": stiffness,
+        "damping [N m s/rad | N s/m]": damping,
         "spring rest positions [rad | m]": robot.rest,
         "passive joints": robot.passive,
         "locked joints": robot.locked,

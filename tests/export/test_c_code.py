@@ -1,13 +1,17 @@
 """C code of every kind of law, compared with the policies that simulations use."""
 
+import copy
 import json
+import pickle
 import re
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.robot.catalog import find_robot
 from tests.support.c_code import COMPILERS, needs_compiler, outcome
 from tests.support.policies import between_gains, compensated
 
@@ -180,8 +184,6 @@ def test_a_law_from_a_file_needs_its_robot(tmp_path):
     loaded = fflin.Gain.load(tmp_path / "gain.npz")
     one, other = (fflin.write_c(x, tmp_path / f"{k}") for k, x in enumerate((gain, loaded)))
     assert (one / "controller.c").read_bytes() == (other / "controller.c").read_bytes()
-    from dataclasses import replace
-
     unknown = replace(loaded, robot="of my own")
     with pytest.raises(fflin.InputError, match="robot="):
         fflin.write_c(unknown, tmp_path / "none")
@@ -214,7 +216,7 @@ def test_what_cannot_be_written_is_refused(change, match, tmp_path):
 
 def test_the_code_is_not_flown_with_another_robot(tmp_path):
     code = fflin.CLaw(fflin.write_c(law("hybrid")[1], tmp_path))
-    with pytest.raises(fflin.InputError, match="has other"):
+    with pytest.raises(fflin.InputError, match="does not fit the given robot 'planar_detumble'"):
         code.bind(fflin.load("planar_detumble"))
     with pytest.raises(fflin.FileError, match="holds 0"):
         fflin.CLaw(tmp_path / "nowhere")
@@ -254,6 +256,90 @@ def test_a_gain_from_a_file_is_not_written_for_another_robot(tmp_path):
         fflin.write_c(old, tmp_path / "none", robot=robot)
 
 
+def test_the_code_is_not_flown_with_other_continuous_joints(tmp_path):
+    xml = find_robot("servicer_7dof").path.read_text()
+    (tmp_path / "own.urdf").write_text(xml.replace('type="revolute"', 'type="continuous"'))
+    robot = fflin.load("servicer_7dof")
+    code = fflin.CLaw(fflin.write_c(fflin.lqr(fflin.linearize(robot)), tmp_path / "c"))
+    turning = fflin.load(tmp_path / "own.urdf")
+    assert turning.nq > robot.nq
+    with pytest.raises(fflin.InputError, match="other joints are continuous"):
+        code.bind(turning)
+
+
+@pytest.mark.parametrize("ending", ["c", "h", "json"])
+def test_files_of_another_law_or_edited_ones_are_refused(ending, tmp_path):
+    """A pair of which one file is of another law, though both are valid."""
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot)
+    folders = [
+        fflin.write_c(fflin.StateFeedback(lin, k * fflin.lqr(lin).K), tmp_path / f"{k}", real=real)
+        for k, real in ((1.0, "double"), (2.0, "float"))
+    ]
+    one, other = (folder / f"controller.{ending}" for folder in folders)
+    assert one.read_bytes() != other.read_bytes()
+    one.write_bytes(other.read_bytes())
+    with pytest.raises(fflin.FileError, match="does not belong to"):
+        fflin.CLaw(folders[0])
+    fflin.CLaw(folders[1])
+
+
+def test_a_folder_holds_several_laws_and_none_is_lost(tmp_path):
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot).discretize(0.1)
+    gain, by = fflin.lqr(lin), fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
+    fflin.write_c(gain, tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for law in (by, fflin.lqr(fflin.linearize(fflin.load("cubesat")))):
+        with pytest.raises(fflin.InputError, match=r"controller\.h exists and does not belong to"):
+            fflin.write_c(law, tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    fflin.write_c(fflin.OutputFeedback(lin, by), tmp_path, name="filter")
+    fflin.write_c(fflin.lqr(lin, 2.0, 1.0), tmp_path)  # the same gain, tuned again
+    with pytest.raises(fflin.FileError, match="holds 2 pairs"):
+        fflin.CLaw(tmp_path)
+    names = [fflin.CLaw(tmp_path, name=name).name for name in ("controller", "filter")]
+    assert names == ["controller", "filter"]
+    (tmp_path / "own.c").write_text("int main(void) { return 0; }")
+    with pytest.raises(fflin.InputError, match=r"own\.c exists"):
+        fflin.write_c(gain, tmp_path, name="own")
+
+
+def test_copies_of_the_code_fly_as_the_code(tmp_path):
+    robot, by = law("no joints")
+    code = fflin.CLaw(fflin.write_c(by, tmp_path))
+    q = fflin.configuration(robot, {}, POSE)
+    u = code.bind(robot)(0.0, q, np.zeros(robot.nv))
+    for other in (copy.deepcopy(code), pickle.loads(pickle.dumps(code))):
+        assert (other.bind(robot)(0.0, q, np.zeros(robot.nv)) == u).all()
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("axis", [*np.eye(4)[:3].tolist(), [0.6, 0.8, 0.0, 0.0]])
+def test_half_a_turn_is_decided_as_in_python(axis, side, tmp_path):
+    """Both ways back are equally short: the sign of the quaternion decides, in C as in Python."""
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    by = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    code = fflin.CLaw(fflin.write_c(by, tmp_path))
+    q, v = np.append(np.zeros(3), side * np.array(axis)), np.zeros(robot.nv)
+    u, other = code.bind(robot)(0.0, q, v), by.bind(robot)(0.0, q, v)
+    assert np.abs(u).max() > 0.0
+    assert u == pytest.approx(other, rel=1e-14, abs=1e-14 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_units_of_a_compensator_are_those_of_its_robot(known, tmp_path):
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot).discretize(0.1)
+    by = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
+    by = by if known else replace(by, robot="of my own")
+    header = (fflin.write_c(by, tmp_path) / "controller.h").read_text()
+    assert ("u[0]  tau_b.x [N m]" in header) == known
+    assert ("omega_b.z [rad/s]" in header) == known
+    assert ("[unknown]" in header) != known
+
+
 @pytest.mark.parametrize(
     "change", [[], {"reference": [1, 2]}, {"dt": "x"}, {"kind": "zz"}, {"real": "half"}]
 )
@@ -262,5 +348,5 @@ def test_a_damaged_folder_is_one_line(change, tmp_path):
     path = tmp_path / "controller.json"
     about_law = json.loads(path.read_text())
     path.write_text(json.dumps({**about_law, **change} if change else []))
-    with pytest.raises(fflin.FflinError, match="not a file of"):
+    with pytest.raises(fflin.FileError, match=r"controller\.json: (not a|does not belong)"):
         fflin.CLaw(tmp_path)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fflin
+from fflin.base.errors import InputError
 from fflin.campaign.statistics import KINDS, kinds_of
 from fflin.dynamics.state import StateMap
 from tests.robot.test_appendages import beam, full, hub_with_rod, servicer
@@ -118,8 +119,16 @@ def test_a_summary_lists_the_appendages():
     from fflin.robot.summary import robot_info
 
     text = robot_info(full())
-    assert row(text, "boom       base             boom_mode_2") == ["0.8", "0.005"]
-    assert row(text, "swing      base             swing_x") == [".", "."]
+    assert row(text, "boom       base             boom_mode_2") == [
+        *("0.8", "0.005", "25.2662", "1/s^2"),
+    ]
+    assert row(text, "tank       base             tank_x")[2:] == ["47.3741", "N/m"]
+    assert row(text, "swing      base             swing_x") == [".", ".", "."]
+    # The modes are neither joints nor bodies nor frames of the user's.
+    rigid = robot_info(servicer()[0])
+    assert row(text, "(base)")[1] == row(rigid, "(base)")[1]
+    assert f"{servicer()[0].n + 1} joints, 10 modes" in text
+    assert text.count("boom_mode_2") == 1
 
 
 def test_default_weights_leave_modes_to_their_damping_and_name_them():
@@ -140,3 +149,29 @@ def test_default_weights_leave_modes_to_their_damping_and_name_them():
 def test_a_pendulum_without_gravity_is_named():
     with pytest.raises(fflin.StabilizabilityError, match=r"'swing_x'.*is a pendulum"):
         fflin.lqr(fflin.linearize(full().replace(gravity=(0, 0, 0))))
+    tank = fflin.Slosh.cylinder("base", 0.1, 0.1, 1000.0, 0.04, name="tank")
+    alone = fflin.load("planar_detumble", lock=["*"], appendages=[tank])
+    with pytest.raises(fflin.StabilizabilityError, match=r"'tank_x', 'tank_y' is a pendulum"):
+        fflin.lqr(fflin.linearize(alone))
+
+
+def test_a_mode_cannot_jam_and_no_pattern_means_it():
+    robot = full()
+    with pytest.raises(InputError, match="'boom_mode_1' is a mode of a flexible appendage"):
+        fflin.jam(robot, "boom_mode_1")
+    jammed = fflin.jam(robot, "joint_*")
+    assert {mode.name for mode in robot.modes} <= {*jammed.robot.joint_names}
+    assert len(fflin.jam(robot, "*").impulse) == servicer()[0].n + 1
+
+
+@pytest.mark.parametrize("engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)])
+def test_a_campaign_that_draws_too_light_a_link_is_refused_by_the_mode(engine):
+    robot = hub_with_rod(1.0, 0.5, 1.0, 2.0).replace(appendages=[beam(1.0, 2.0, 5.0, 2)])
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, np.zeros((len(lin.input_names), len(lin.state_names))))
+    options = {"runs": 8, "duration": 0.1, "dt": 0.05, "engine": engine}
+    light = {"base.density": (-0.7, -0.5)}  # the modes have 0.8 of 2 kg
+    with pytest.raises(InputError, match=r"run \d draws .*'beam_mode_\d' has more participation"):
+        fflin.monte_carlo(robot, policy, light, **options)
+    made = fflin.monte_carlo(robot, policy, {"base.density": (-0.1, 0.2)}, **options)
+    assert len(made.largest) == 8

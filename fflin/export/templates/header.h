@@ -12,10 +12,11 @@
  * No memory is allocated, there is no global variable, every loop has a fixed bound, and sqrt is
  * the only library function. Calls with different arguments may run at the same time.
  *
- * The test program ${name}_test.c compares $count cases with fflin. Largest permitted difference
- * of each input, $error
- * times the sum of the sizes of its terms:
+ * The test program ${name}_test.c compares $count cases with fflin. In each case, an input may
+ * differ by $error times the sum of the absolute values of its terms, which allows for
+ * rounding. The largest differences that it permits in these cases:
 $tolerances
+ * Larger arguments may differ by more.
  */
 #ifndef ${NAME}_H
 #define ${NAME}_H
