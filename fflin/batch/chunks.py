@@ -18,7 +18,7 @@ from fflin.batch.rows import Points
 from fflin.batch.run import ChunkResult
 from fflin.dynamics.chart import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.inertia import Inertia
-from fflin.dynamics.rnea import Rates
+from fflin.dynamics.rnea import AccelerationDerivatives
 from fflin.kernel.compiled import checked_engine
 from fflin.kernel.tree import LANES
 from fflin.linear.linearization import LARGEST, Linearizer, Prepared
@@ -26,7 +26,7 @@ from fflin.linear.state_equations import assemble, drift
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.kernel.accelerations import Mask
+    from fflin.kernel.derivatives import Mask
 
 RowNumbers: TypeAlias = NDArray[np.integer[Any]]
 
@@ -80,11 +80,6 @@ class ChunkJob:
         count = len(points.q)
         if out is None:
             out = {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
-        if self.only_inertia and not self.linearizer.robot.n and count > 1:
-            # Without joints M is the same everywhere.
-            one = self.run(Points(points.q[:1], None, None), start)
-            out["B_lower"][:] = one.arrays["B_lower"]
-            return ChunkResult(dict(out), one.notes)
         left = self.compiled.write(points, out) if self.compiled else np.arange(count)
         if not len(left):
             return ChunkResult(dict(out), [])
@@ -168,7 +163,7 @@ class BatchEquations:
         nv = nu.shape[1]
         A[:, :nv] = ready.rest["A"][:nv]
         c, judged = self._kernel.write(q, nu, q_m, u, A, B)
-        rates = Rates(c, A[:, nv:], B, state.gravity(q))
+        rates = AccelerationDerivatives(c, A[:, nv:], B, state.gravity(q))
         f0 = assemble(state, actuation, chart, nu, u, rates, A, moving=ready.moving)
         out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
         out["f0"][:] = 0.0 if ready.moving else f0

@@ -151,8 +151,8 @@ def sweep(
     shares = (_SHARES, 1) if parallel else (4 * threads, threads)
     store = _store(task, path, chunk or _chunk_size(task, *shares))
     with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
-        if others is None and not (job.compiled and robot.n):
-            threads = 1  # without joints there is but one M
+        if others is None and not job.compiled:
+            threads = 1
         failed = run_chunks(
             job, task.points, store, executor=others, threads=threads, progress=progress
         )

@@ -48,10 +48,10 @@ class LeastSquares(
 
     `columns` has the k columns of an input's unit force, one after the other, and then the force.
     What follows is work space: the `given` columns of a lane; `A`, the same divided by their norm;
-    the orthogonal factors `Q` and `R` of the free ones with the rows of `LEAST` below, in the `order`
-    in which they became free; the remainder `b`, and `y` for its components; the force `wanted` of
-    length 1; the solution `s` without bounds; the scaled bounds `low` and `high`; and the `state`
-    of each input.
+    the orthogonal factors `Q` and `R` of the columns of free inputs, with the rows of `LEAST`
+    below, in the `order` in which the inputs became free; the remainder `b`, and `y` for its
+    components; the force `wanted` of length 1; the solution `s` without bounds; the scaled bounds
+    `low` and `high`; and the `state` of each input.
     """
 
 

@@ -76,11 +76,6 @@ def below(value: Any, bound: Any) -> Any:
     return value < bound
 
 
-def transpose(source: Any, index: int, target: Any, start: int, stride: int) -> None:
-    """Write eight entries in eight lanes, lane k to ``target`` from ``start + k stride`` on."""
-    raise NotImplementedError("eight lanes need compiled code")
-
-
 @inlined
 def width(array: Any) -> Any:
     """Return how many lanes an array has; none where it is empty."""

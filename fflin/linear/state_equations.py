@@ -16,7 +16,7 @@ from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart, times
 from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.outputs import Sensing
-from fflin.dynamics.rnea import Rates
+from fflin.dynamics.rnea import AccelerationDerivatives
 from fflin.dynamics.state import StateMap
 
 
@@ -34,7 +34,7 @@ def assemble(
     chart: Chart,
     nu: Array,
     u: Array,
-    rates: Rates,
+    rates: AccelerationDerivatives,
     A: Array,
     *,
     moving: bool,
@@ -96,7 +96,12 @@ def assemble(
 
 
 def _over_rotations(
-    state: StateMap, actuation: Actuation, chart: Chart, u: Array, rates: Rates, W: Array
+    state: StateMap,
+    actuation: Actuation,
+    chart: Chart,
+    u: Array,
+    rates: AccelerationDerivatives,
+    W: Array,
 ) -> Array:
     """Return the derivatives Theta (.., 6 + n, 3) of `rates` over base rotations (4.4)."""
     omega_in_reference, v_in_reference = state.axes
@@ -131,7 +136,7 @@ def output_equations(
     actuation: Actuation,
     data: pin.Data,
     chart: Chart,
-    rates: Rates,
+    rates: AccelerationDerivatives,
     x0: Array,
     point: Sequence[Array],
 ) -> dict[str, Array]:
