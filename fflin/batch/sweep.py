@@ -92,7 +92,7 @@ def sweep(
         Compiled by default if numba is installed and the outputs are the state.
     executor : concurrent.futures.Executor, optional
         Executor whose workers process the chunks: processes, dask (``Client.get_executor()``) or
-        mpi4py.futures. The robot is sent to each worker once. The executor is not shut down.
+        mpi4py.futures. The executor is not shut down.
     workers : int, optional
         Number of worker processes to start, at most one per core. A process that dies is replaced.
         With workers, call `sweep` under ``if __name__ == "__main__":``.

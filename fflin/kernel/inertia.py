@@ -101,20 +101,14 @@ def _carry(work, at, above, place):
 
 
 @inlined
-def inertia_times(work, at, w):
-    """Return I w of the inertia at `at`."""
-    xx, xy, xz = vec.get3(work, at + 4)
-    yy, yz, zz = vec.get3(work, at + 7)
-    return vec.dot((xx, xy, xz), w), vec.dot((xy, yy, yz), w), vec.dot((xz, yz, zz), w)
-
-
-@inlined
 def spatial_inertia_times(work, at, motion):
     """Return inertia times a motion vector, moment and force."""
     m, h = load(work, at), vec.get3(work, at + 1)
+    xx, xy, xz = vec.get3(work, at + 4)
+    yy, yz, zz = vec.get3(work, at + 7)
     w, v = motion
-    moment = vec.plus(inertia_times(work, at, w), vec.cross(h, v))
-    return moment, vec.plus(vec.times(v, m), vec.cross(w, h))
+    turning = vec.dot((xx, xy, xz), w), vec.dot((xy, yy, yz), w), vec.dot((xz, yz, zz), w)
+    return vec.plus(turning, vec.cross(h, v)), vec.plus(vec.times(v, m), vec.cross(w, h))
 
 
 @inlined
