@@ -58,6 +58,55 @@ def test_a_worker_unpickles_the_robot_once(robot, monkeypatch):
     assert np.array_equal(batch.q, q)
 
 
+def kill_at(start_to_kill, marker, original=batch_chunks.ChunkJob.run):
+    """A run that kills its worker at one chunk, as long as the marker's count lasts."""
+
+    def run(job, points, start, out=None):
+        if start == start_to_kill and marker.exists():
+            left = int(marker.read_text()) - 1
+            if left:
+                marker.write_text(str(left))
+            else:
+                marker.unlink()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return original(job, points, start, out)
+
+    return run
+
+
+class KillingJob(batch_chunks.ChunkJob):
+    """A job whose worker is killed at the chunk that begins at 24."""
+
+    marker = None
+
+    def __reduce__(self):
+        return _killing, (self.marker, self._again)
+
+    def run(self, points, start, out=None):
+        if self.marker is not None:
+            return kill_at(24, self.marker)(self, points, start, out)
+        return super().run(points, start, out)
+
+
+def _killing(marker, again):
+    job = again()
+    job.marker = marker
+    return job
+
+
+@pytest.fixture
+def killing(monkeypatch, tmp_path):
+    """A function that lets the chunk at 24 kill its worker so many times."""
+    marker = tmp_path / "marker"
+
+    def set_up(times):
+        marker.write_text(str(times))
+        monkeypatch.setattr(KillingJob, "marker", marker)
+        monkeypatch.setattr("fflin.batch.sweep.ChunkJob", KillingJob)
+
+    return set_up
+
+
 @pytest.mark.compiled
 def test_a_worker_that_is_killed_is_replaced(robot, killing):
     q, _, _ = points(robot, 80)
