@@ -25,13 +25,8 @@ TASKS = {
     "inspect robots": {"robots": "models", "info": "models", "init": "models", "view": "visual"},
     "make and check a linear model": {"linearize": "models", "check": "models"},
     "analyse a model": {
-        **{"analyze": "analysis", "modes": "analysis", "equilibrium": "analysis"},
-        **{
-            "sensitivity": "analysis",
-            "uncertain": "analysis",
-            "validity": "regions",
-            "funnel": "regions",
-        },
+        **dict.fromkeys(("analyze", "modes", "equilibrium", "sensitivity"), "analysis"),
+        **{"uncertain": "analysis", "validity": "regions", "funnel": "regions"},
     },
     "design and simulate": {
         **{"lqr": "regulator", "tvlqr": "tracking", "plan": "planning", "simulate": "simulation"},

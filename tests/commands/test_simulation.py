@@ -347,7 +347,7 @@ def test_an_on_off_thruster_without_samples_is_told_of_dt(tmp_path):
         'frame = "base"\nposition = [0, 0, 0]\ndirection = [1, 0, 0]\nmax = 1\non_off = true\n'
     )
     said = refused("simulate", tmp_path / "t.toml", "--no-allocate", "--rpy", 9, 0, 0, "--reduce")
-    assert says(said, "(--dt)")
+    assert says(said, "(--sample)")
 
 
 @pytest.mark.exhaustive
