@@ -123,7 +123,7 @@ class SecondOrder:
     def poles(self) -> tuple[Values, Margin]:
         """The poles that are not zero, one of each pair, as eigenvalues approximate them."""
         rigid, margin = self._null(self.K, self.D)
-        still, other = self._null(self.K)
+        unloaded, other = self._null(self.K)
         R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
         part = self.restricted(R / self.size[:, None])
         r = len(part.M)
@@ -131,7 +131,7 @@ class SecondOrder:
             return np.zeros(0, dtype=complex), margin & other
         L = np.linalg.inv(np.linalg.cholesky(part.M))
         K, D = L @ part.K.values @ L.T, L @ part.D.values @ L.T
-        zeros = still.shape[1] - rigid.shape[1]
+        zeros = unloaded.shape[1] - rigid.shape[1]
         if D.any():
             fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
             A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])

@@ -129,8 +129,9 @@ def _range(text: str) -> tuple[str, Any]:
 
 
 def _analyze(arguments: argparse.Namespace) -> int:
-    from fflin.analysis.controllability import controllability, observability
+    from fflin.analysis.controllability import controllability
     from fflin.analysis.modes import modes
+    from fflin.analysis.observability import observability
 
     check_figure(arguments.plot)
     _, lin = linear_model(arguments)

@@ -10,7 +10,13 @@ from scipy.linalg import eigh
 
 from fflin.analysis.mechanics import second_order, slopes
 from fflin.analysis.ranks import Noisy, null_space
-from fflin.analysis.reduction import ignorable_wheels, picked, regulated_part, rigid_forces, without
+from fflin.analysis.reduction import (
+    ignorable_wheels,
+    regulated_part,
+    rigid_forces,
+    selection,
+    without,
+)
 from fflin.base.errors import FflinWarning, InputError, listed, unknown
 from fflin.base.names import input_keys
 from fflin.base.validation import Array
@@ -502,11 +508,11 @@ def _of_regulated(
     Q, R, rule, bandwidth, (of_positions, of_inputs) = found
     if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
         rule += f"; at or beyond the URDF limit at the point itself: {listed(beyond)}"
-    S = picked(body.state_names, lin.state_names)
+    S = selection(body.state_names, lin.state_names)
     Q = S.T @ Q @ S
     terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
     if speeds := [name for name in part.state_names if name not in body.state_names]:
-        S, slow = picked(speeds, lin.state_names), _SPEEDS * bandwidth
+        S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
         # Inputs R^-1/2 Z n that turn no body change the speeds at X n.
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
         X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fflin.analysis.mechanics import slopes
-from fflin.analysis.reduction import picked, regulated_part
+from fflin.analysis.reduction import regulated_part, selection
 from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
@@ -137,7 +137,7 @@ def lqr(
     Q, R, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:
-        S = picked(part.state_names, lin.state_names)
+        S = selection(part.state_names, lin.state_names)
         Q, cross = S @ Q @ S.T, None if cross is None else S @ cross
     solution = _solve(part, Q, R, cross)
     return make_gain(lin, part, solution, Q, R, cross, rule)

@@ -140,9 +140,9 @@ def _cancelling_terms(
     speed, rate, momentum = speeds(state, v)
     # What the momentum of wheels does to a turning link, in the units of the rows.
     spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
-    still = speed.copy()
-    still[LINEAR] *= _ROUNDING_SHARE
-    resting = still / mobility
+    slowed = speed.copy()
+    slowed[LINEAR] *= _ROUNDING_SHARE
+    resting = slowed / mobility
     accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
     forces = np.abs(lin.u0) * input_mobility
     size = _largest(accelerations) + _largest(forces) + rate * (_largest(resting) + spin)
