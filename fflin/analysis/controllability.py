@@ -220,7 +220,7 @@ class _Part(NamedTuple):
 
 def _by_poles(lin: LinearModel, conserved: ConservedMomenta) -> _Part:
     z, R = conserved.selected, conserved.rates
-    X, M = mechanics.slopes(lin)[z] @ conserved.T, R.T @ lin.M @ R
+    X, M = mechanics.rate_matrix(lin)[z] @ conserved.T, R.T @ lin.M @ R
     found = split_by_poles(X, lin.B[z], M, lin.dt)
     return _Part(found.inside, found.rows, None, "eigenvalues", found.fixed.transformed(R))
 
@@ -247,7 +247,7 @@ def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | N
     normal = np.linalg.qr((normal / np.linalg.norm(normal, axis=1, keepdims=True)).T, "complete")[0]
     controllable = normal[:, len(rows) :] / size[:, None]
     to_s = np.linalg.inv(
-        (mechanics.rates_of_positions(mechanics.slopes(source)) @ R)[conserved.kept]
+        (mechanics.rates_of_positions(mechanics.rate_matrix(source)) @ R)[conserved.kept]
     )
     controllable[:r] = np.linalg.solve(to_s, controllable[:r])
     fixed = found.fixed.transformed(R)

@@ -129,7 +129,7 @@ def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
     source, nv = mechanics.at_rest(lin), len(lin.M)
     if source is not None:
         system = mechanics.second_order(source)
-        N = mechanics.rates_of_positions(mechanics.slopes(source))
+        N = mechanics.rates_of_positions(mechanics.rate_matrix(source))
         C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
         size = np.tile(system.size, 2)
         each = np.linalg.norm(C / size, axis=1)
@@ -141,5 +141,5 @@ def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
             motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
             return motions, found.fixed, "eigenvalues" if system.acting else "closed form"
     # The uncontrollable subspace of the dual pair (A^T, C^T).
-    part = split_by_poles(mechanics.slopes(lin), lin.C.T, lin.M, lin.dt, dual=True)
+    part = split_by_poles(mechanics.rate_matrix(lin), lin.C.T, lin.M, lin.dt, dual=True)
     return part.outside, part.fixed, "eigenvalues"

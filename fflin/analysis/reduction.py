@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from fflin.analysis.mechanics import checked, conserved, floating_inertia, second_order, slopes
+from fflin.analysis.mechanics import checked, conserved, floating_inertia, rate_matrix, second_order
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin, Noisy, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError, listed
@@ -305,7 +305,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
 
 def damped_wheels(part: LinearModel) -> str:
     """Return what to do where wheels have damping, of a model that may be without their angles."""
-    nv, rates = len(part.M), slopes(part)[-len(part.M) :, -len(part.M) :]
+    nv, rates = len(part.M), rate_matrix(part)[-len(part.M) :, -len(part.M) :]
     least = _ROUNDING * (np.abs(part.M) @ np.abs(rates)).diagonal()
     dragged = -(part.M @ rates).diagonal() > least
     names = [part.state_names[i - nv].removeprefix("qdot_m.") for i in np.flatnonzero(dragged)]

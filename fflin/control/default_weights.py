@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from scipy.linalg import eigh
 
-from fflin.analysis.mechanics import second_order, slopes
+from fflin.analysis.mechanics import rate_matrix, second_order
 from fflin.analysis.ranks import Noisy, null_space
 from fflin.analysis.reduction import (
     ignorable_wheels,
@@ -94,7 +94,7 @@ def default_weights(
 ) -> Weights:
     """Return weights with which a displaced robot comes back within the URDF's limits (10.7)."""
     m = len(lin.M)
-    N = slopes(lin)[:m, m:]
+    N = rate_matrix(lin)[:m, m:]
     if N.shape != lin.M.shape or not np.linalg.cond(N) < 1e8:
         raise InputError(
             f"the states of the model of '{lin.robot}' are not coordinates and their rates, which "
@@ -165,7 +165,7 @@ def _of_inertia(
         *_limits("effort", _efforts(lin), use, 2.0),
     ]
     limit, achieved = min(limits), ""
-    rate = slopes(lin)
+    rate = rate_matrix(lin)
     loaded = rate[m:].any() or rate[:m, :m].any()
     if loaded:
         grows = _growth(lin)
@@ -198,7 +198,7 @@ def _on_velocities(
     lin: LinearModel, S: Array, cost: Array, least: Array, damped: bool
 ) -> Callable[[float], Array]:
     """Return the weight (m, m) on velocities of (10.8), for a bandwidth."""
-    m, X = len(lin.M), slopes(lin)
+    m, X = len(lin.M), rate_matrix(lin)
     size = np.sqrt(least)
     values, directions = np.linalg.eigh((S / cost) @ S.T / np.outer(size, size))
     root = size[:, None] * directions * np.sqrt(values.clip(_LEAST_REACH))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.analysis.mechanics import slopes
+from fflin.analysis.mechanics import rate_matrix
 from fflin.analysis.reduction import regulated_part, selection
 from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
@@ -340,7 +340,7 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
             raise np.linalg.LinAlgError("the weights are too badly scaled")
     except np.linalg.LinAlgError as error:
         # The closed form is for double integrators alone.
-        forces = slopes(lin)[len(lin.M) - len(lin.A) :].any()
+        forces = rate_matrix(lin)[len(lin.M) - len(lin.A) :].any()
         raise StabilizabilityError(
             f"no stabilising solution of the Riccati equation was found: {error}; scale the "
             f"weights, for example with bryson{'' if forces else ', or use acceleration_lqr'}"

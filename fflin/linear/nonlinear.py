@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 from copy import copy
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
@@ -115,7 +115,9 @@ class ErrorDynamics(Nonlinear):
         )
 
 
-def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None) -> Array:
+def outputs(
+    robot: Robot, lin: LinearModel, q: Array, v: Array | None = None, u: Array | None = None
+) -> Array:
     """Return the outputs y of a robot in the coordinates of a linear model.
 
     - Attitudes are in the model's chart, with q0 >= 0.
@@ -171,7 +173,9 @@ def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None
     return Measuring(state, lin.q)(x, at, moving, a)
 
 
-def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Any) -> Array:
+def jacobian(
+    f: Callable[[Array], Array], point: Array, steps: Array, is_curved: NDArray[np.bool_]
+) -> Array:
     """Return the Jacobian of f, a function of rows, by central differences of the given steps."""
     curved, straight = np.diag(steps)[is_curved], np.diag(steps)[~is_curved]
     offsets = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))

@@ -47,7 +47,7 @@ TOOLS = {
 }
 
 
-class Slopes(NamedTuple):
+class Jacobians(NamedTuple):
     """Derivatives of coordinates x' and inputs u' at a point, over y (15.1) and u in base axes."""
 
     P: Array  # of x' over y (15.2)
@@ -177,7 +177,7 @@ class ToolCoordinates:
         """Return the derivatives (6, 3) over a rotation of world-fixed vectors, base axes (4.4)."""
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
-    def slopes(self, q: Array, nu: Array, u: Array, rates: Array) -> Slopes:
+    def jacobians(self, q: Array, nu: Array, u: Array, rates: Array) -> Jacobians:
         """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) in base axes."""
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
         here, R_now = self._attitude(q)
@@ -221,7 +221,7 @@ class ToolCoordinates:
         H[:, :3] = (
             wrench.T @ X.T @ self._held(np.linalg.solve(X.T, wrench @ u)) @ X[ANGULAR, ANGULAR]
         )
-        return Slopes(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
+        return Jacobians(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
