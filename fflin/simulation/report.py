@@ -225,6 +225,40 @@ def motion_report(motion: Any) -> str:
     return "\n".join(parts)
 
 
+def motion_record(motion: Any) -> dict[str, Any]:
+    """Return the figures of the report by name."""
+    t = motion.t
+    errors = {
+        each.title: {
+            "unit": each.unit,
+            "initial": each.size[0],
+            "largest": each.size.max(),
+            "final": each.size[-1],
+            "settled": None if each.late else t[each.settled],
+        }
+        for each in courses(motion)
+    }
+    return {
+        "stopped": motion.stopped,
+        "duration": t[-1],
+        "rows": len(t),
+        "frame": motion.frame,
+        "engine": motion.engine,
+        "errors": errors,
+        "state_names": motion.state_names,
+        "state_units": motion.state_units,
+        "x": motion.x[-1],
+        "input_names": motion.input_names,
+        "input_units": motion.input_units,
+        "largest_inputs": np.abs(motion.u).max(axis=0),
+        "limits_exceeded": motion.passed,
+        "saturated": motion.saturated,
+        "energy": motion.energy[[0, -1]],
+        "momentum_drift": motion.momentum_drift.max(),
+        "notes": motion.notes,
+    }
+
+
 def _phases(motion: Any) -> list[list[str]]:
     """Return the table of phases; a motion from a file does not know the impacts before them."""
     table = [["phase", "", "t [s]", "energy [J]", "|p| [N s]", "|h| [N m s]"]]
