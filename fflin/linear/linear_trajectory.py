@@ -120,7 +120,7 @@ class LinearTrajectory(Trajectory):
 
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
         """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), as `matrices` does at one."""
-        placements = [placed(self.t, t) for t in times.tolist()]
+        placements = [interval_of(self.t, t) for t in times.tolist()]
         knot = np.array([k + (share == 1.0) for k, share in placements])
         inside = np.array([0.0 < share < 1.0 for _, share in placements])
         A, B = self.A[knot], self.B[knot]
