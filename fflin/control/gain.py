@@ -17,11 +17,11 @@ from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array
 from fflin.control.margins import Margins, input_margins
-from fflin.control.riccati import rates_of
+from fflin.control.optimal.riccati import rates_of
 from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
-    from fflin.control.riccati import Solution
+    from fflin.control.optimal.riccati import Solution
     from fflin.linear.exchange import ToolGain
 
 # A larger gain, of more than three joints, is shown by the norms of its blocks.

@@ -16,7 +16,7 @@ from fflin.base.record import Design
 from fflin.base.validation import Array, dimension
 from fflin.control.gain import Gain, titled
 from fflin.control.lqr import require_fixed_point
-from fflin.control.riccati import solve
+from fflin.control.optimal.riccati import solve
 from fflin.control.weights import Weight, columns, weight
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel, state_space

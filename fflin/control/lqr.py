@@ -16,7 +16,7 @@ from fflin.base.errors import EquilibriumError, FflinWarning, InputError, Stabil
 from fflin.base.validation import Array, dimension
 from fflin.control.default_weights import rule_weights
 from fflin.control.gain import Gain, make_gain
-from fflin.control.riccati import Riccati, Solution, half_size, solve
+from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve
 from fflin.control.weights import Weight, cost_weights, weight
 from fflin.linear.model import LinearModel
 
