@@ -151,8 +151,9 @@ def _range(text: str) -> tuple[str, Any]:
 
 
 def _analyze(arguments: argparse.Namespace) -> Report:
-    from fflin.analysis.controllability import controllability, observability
+    from fflin.analysis.controllability import controllability
     from fflin.analysis.modes import modes
+    from fflin.analysis.observability import observability
 
     _, lin = linear_model(arguments)
     moved, shown, found = controllability(lin), observability(lin), modes(lin)
