@@ -14,7 +14,6 @@ from fflin.control.channel import channel_of
 from fflin.control.linear_controller import LinearController, measured_at
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
-from fflin.dynamics.points import LARGEST_SPEED
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, conservation, forward, loop, policies
 from fflin.kernel.arguments import empty, laid_out, words_of
@@ -25,7 +24,8 @@ from fflin.robot.limits import limits_of
 from fflin.simulation.conservation import Conserved, MomentumReference
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant, triads
-from fflin.simulation.times import LARGEST_TURN, Times
+from fflin.simulation.run import stop_conditions
+from fflin.simulation.times import Times
 
 SLOTS = 128  # samples whose noise is there at a time, and steps of a campaign
 _MEMORY = 2**22  # [bytes] of rows that are there at a time
@@ -34,17 +34,16 @@ _MEMORY = 2**22  # [bytes] of rows that are there at a time
 def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.Arguments:
     """Return what `kernel.loop.advance` reads of a plan whose policy and method it knows."""
     h, state, method = plan.times.dt, plant.state, plan.method
-    size, (way, speed) = 6 + state.robot.n, method.shares(h)
+    size, (shift, speed) = 6 + state.robot.n, method.shares(h)
     start = MomentumReference(conserved, method, h, plan.q, plan.v)
-    squares = np.full(state.robot.nv, LARGEST_SPEED**2)
-    squares[plan.turning] = (LARGEST_TURN / h) ** 2
+    stop = stop_conditions(plan)
     mechanics = mechanics_of(plant, tree)
     return loop.Arguments(
         robot=mechanics,
         method=loop.Method(
             h=h,
             origin=method.origins,
-            way=way.ravel(),
+            shift=shift.ravel(),
             speed=speed.ravel(),
             nodes=np.minimum(np.array(method.nodes) * h, plan.last_node * h),
             weights=np.array(method.weights) * h,
@@ -64,10 +63,7 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.A
         ),
         project=plan.project,
         pushed=not plant.isolated(driven=plan.law is not None),
-        stop=loop.StopConditions(
-            squares=state.velocities(squares),
-            sign=np.array([np.sign(plan.chart.scalar(plan.q)) if plan.chart else 0.0]),
-        ),
+        stop=stop._replace(squares=state.velocities(stop.squares)),
         point=forward.Point(
             q=plan.q,
             nu=state.velocities(plan.v),
@@ -283,7 +279,7 @@ def _path(path: policies.Path, plan: Plan, policy: Any, asking: Plant) -> polici
     if type(policy) is not TrajectoryFeedback:
         return path
     motion, schedule = policy.trajectory, policy.schedule
-    way, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
+    shift, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
     q, u = list(motion.q), list(motion.u)
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
     held = _places([each.start for each in motion.flow.held])
@@ -304,7 +300,7 @@ def _path(path: policies.Path, plan: Plan, policy: Any, asking: Plant) -> polici
         t=np.array(motion.t),
         q=np.concatenate(q),
         u=np.concatenate(u),
-        way=way,
+        shift=shift,
         speed=speed,
         hold=motion.hold == "previous",
         ahead=policy.ahead,
