@@ -10,7 +10,7 @@ import numpy as np
 from fflin.analysis.mechanics import floating_inertia
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, grid, width
-from fflin.base.validation import Array, FrozenArrays
+from fflin.base.validation import Array, FrozenArrays, instance
 from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
@@ -145,8 +145,7 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     >>> bool(abs(parts - found.total).max() < 1e-9)
     True
     """
-    if not isinstance(lin, LinearModel):
-        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     lin.require_unchanged()
     robot = lin._robot
     if robot is None or len(lin.M) != 6 + robot.n:

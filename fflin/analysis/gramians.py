@@ -1,13 +1,13 @@
 """Controllability and observability Gramians."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, FrozenArrays, number
+from fflin.base.validation import Array, FrozenArrays, instance, number
 from fflin.linear.model import LinearModel
+from fflin.linear.sampling import held_cost
 
 # A pole that decays less, relative to the fastest, may be one at zero that rounding moved.
 _DECAY = 1e-7
@@ -82,8 +82,7 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     >>> fflin.gramians(lin, duration=10.0).controllability.shape
     (18, 18)
     """
-    if not isinstance(lin, LinearModel):
-        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     pairs = ((lin.A, lin.B), (lin.A.T, lin.C.T))
     if duration is None:
         _require_decay(lin)
@@ -130,32 +129,3 @@ def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
         Q, A = Q + A @ Q @ A.T, A @ A
         steps >>= 1
     return total
-
-
-def held_cost(F: Array, W: Array, h: float) -> Array:
-    """Return the integral of e^(F' t) W e^(F t) over [0, h]."""
-    # The exponential rounds relative to its largest block, so that W is scaled to the size of F.
-    square = F @ F
-    if not (square @ F).any():
-        total, step = np.zeros_like(W), np.float64(h)
-        terms = (np.eye(len(F)), F, 0.5 * square)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for i, left in enumerate(terms):
-                for j, right in enumerate(terms):
-                    total += left.T @ W @ right * (step ** (i + j + 1) / (i + j + 1))
-            return 0.5 * (total + total.T)
-    from scipy.linalg import expm
-
-    n = len(F)
-    doublings = math.ceil(math.log2(max(2.0 * h * float(np.linalg.norm(F, 1)), 1.0)))
-    block = np.zeros((2 * n, 2 * n))
-    size = float(np.linalg.norm(W, 1)) / float(np.linalg.norm(F, 1)) or 1.0
-    block[:n, :n], block[:n, n:], block[n:, n:] = -F.T, W / size, F
-    with np.errstate(over="ignore", invalid="ignore"):
-        exponential = expm(block * (h / 2**doublings))
-        step = exponential[n:, n:]
-        total = step.T @ exponential[:n, n:]
-        for _ in range(doublings):
-            total = total + step.T @ total @ step
-            step = step @ step
-        return 0.5 * size * (total + total.T)

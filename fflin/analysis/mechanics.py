@@ -21,7 +21,7 @@ from fflin.analysis.ranks import (
     without_rounding,
 )
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, instance
 from fflin.linear.model import LinearModel
 
 # Springs or dampers with a larger relative asymmetry are not symmetric.
@@ -39,8 +39,7 @@ _SLOWEST = 3e-6
 
 def checked(lin: LinearModel) -> LinearModel:
     """Return a model whose state is positions and their rates, or raise `InputError`."""
-    if not isinstance(lin, LinearModel):
-        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     lin.require_unchanged()
     nx = len(lin.A)
     if lin.M.shape != (nx // 2, nx // 2) or nx % 2:

@@ -14,7 +14,7 @@ from fflin.analysis.eigenpairs import natural_modes
 from fflin.analysis.reduction import ReducedModel
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, grid, width
-from fflin.base.validation import Array, FrozenArrays
+from fflin.base.validation import Array, FrozenArrays, instance
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
@@ -294,8 +294,7 @@ def modes(lin: LinearModel) -> Modes:
     >>> found.rigid_body, found.frequencies.round(1)
     (13, array([0.9, 1.2]))
     """
-    if not isinstance(lin, LinearModel):
-        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     lin.require_unchanged()
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous model")

@@ -35,7 +35,7 @@ _ROUNDING = 1e-9
 _DRIFT = 1e-9
 
 
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, init=False, kw_only=True)
 class ReducedModel(LinearModel):
     """Linear model reduced to the coordinates on which inputs, springs and dampers act.
 

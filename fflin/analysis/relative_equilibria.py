@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, SingularInertiaError
 from fflin.base.tables import grid
-from fflin.base.validation import Array, FrozenArrays
+from fflin.base.validation import Array, FrozenArrays, instance
 from fflin.dynamics.names import frame_of
 from fflin.dynamics.orbital import field_of, mean_motion
 from fflin.robot.joints import ROOT
@@ -135,8 +135,7 @@ def relative_equilibria(
     >>> len(found), found[0].stable
     (24, True)
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+    instance("robot", robot, Robot, "a fflin.Robot")
     field = field_of(robot, frame_of(robot, frame))
     if field is None:
         raise InputError(

@@ -328,7 +328,7 @@ class LinearBatch(FrozenArrays):
         rows["y0"] = rows.pop("_y0", rows["x0"])
         if self._reference is None:
             rows["_reference"] = _in_world(root, rows["q"][:7])
-        return LinearModel.from_fields({**common, **rows, **self._asked})
+        return LinearModel({**common, **rows, **self._asked})
 
     def _states_at_rest(self, q: Array) -> Array:
         q_m = positions(q, self.columns)

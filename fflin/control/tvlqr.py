@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from fflin.analysis.gramians import held_cost
 from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import DetectabilityError, EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
@@ -28,7 +27,7 @@ from fflin.linear.equilibrium import equilibrium
 from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import HEAVY, LIGHT
+from fflin.linear.sampling import HEAVY, LIGHT, held_cost
 from fflin.linear.trajectory import Trajectory
 
 

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.analysis.gramians import held_cost
 from fflin.base.errors import InputError
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import Array, dimension, instance, number, vector
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
+from fflin.linear.sampling import held_cost
 
 Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 

@@ -1,6 +1,6 @@
 """Check of A and B against ABA derivatives and against differences of the nonlinear model."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -8,8 +8,9 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.tables import folded, grid, width
-from fflin.base.validation import Array, share
+from fflin.base.validation import Array, instance, share
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.names import Groups
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
@@ -50,78 +51,38 @@ class Row(NamedTuple):
         return self.error <= self.tolerance
 
 
-def check_report(every: tuple[Row, ...], title: str) -> str:
-    """Show the verdict of a check, a table of blocks, and the single figures."""
-    states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
-    blocks = [row.block for row in every]
-    inputs = dict.fromkeys(b[:-1].split(", ")[1] for b in blocks if b.startswith("B["))
-    parts = [_verdict(every), folded([f"{title}, {len(every)} figures"])]
-    columns = {f"A[{{}}, {each}]": each for each in states}
-    columns |= {f"B[{{}}, {each}]": each for each in inputs}
-    found: dict[str, dict[str, Row]] = {
-        route: {row.block: row for row in every if row.test == test}
-        for test, route in _ROUTES.items()
-    }
-    allowed = []
-    for test, route in _ROUTES.items():
-        tolerance = next(iter(found[route].values())).tolerance
-        allowed.append(f"{route}: {test} (allowed {tolerance:.1e})")
-    body = [
-        [route, state, *(_error(rows[key.format(state)]) for key in columns)]
-        for route, rows in found.items()
-        for state in states
-        if any(rows[key.format(state)].error for key in columns)
-    ]
-    if not body:
-        said = f"A and B compared with {' and '.join(_ROUTES)}: no difference in any of "
-        parts.append(folded([f"{said}{len(states) * len(columns)} blocks"]))
-    else:
-        heads = [["", "", *columns.values()], *body]
-        said = f"relative errors of the blocks of A and B compared with {', '.join(allowed)}; "
-        said += "a dot is an error of exactly zero"
-        parts.append(f"{folded([said])}\n\n{_fitted(heads, 2 + len(states))}")
-    single = [row for row in every if row.test not in _ROUTES]
-    rest = [["figure", "error", "allowed"]]
-    rest += [[f"{r.test}: {r.block}", _error(r), f"{r.tolerance:.1e}"] for r in single if r.error]
-    if rest[1:]:
-        parts.append(grid(rest, "l"))
-    exact: dict[str, list[str]] = {}
-    for row in single:
-        if not row.error:
-            exact.setdefault(row.test, []).append(row.block)
-    if exact:
-        said = "; ".join(f"{test} {', '.join(each)}" for test, each in exact.items())
-        parts.append(folded([f"without any error: {said}"]))
-    return "\n\n".join(parts)
-
-
 # The independent computations that A and B are compared with, and the rows of each.
 _ROUTES = {"ABA derivatives": "ABA", "differences": "diff"}
 
 
-def _verdict(every: tuple[Row, ...]) -> str:
-    failures = [row for row in every if not row.ok]
-    if not failures:
-        largest = max(every, key=lambda row: row.error)
-        said = f"largest error {largest.error:.1e} (allowed {largest.tolerance:.1e})"
-        return folded([f"A and B hold: {said}"])
-    names = [f"{row.block} ({row.test})" for row in failures[:6]]
-    names += ["..."] * (len(failures) > 6)
-    said = f"{len(failures)} of {len(every)} figures FAILED"
-    return folded([f"A and B do not hold: {said}: {', '.join(names)}"])
-
-
-def _fitted(rows: list[list[str]], split: int) -> str:
-    """Show a table, or its columns from `split` on below where it is too wide."""
-    table = grid(rows, "ll")
-    if max(map(len, table.splitlines())) <= width():
-        return table
-    halves = [row[:split] for row in rows], [[*row[:2], *row[split:]] for row in rows]
-    tables = []
-    for head, *body in halves:
-        errors = [row for row in body if any(cell != "." for cell in row[2:])]
-        tables.append(grid([head, *errors], "ll"))
-    return "\n\n".join(tables)
+def _block_table(every: Sequence[Row]) -> str:
+    """Show the errors of the blocks of A and B, one row for each state and computation."""
+    cells: dict[tuple[str, str], dict[str, Row]] = {}
+    allowed: dict[str, str] = {}
+    for row in every:
+        state, column = row.block[2:-1].split(", ")
+        route = _ROUTES[row.test]
+        cells.setdefault((route, state), {})[column] = row
+        allowed[route] = f"{route}: {row.test} (allowed {row.tolerance:.1e})"
+    body = [
+        [*key, *map(_error, found.values())]
+        for key, found in cells.items()
+        if any(row.error for row in found.values())
+    ]
+    if not body:
+        said = f"A and B compared with {' and '.join(_ROUTES)}: no difference in any of "
+        return folded([f"{said}{len(every) // len(_ROUTES)} blocks"])
+    said = f"relative errors of the blocks of A and B compared with {', '.join(allowed.values())}; "
+    said += "a dot is an error of exactly zero"
+    heads, split = ["", "", *next(iter(cells.values()))], 2 + len(Groups._fields)
+    tables = [grid([heads, *body], "ll")]
+    if max(map(len, tables[0].splitlines())) > width():  # the columns of B below those of A
+        halves = [[row[:split] for row in body], [[*row[:2], *row[split:]] for row in body]]
+        tables = [
+            grid([head, *(row for row in half if any(cell != "." for cell in row[2:]))], "ll")
+            for head, half in zip((heads[:split], ["", "", *heads[split:]]), halves, strict=True)
+        ]
+    return "\n\n".join((folded([said]), *tables))
 
 
 def _error(row: Row) -> str:
@@ -187,7 +148,30 @@ class Check:
         return tuple(row for row in self.rows if not row.ok)
 
     def __str__(self) -> str:
-        return check_report(self.rows, self.title)
+        """Show the verdict, a table of blocks, and the single figures."""
+        if failures := self.failures:
+            names = [f"{row.block} ({row.test})" for row in failures[:6]]
+            names += ["..."] * (len(failures) > 6)
+            said = f"{len(failures)} of {len(self.rows)} figures FAILED: {', '.join(names)}"
+            verdict = f"A and B do not hold: {said}"
+        else:
+            largest = max(self.rows, key=lambda row: row.error)
+            said = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
+            verdict = f"A and B hold: largest error {said}"
+        title = f"{self.title}, {len(self.rows)} figures"
+        blocks = [row for row in self.rows if row.test in _ROUTES]
+        parts = [folded([verdict]), folded([title]), _block_table(blocks)]
+        rest, exact = [["figure", "error", "allowed"]], list[str]()
+        for row in self.rows[len(blocks) :]:
+            if row.error:
+                rest.append([f"{row.test}: {row.block}", _error(row), f"{row.tolerance:.1e}"])
+            else:
+                exact.append(f"{row.test}: {row.block}")
+        if rest[1:]:
+            parts.append(grid(rest, "l"))
+        if exact:
+            parts.append(folded([f"without any error: {', '.join(exact)}"]))
+        return "\n\n".join(parts)
 
 
 def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> Check:
@@ -231,8 +215,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     >>> found.ok, found.max_error < 1e-6
     (True, True)
     """
-    if not isinstance(lin, LinearModel):
-        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     if lin.dt:
         raise InputError(
             f"the model is sampled at dt = {lin.dt:g} s; check the continuous-time model instead"
@@ -269,21 +252,30 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     rows = [
         Row("ABA derivatives", *block, by_aba) for block in compare(state, actuation, lin, M, A, B)
     ]
-    steps, rounding = difference_steps(state, lin, M), _STEP_ULPS * _EPS / difference
-    A, B = _differences(model, lin, M, steps)
+    (steps, input_steps), nx = difference_steps(state, lin, M), state.nx
+    # f is curved in the attitude and the joints alone.
+    bends = np.zeros(nx + len(input_steps), dtype=bool)
+    bends[state.groups.q_b] = bends[state.groups.q_m] = True
+    point, every = np.concatenate((lin.x0, lin.u0)), np.concatenate((steps, input_steps))
+    slopes = jacobian(lambda rows: model.rates(rows[:, :nx], rows[:, nx:]), point, every, bends)
+    A, B, rounding = slopes[:, :nx], slopes[:, nx:], _STEP_ULPS * _EPS / difference
     rows += [
         Row("differences", *block, difference)
-        for block in compare(state, actuation, lin, M, A, B, steps=steps[0], rounding=rounding)
+        for block in compare(state, actuation, lin, M, A, B, steps=steps, rounding=rounding)
     ]
-    rows += _output_rows(model, lin, M, difference)
+    rows += _output_rows(model, lin, (steps, input_steps), difference)
     rows.append(Row("flow", "f", flow_error(model, lin), difference))
     rows += [Row("point", name, error, route) for name, error in _point_errors(model, lin, M, q, v)]
     rows.append(Row("inertia", "M", _relative(lin.M, M, floor=0.0), route))
-    inverse = inverse_inertia(state, lin)
-    if model.aba.actuation.default:
-        inverse = lin.B[-len(M) :]  # all of it stands in B
+    # With the default inputs M^-1 is the lower half of B.
+    inverse = lin.B[-len(M) :] if actuation.default else inverse_inertia(state, lin)
     rows.append(Row("inertia", "M M^-1 = I", inertia_residual(M, inverse), route))
-    rows += [Row("inertia", name, error, 1e-12) for name, error in _positive_definite(inverse)]
+    scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
+    scaled = scale[:, None] * inverse * scale
+    asymmetry = float(np.abs(scaled - scaled.T).max())
+    least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
+    rows.append(Row("inertia", "M^-1 symmetric", asymmetry, 1e-12))
+    rows.append(Row("inertia", "M^-1 positive", max(0.0, -least), 1e-12))
     return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}")
 
 
@@ -321,20 +313,9 @@ def _point_errors(
     return errors
 
 
-def _differences(
-    model: Nonlinear, lin: LinearModel, M: Array, steps: tuple[Array, Array]
-) -> tuple[Array, Array]:
-    """Return A and B by central differences of the nonlinear model."""
-    step, push = steps
-    bends = np.arange(len(step)) < len(step) - len(M)
-    bends[model.state.groups.r_b] = False
-    nx, point = len(step), np.concatenate((lin.x0, lin.u0))
-    every, bends = np.concatenate((step, push)), np.concatenate((bends, push < 0.0))
-    slopes = jacobian(lambda rows: model.rates(rows[:, :nx], rows[:, nx:]), point, every, bends)
-    return slopes[:, :nx], slopes[:, nx:]
-
-
-def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:
+def _output_rows(
+    model: Nonlinear, lin: LinearModel, steps: tuple[Array, Array], tolerance: float
+) -> list[Row]:
     """Rows of C, D and y0 against differences of what the nonlinear model measures."""
     state = model.state
     outputs = (lin.output_names, lin.output_units)
@@ -352,7 +333,7 @@ def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float)
     def y(x: Array, u: Array) -> Array:
         return measuring(x, *model.acceleration(x, u))
 
-    step_x, step_u = difference_steps(model.state, lin, M)
+    step_x, step_u = steps
     here = y(lin.x0, lin.u0)
     of_x, of_u = (np.ones(len(each), dtype=bool) for each in (step_x, step_u))
     C = jacobian(lambda rows: np.array([y(x, lin.u0) for x in rows]), lin.x0, step_x, of_x)
@@ -373,12 +354,3 @@ def _relative(given: Array, expected: Array, floor: float = 1.0) -> float:
     if not given.size:
         return 0.0
     return float(np.abs(given - expected).max() / max(floor, float(np.abs(expected).max())))
-
-
-def _positive_definite(inverse: Array) -> list[tuple[str, float]]:
-    """Asymmetry of M^-1, and how far its least eigenvalue is below zero."""
-    scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
-    scaled = scale[:, None] * inverse * scale
-    asymmetry = float(np.abs(scaled - scaled.T).max())
-    least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
-    return [("M^-1 symmetric", asymmetry), ("M^-1 positive", max(0.0, -least))]

@@ -14,7 +14,7 @@ from fflin.base.validation import Array, as_double, instance, number, vector
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, StateSpace
 from fflin.linear.sampling import held_exponential
 from fflin.linear.tool_coordinates import Slopes, ToolCoordinates, tool_coordinates
 from fflin.robot.robot import Robot
@@ -23,7 +23,7 @@ _ROUNDING = 1e-12  # of the largest entry, by which another route to a matrix ma
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ToolModel(Design):
+class ToolModel(StateSpace, Design):
     r"""Linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The state x holds q and v of the tool. If q is on a manifold (mujoco, pinocchio, spart), x holds
@@ -61,21 +61,6 @@ class ToolModel(Design):
 
     tool: str
     robot: str
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    f0: Array
-    x0: Array
-    u0: Array
-    y0: Array
-    dt: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    output_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    input_units: tuple[str, ...]
-    output_units: tuple[str, ...]
     T: Array
     T_left: Array
     T_u: Array

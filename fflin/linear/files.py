@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -35,10 +37,11 @@ _LATER: Record = {"ignorable": (), "drift": (), "limit_names": (), "limits": ()}
 _LATER |= {"weights": "{}", "mean_motion": 0.0}
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
 _FIGURES = ("dt", "moving", "mean_motion")
-_CERTIFICATE = ("condition", "inertia_residual", "route_A", "route_B", "f0")
 
 # Of csv, the last of which has the digest of all.
 _TABLES = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "point", "info")
+
+T = TypeVar("T")
 
 FORMATS = (*record.FORMATS, ".csv")
 
@@ -54,7 +57,7 @@ def record_of(lin: Any) -> Record:
     entries |= {key: getattr(lin, key) for key in _TEXTS[:-1]}
     entries["weights"] = json.dumps(dict(lin.weights))
     entries |= {key: float(getattr(lin, key)) for key in _FIGURES}
-    entries["certificate"] = {key: getattr(lin.certificate, key) for key in _CERTIFICATE}
+    entries["certificate"] = asdict(lin.certificate)
     return entries
 
 
@@ -71,14 +74,13 @@ def write_model(path: Path, entries: Record, *, sealed: bool) -> None:
     write_whole({_csv_path(path, key): content for key, content in contents.items()})
 
 
-def read_model(path: Path) -> tuple[dict[str, Any], dict[str, float]]:
+def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, Any], T]:
     """Return the fields of a model, and its certificate; see `LinearModel.load`."""
     check_ending(path, FORMATS)
     with record.reading(path, "linear model"):
         entries, verified = _from_csv(path) if path.suffix == ".csv" else record.read_record(path)
         fields = _fields(_LATER | entries)
-        certificate = {key: figures(entries["certificate"])[key] for key in _CERTIFICATE}
-        return fields | {"verified": verified}, certificate
+        return fields | {"verified": verified}, certificate(**figures(entries["certificate"]))
 
 
 def _fields(entries: Record) -> dict[str, Any]:

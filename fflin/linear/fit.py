@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, instance
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.state import StateMap
@@ -114,8 +114,7 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
     """
     if not hasattr(gain, "K") or not hasattr(gain, "state_names"):
         raise InputError(f"gain is a {type(gain).__name__}, expected a Gain or GainBatch")
-    if not isinstance(lin, LinearModel):
-        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     for key in ("frame", "dt"):
         own, other = getattr(gain, key, lin.dt), getattr(lin, key)
         if own != other:

@@ -61,7 +61,7 @@ class Prepared:
         at_rest = partial(_state_at_rest, self.map)
         asked = {"x0": at_rest, "y0": at_rest, "_reference": partial(own_reference, self.robot)}
         other = {} if self.own_reference else {"_reference": self.reference}
-        return {**self.common, **self.rest, "_when_asked": asked, **other}
+        return {**self.common, **self.rest, "_computed": asked, **other}
 
     def kernel(self) -> RowRates:
         """Return the compiled accelerations; `InputError` if the robot has none."""
@@ -331,7 +331,7 @@ class Linearizer:
         self._accelerations.invert(q, B[self._lower])
         B.setflags(write=False)
         q.setflags(write=False)
-        return LinearModel.from_fields(self._fields | {"B": B, "q": q})
+        return LinearModel(self._fields, B=B, q=q)
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         ready, lower = self.prepared, self._lower
@@ -359,7 +359,7 @@ class Linearizer:
             made["u0"] = u
         for array in made.values():
             array.setflags(write=False)
-        return LinearModel.from_fields(self._fields | made)
+        return LinearModel(self._fields, **made)
 
     def along(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
         """Return A, B, C, D and y (N, ..) about rows of valid points, with u in base axes.

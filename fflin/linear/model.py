@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError, MissingPackageError
-from fflin.base.validation import Array, FrozenArrays, number
+from fflin.base.validation import Array, FrozenArrays, frozen, number
 from fflin.linear.sampling import held_exponential
 
 if TYPE_CHECKING:
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from fflin import ToolModel
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
-
-_new, _set = object.__new__, object.__setattr__
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,28 @@ class Certificate:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearModel(FrozenArrays):
+class StateSpace(FrozenArrays):
+    """Matrices of a linear model about a point, with names and units of its signals."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    f0: Array
+    x0: Array
+    u0: Array
+    y0: Array
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, repr=False, init=False)
+class LinearModel(StateSpace):
     r"""Linear model about a point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The output is ``y = y0 + C (x - x0) + D (u - u0)``. If ``dt > 0``, the left side is ``x - x0``
@@ -119,21 +138,6 @@ class LinearModel(FrozenArrays):
     (0.0, 0.1)
     """
 
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    f0: Array
-    x0: Array
-    u0: Array
-    y0: Array
-    dt: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    output_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    input_units: tuple[str, ...]
-    output_units: tuple[str, ...]
     frame: Frame
     moving: bool
     q: Array
@@ -157,18 +161,18 @@ class LinearModel(FrozenArrays):
     _robot: Robot | None = None  # that it was made of; None where it is from a file
     mean_motion: float = 0.0
 
-    @classmethod
-    def from_fields(cls, values: dict[str, Any]) -> LinearModel:
-        """Return a model made from its fields; fields in ``_when_asked`` are functions of q."""
-        # The generated __init__ sets two dozen frozen fields one by one, which takes as long
-        # as the dynamics of a small robot.
-        lin = _new(cls)
-        _set(lin, "__dict__", values)
-        return lin
+    def __init__(self, shared: Mapping[str, Any] | None = None, /, **fields: Any) -> None:
+        # The __init__ of a dataclass sets three dozen frozen fields one by one, which takes as long
+        # as the dynamics of a small robot. Most of them are `shared` by the models of a robot.
+        for name, value in fields.items():
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                fields[name] = frozen(value.copy())
+        vars(self).update(shared or {}, **fields)
 
     def __getattr__(self, name: str) -> Any:
-        # At rest some fields take as long to make as the dynamics, so they wait until asked for.
-        make = vars(self).get("_when_asked", {}).get(name)
+        # `shared` may hold {field: function of q} for fields that are computed at first access,
+        # because they take as long as the dynamics.
+        make = vars(self).get("_computed", {}).get(name)
         if make is None:
             raise AttributeError(f"'LinearModel' object has no attribute '{name}'")
         return vars(self).setdefault(name, make(self.q))
@@ -403,8 +407,8 @@ class LinearModel(FrozenArrays):
         from fflin.base.writing import as_path
         from fflin.linear.files import given, read_model
 
-        values, certificate = read_model(as_path(path))
-        lin = LinearModel(**values, _certify=partial(given, Certificate(**certificate)))
+        values, certificate = read_model(as_path(path), Certificate)
+        lin = LinearModel(**values, _certify=partial(given, certificate))
         return replace(lin, _certify=partial(same_certificate, lin, lin.fingerprint))
 
 

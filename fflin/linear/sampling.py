@@ -1,5 +1,7 @@
 """Exact solution of a linear model over a sample, with its input held constant."""
 
+import math
+
 import numpy as np
 
 from fflin.base.validation import Array
@@ -35,3 +37,32 @@ def held_slopes(A: Array, driven: Array, h: float, dA: Array, d_driven: Array) -
     block[:n], along[:n] = np.hstack((A, driven)) * h, np.hstack((dA, d_driven)) * h
     slope = expm_frechet(block, along, compute_expm=False)
     return slope[:n, :n], slope[:n, n:]
+
+
+def held_cost(F: Array, W: Array, h: float) -> Array:
+    """Return the integral of e^(F' t) W e^(F t) over [0, h]."""
+    # The exponential rounds relative to its largest block, so that W is scaled to the size of F.
+    square = F @ F
+    if not (square @ F).any():
+        total, step = np.zeros_like(W), np.float64(h)
+        terms = (np.eye(len(F)), F, 0.5 * square)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, left in enumerate(terms):
+                for j, right in enumerate(terms):
+                    total += left.T @ W @ right * (step ** (i + j + 1) / (i + j + 1))
+            return 0.5 * (total + total.T)
+    from scipy.linalg import expm
+
+    n = len(F)
+    doublings = math.ceil(math.log2(max(2.0 * h * float(np.linalg.norm(F, 1)), 1.0)))
+    block = np.zeros((2 * n, 2 * n))
+    size = float(np.linalg.norm(W, 1)) / float(np.linalg.norm(F, 1)) or 1.0
+    block[:n, :n], block[:n, n:], block[n:, n:] = -F.T, W / size, F
+    with np.errstate(over="ignore", invalid="ignore"):
+        exponential = expm(block * (h / 2**doublings))
+        step = exponential[n:, n:]
+        total = step.T @ exponential[:n, n:]
+        for _ in range(doublings):
+            total = total + step.T @ total @ step
+            step = step @ step
+        return 0.5 * size * (total + total.T)

@@ -8,8 +8,8 @@ from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
 import fflin
-from fflin.analysis.gramians import held_cost
 from fflin.control.margins import largest_gain
+from fflin.linear.sampling import held_cost
 from tests.support.messages import any_wording
 from tests.support.robots import BUNDLED, random_point
 
