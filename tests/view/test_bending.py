@@ -10,6 +10,7 @@ import pytest
 import fflin
 from fflin.robot.robot import ROOT
 from fflin.view.mode_page import mode_page
+from fflin.view.panel import panel
 from fflin.view.playback import body_poses
 from fflin.view.shapes import shapes
 
@@ -81,3 +82,13 @@ def test_the_page_of_modes_plays_the_arrays():
     assert np.linalg.norm(swings, axis=-1).min() > 0.05  # [rad] relative to the bus
     # The slowest mode bends both arrays towards the same side, the next towards opposite sides.
     assert swings[0][0][0] * swings[0][1][0] < 0.0 < swings[1][0][0] * swings[1][1][0]
+
+
+def test_the_page_of_a_motion_plots_modal_amplitudes():
+    robot = fflin.load("inspector_flexible.toml", lock=["arm_*"])
+    q = fflin.configuration(robot, {"left_mode_1": 0.1})
+    motion = fflin.simulate(robot, q0=q, duration=2.0, dt=0.1)
+    found = panel(robot, motion, np.arange(len(motion.t)), np.zeros((0, robot.nq)))
+    chart = next(each for each in found["plots"] if each["title"] == "modal amplitudes")
+    assert chart["unit"] == "kg^0.5 m"
+    assert "left_mode_1" in {line["label"] for line in chart["lines"]}
