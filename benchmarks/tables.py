@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-RESULTS, README = ROOT / "benchmarks" / "results.md", ROOT / "README.md"
+RESULTS, README = (ROOT / "benchmarks" / name for name in ("results.md", "README.md"))
 BEGIN, END = "<!-- benchmarks: begin -->", "<!-- benchmarks: end -->"
 PACKAGES = (
     "pin",
@@ -101,7 +101,7 @@ def insert_in_readme(tables: Sequence[Table], command: str) -> None:
     before, _, rest = text.partition(BEGIN)
     _, found, after = rest.partition(END)
     if not found:
-        raise SystemExit(f"README.md has no '{BEGIN}' followed by '{END}'")
+        raise SystemExit(f"benchmarks/README.md has no '{BEGIN}' followed by '{END}'")
     shown = [table for table in tables if table.in_readme]
     body = "\n".join(
         textwrap.fill(f"{table.title}. {table.about}", 100)

@@ -25,6 +25,7 @@ extensions = [
     "executed",
     "from_code",
     "index_terms",
+    "notebooks",
 ]
 exclude_patterns = ["_*"]
 templates_path = ["_templates"]

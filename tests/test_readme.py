@@ -1,4 +1,4 @@
-"""The examples and commands of the README and of the first pages run."""
+"""The examples and commands of the README, of the first pages and of the command line run."""
 
 import re
 import shlex
@@ -12,6 +12,7 @@ import fflin
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+COMMANDS = (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8")
 
 
 def code_blocks(language, text=README):
@@ -31,7 +32,12 @@ def test_python_examples_run(tmp_path, page):
 
 
 def test_links_lead_somewhere():
-    for page in (ROOT / "README.md", *(ROOT / "docs").glob("**/*.md")):
+    pages = [
+        path
+        for folder in ("", "robots", "examples", "benchmarks", ".github")
+        for path in (ROOT / folder).glob("*.md")
+    ]
+    for page in (*pages, *(ROOT / "docs").glob("**/*.md")):
         prose = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
         for link in re.findall(r"\]\((?!http)([^)#]+)", prose):
             assert (page.parent / link).exists(), f"{page.name}: {link}"
@@ -40,10 +46,7 @@ def test_links_lead_somewhere():
 @pytest.mark.docs
 def test_commands_run(tmp_path):
     commands = [
-        shlex.split(line)
-        for block in code_blocks("sh")
-        for line in block.splitlines()
-        if line.startswith("fflin ")
+        shlex.split(line) for block in code_blocks("sh", COMMANDS) for line in block.splitlines()
     ]
     assert len(commands) >= 4
     for command in commands:
@@ -80,4 +83,4 @@ def test_every_bundled_robot_is_named():
 
     for name in fflin.list_robots():
         if find_robot(name).origin == "fflin":
-            assert f"`{name}`" in README
+            assert f"`{name}`" in (ROOT / "robots" / "README.md").read_text(encoding="utf-8")

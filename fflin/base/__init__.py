@@ -4,4 +4,4 @@ Errors, files and records, rotations, tables and figures, checks of arguments. I
 room.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
