@@ -17,6 +17,7 @@ from fflin.robot.robot import Robot
 from fflin.robot.urdf.links import read_pose
 from fflin.robot.urdf.reader import expand, first_xacro, read_document
 from fflin.robot.urdf.xml import Element, named, parse
+from fflin.view.bending import balls, bent_links
 from fflin.view.meshes import Color, load_mesh
 
 # Where a URDF names no colour.
@@ -72,6 +73,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         for element in root.find_all("material")
         if "name" in element.attributes and (color := _color(element)) is not None
     }
+    bent = bent_links(robot, root)
     missing: list[str] = []
     unreadable: list[str] = []
     odd: list[int] = []
@@ -82,10 +84,13 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         frame = robot.model.frames[frame_id]
         if frame.parentJoint < ROOT:
             continue
+        joint, at = frame.parentJoint, frame.placement
+        if bending := bent.get(frame.name):
+            joint, at = bending.node, bending.frame.actInv(at)
         for visual in link.find_all("visual"):
             try:
                 kind, size, mesh = _geometry(visual)
-                placement = frame.placement * _placement(visual)
+                placement = at * _placement(visual)
                 color, finish = _material(visual, colors, kind)
             except (ValueError, LookupError):
                 odd.append(visual.line)
@@ -101,7 +106,10 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
                 except ValueError:
                     unreadable.append(file.name)
                     continue
-            yield Shape(frame.parentJoint, kind, size, placement, color, finish, file)
+            yield Shape(joint, kind, size, placement, color, finish, file)
+    for joint, kind, size, position in balls(robot, bent):
+        sides = (size,) if kind == "sphere" else (size,) * 3
+        yield Shape(joint, kind, sides, pin.SE3(np.eye(3), position))
     if missing:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
         notes.append(
