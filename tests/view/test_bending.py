@@ -19,8 +19,7 @@ def posed(robot, q):
     """Return the placements in the world of the shapes of a robot at q."""
     poses = body_poses(robot, robot.create_data(), q)
     return [
-        pin.XYZQUATToSE3(poses[shape.joint - ROOT]) * shape.placement
-        for shape in shapes(robot)[0]
+        pin.XYZQUATToSE3(poses[shape.joint - ROOT]) * shape.placement for shape in shapes(robot)[0]
     ]
 
 
