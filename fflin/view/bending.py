@@ -81,19 +81,30 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
     return found
 
 
-def balls(robot: Robot, bent: dict[str, Bending]) -> list[tuple[int, str, float, Array]]:
+def node_of(frame: pin.Frame, bent: dict[str, Bending]) -> tuple[int, pin.SE3]:
+    """Return the Pinocchio joint whose node carries a link's frame, and the frame on this node."""
+    if bending := bent.get(frame.name):
+        return bending.node, bending.frame.actInv(frame.placement)
+    return frame.parentJoint, frame.placement
+
+
+def balls(
+    robot: Robot, bent: dict[str, Bending]
+) -> list[tuple[int, str, tuple[float, ...], Array]]:
     """Return Pinocchio joint, kind, size [m] and position of what stands for other appendages."""
-    found = []
+    found: list[tuple[int, str, tuple[float, ...], Array]] = []
     for item in robot.appendages:
         if isinstance(item, Slosh):
             joint = robot.model.getJointId(item.modes[1])
             lever = robot.model.inertias[joint].lever
-            found.append((joint, "sphere", _radius(item.mass), lever))
+            found.append((joint, "sphere", (_radius(item.mass),), lever))
         elif item.frame not in bent:
             bending = bendings(robot)[item.title]
             mass = float(np.square(item.participation[:3, 0]).sum())
-            kind = "sphere" if mass else "box"  # whose rotation is seen
-            found.append((bending.node, kind, _radius(mass or 1.0), bending.center))
+            size = _radius(mass or 1.0)
+            # The rotation of a box is seen.
+            kind, sides = ("sphere", (size,)) if mass else ("box", (size,) * 3)
+            found.append((bending.node, kind, sides, bending.center))
     return found
 
 

@@ -17,7 +17,7 @@ from fflin.robot.robot import Robot
 from fflin.robot.urdf.links import read_pose
 from fflin.robot.urdf.reader import expand, first_xacro, read_document
 from fflin.robot.urdf.xml import Element, named, parse
-from fflin.view.bending import balls, bent_links
+from fflin.view.bending import balls, bent_links, node_of
 from fflin.view.meshes import Color, load_mesh
 
 # Where a URDF names no colour.
@@ -84,9 +84,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         frame = robot.model.frames[frame_id]
         if frame.parentJoint < ROOT:
             continue
-        joint, at = frame.parentJoint, frame.placement
-        if bending := bent.get(frame.name):
-            joint, at = bending.node, bending.frame.actInv(at)
+        joint, at = node_of(frame, bent)
         for visual in link.find_all("visual"):
             try:
                 kind, size, mesh = _geometry(visual)
@@ -107,9 +105,10 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
                     unreadable.append(file.name)
                     continue
             yield Shape(joint, kind, size, placement, color, finish, file)
-    for joint, kind, size, position in balls(robot, bent):
-        sides = (size,) if kind == "sphere" else (size,) * 3
-        yield Shape(joint, kind, sides, pin.SE3(np.eye(3), position))
+    yield from (
+        Shape(joint, kind, size, pin.SE3(np.eye(3), position))
+        for joint, kind, size, position in balls(robot, bent)
+    )
     if missing:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
         notes.append(
