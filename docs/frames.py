@@ -8,12 +8,12 @@ within the joint limits starts with the base rotated about a random axis and dis
 import sys
 import warnings
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 import fflin
-from fflin.campaign.dispersions import Draws
-from fflin.campaign.settling import OUTCOMES, SettlingJob, checked_loop, settle
+from fflin.campaign.settling import OUTCOMES, checked_loop, settle, settling_runs
 
 FRAMES = ("hybrid", "local", "world")
 ROBOTS, TURNS, POSTURES = ("canadarm2", "ur5", "panda", "servicer_7dof"), (20, 60, 90, 120, 150), 10
@@ -30,11 +30,11 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
         lin = fflin.linearize(robot, q)
         loop = checked_loop(robot, lin, GAINS[design](lin))
         x = loop.displaced(np.random.default_rng(k), degrees, 0.5 * degrees / 90.0, 0.0)
-        x = (x - loop.state.to_state(lin.q, lin.v))[None]
+        x = (x - loop.start)[None]
         for frame in FRAMES:
             there = replace(loop, lin=replace(lin, frame=frame))
-            job = SettlingJob(there, False, None, 0.0, engine="python")
-            arrays = settle(job, lambda runs, *_, x=x: Draws(x, runs), np.arange(1))
+            runs_of = partial(settling_runs, there, False, None, 0.0)
+            arrays = settle(runs_of, lambda _, x=x: x, np.arange(1), "python")
             counts[frame] += OUTCOMES[int(arrays["outcome"][0])] == "settled"
     return "/".join(map(str, counts.values()))
 

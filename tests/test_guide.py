@@ -17,6 +17,7 @@ PAGES = sorted(path.stem for path in GUIDE.glob("*.md") if path.stem != "index")
 # Packages without which a page cannot run.
 NEEDS = {
     "controllers": "slycot",
+    "files": "pandas",
     "monte_carlo": "h5py",
     "sweeps": "h5py",
     "uncertain_models": "slycot",
@@ -108,7 +109,7 @@ def test_pages_are_short():
 @pytest.mark.docs
 @pytest.mark.skipif(not which("octave"), reason="needs Octave")
 def test_octave_reads_a_saved_model(tmp_path):
-    [block] = re.findall(r"^```matlab\n(.*?)^```", read("files"), re.DOTALL | re.MULTILINE)
+    block, _ = re.findall(r"^```matlab\n(.*?)^```", read("files"), re.DOTALL | re.MULTILINE)
     robot = fflin.load("servicer_7dof")
     lin = fflin.linearize(robot, v=fflin.velocity(robot, {"joint_1": 0.1}))
     lin.save(tmp_path / "model.mat")

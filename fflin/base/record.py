@@ -274,7 +274,7 @@ class Design(FrozenArrays):
         InputError
             If a value is not finite.
         """
-        write_record(as_path(path), _record_of(self), sealed=self.verified)
+        write_record(as_path(path), record_of(self), sealed=self.verified)
 
     @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:
@@ -304,12 +304,8 @@ class Design(FrozenArrays):
             return cls(**given, **values, verified=verified)
 
 
-def json_text(design: Design) -> str:
-    """Return the text that `Design.save` writes to a .json file."""
-    return _to_json(_record_of(design), design.verified).decode()
-
-
-def _record_of(design: Design) -> Record:
+def record_of(design: Design) -> Record:
+    """Return what a file holds of a result."""
     record: Record = {"kind": type(design).__name__}
     for item in _saved(type(design)):
         value = getattr(design, item.name)

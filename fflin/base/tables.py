@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 MOST_ROWS, _SPARE = 20, 2  # rows of a table that is read at a glance; a few more are not cut
 
 _GAP = "  "
+_PARAGRAPH = re.compile(r"\n(?!  \S)")
 _EPS = sys.float_info.epsilon
 
 
@@ -32,8 +33,13 @@ def folded(lines: Iterable[str]) -> str:
 
 def headed(command: str, report: str) -> str:
     """Put the name of a command before its report, and fold the first line again."""
-    first, *rest = re.split(r"\n(?!  \S)", report, maxsplit=1)
-    return "\n".join([folded([f"{command}: {' '.join(first.split())}"]), *rest])
+    _, *rest = _PARAGRAPH.split(report, maxsplit=1)
+    return "\n".join([folded([f"{command}: {first_paragraph(report)}"]), *rest])
+
+
+def first_paragraph(report: str) -> str:
+    """Return the first line of a report, together with the indented lines that continue it."""
+    return " ".join(_PARAGRAPH.split(report, maxsplit=1)[0].split())
 
 
 def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[str]]:

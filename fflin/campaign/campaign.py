@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import re
@@ -17,11 +18,12 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import reading
 from fflin.base.validation import Array, FrozenArrays, share, whole
-from fflin.base.writing import as_path
+from fflin.base.writing import as_path, write_whole
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
 from fflin.campaign.spreads import SEED
 from fflin.campaign.statistics import KINDS
+from fflin.linear.trajectory_files import labels, write_table
 
 if TYPE_CHECKING:
     from fflin.campaign.runs import CampaignJob
@@ -341,8 +343,33 @@ class Campaign(FrozenArrays):
         return self._job
 
     def save(self, path: str | Path) -> None:
-        """Save the campaign to a .npz or .h5 file, atomically."""
-        self._save(as_path(path))
+        """Save the campaign to a .npz, .h5, .csv or .mat file, atomically.
+
+        A .csv or .mat file is a table of figures for other programs, with one row for each run;
+        `load` cannot read it. The columns have the names of the figures with units, such as
+        ``worst tau_b.x [N m]``. A .mat file contains `columns`, the names, and `runs`, the values.
+        """
+        target = as_path(path)
+        if target.suffix in (".csv", ".mat"):
+            self._save_table(target)
+        else:
+            self._save(target)
+
+    def _save_table(self, path: Path) -> None:
+        finals = (*KINDS, *self.state_names, *self.input_names)
+        names = [f"drawn {name}" for name in self.names] + ["end", *finals]
+        names += [f"worst {name}" for name in finals] + [f"settle {kind}" for kind in KINDS]
+        values, units = zip(*map(self.figure, names), strict=True)
+        columns = labels(["stop", *names], ["", *units])
+        rows = np.column_stack((self.stop, *values))
+        if path.suffix == ".csv":
+            write_table(path, columns, rows)
+            return
+        from scipy.io import savemat
+
+        content = io.BytesIO()
+        savemat(content, {"columns": np.array(columns, dtype=object), "runs": rows})
+        write_whole({path: content.getvalue()})
 
     def _save(self, path: Path, **texts: str) -> None:
         """Write it with more texts, such as the request that `monte_carlo` knows its call by."""

@@ -132,23 +132,25 @@ class Funnel(Design):
     frame: str
 
     @cached_property
-    def _counts(self) -> list[tuple[int, float, tuple[float, float]]]:
-        return [until_failure(row != 0.0, self.confidence) for row in self.outcomes]
+    def _counts(self) -> tuple[Array, Array, Array]:
+        counts = [until_failure(row != 0.0, self.confidence) for row in self.outcomes]
+        inside, bounds, intervals = map(np.array, zip(*counts, strict=True))
+        return inside, bounds, intervals
 
-    @cached_property
+    @property
     def inside(self) -> Array:
         """Number of runs (m,) that start at or below the level `rho`."""
-        return np.array([inside for inside, *_ in self._counts])
+        return self._counts[0]
 
-    @cached_property
+    @property
     def inside_rate(self) -> Array:
         """Lower bound (m,) on the success rate of runs that start at or below the level `rho`."""
-        return np.array([bound for _, bound, _ in self._counts])
+        return self._counts[1]
 
-    @cached_property
+    @property
     def rate(self) -> Array:
         """Clopper-Pearson interval (m, 2) of the success rate of all runs."""
-        return np.array([interval for *_, interval in self._counts])
+        return self._counts[2]
 
     @cached_property
     def rho(self) -> Array:
@@ -180,8 +182,9 @@ class Funnel(Design):
     @cached_property
     def trajectory(self) -> Trajectory:
         """The followed trajectory."""
-        values: Any = (self.robot, self.knots, self.q, self.v, self.u)
-        return Trajectory(*values, hold=self.hold, frame=self.frame)
+        return Trajectory(
+            self.robot, self.knots, self.q, self.v, self.u, hold=self.hold, frame=self.frame
+        )
 
     def level(self, t: float) -> float:
         """Return rho at time t; between two knots, the smaller of their two levels."""
@@ -194,7 +197,7 @@ class Funnel(Design):
     def cost(self, t: float) -> Array:
         """Return P (nx, nx) at time t by linear interpolation of the schedule."""
         k = int(np.clip(self.at.searchsorted(t, "right") - 1, 0, len(self.at) - 2))
-        part = float(np.clip((t - self.at[k]) / (self.at[k + 1] - self.at[k]), 0.0, 1.0))
+        part = float(np.interp(t, self.at[k : k + 2], [0.0, 1.0]))
         P: Array = (1.0 - part) * self.P[k] + part * self.P[k + 1]
         return P
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -36,6 +36,7 @@ Watcher = Callable[[int, list[Array]], None]
 class Statistics(Protocol):
     """What is kept of eight parallel runs, slice by slice."""
 
+    FIELDS: ClassVar[tuple[str, ...]]
     span: int  # steps between checks of `over`
 
     @property
@@ -45,13 +46,13 @@ class Statistics(Protocol):
     def reset(self) -> None:
         """Begin with eight other runs."""
 
-    def add(self, first: int, rows: Sequence[Array], raw: Any) -> None:
+    def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Add the rows (steps, LANES, ..) of q, nu, u, .. from step `first` on, also as `raw`.
 
         A row may be added again.
         """
 
-    def outcome(self, done: int, stop: Array) -> Any:
+    def outcome(self, done: int, stop: Array) -> dict[str, Array]:
         """Return the outcomes of the runs after so many steps; `stop` are indices into STOPS."""
 
 
@@ -171,7 +172,7 @@ class Lanes:
         diverged = (stop == _DIVERGED)[:count]
 
         def write(chosen: Any) -> None:
-            for name, values in statistics.outcome(done, stop)._asdict().items():
+            for name, values in statistics.outcome(done, stop).items():
                 out[name][chosen] = values[:count][chosen]
 
         if (ending & diverged).any():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from concurrent.futures import Executor
+from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,8 @@ from fflin.batch.run import ChunkResult, Progress, Rows, run_chunks
 from fflin.batch.store import MemoryStore
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.spreads import placed
-from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, stop_of
+from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, outcome_of, stop_of
+from fflin.control.saturation import Saturation
 from fflin.dynamics.state import states_of
 from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES, batch_tree
@@ -38,14 +40,28 @@ _LARGEST_CHUNK = 256
 
 
 class CampaignJob:
-    """Runs of one plan, each with its own drawn values; see `batch.run.Job`."""
+    """Runs of one plan, each with its own drawn values; see `batch.run.Job`.
+
+    A `rule` ends each run, and its outcome replaces the statistics of a campaign.
+    """
 
     def __init__(
-        self, robot: Robot, policy: Any, given: Any, seed: int, engine: str, options: Any
+        self,
+        robot: Robot,
+        policy: Any,
+        given: Any,
+        seed: int,
+        engine: str,
+        options: Any,
+        rule: Statistics | None = None,
     ) -> None:
-        self._arguments: tuple[Any, ...] = (robot, policy, given, seed, engine, options)
-        histories = (options := dict(options)).pop("histories", 0)
+        self._arguments: tuple[Any, ...] = (robot, policy, given, seed, engine, options, rule)
+        self.rule, options = rule, dict(options)
+        histories, unlimited = options.pop("histories", 0), options.pop("unlimited", False)
         self.plan, self.plant = planned(robot, policy, linear=False, progress=False, **options)
+        if unlimited:
+            most = np.full(len(self.plan.initial), np.inf)
+            self.plan = replace(self.plan, limits=Saturation(-most, most))
         self.engine, state, times = engine, self.plant.state, self.plan.times
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
         # Errors are deviations from a state (nx,), or from a moving one (steps + 1, nx).
@@ -64,7 +80,7 @@ class CampaignJob:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A worker repeats the construction, since functions bound to a robot cannot be sent.
-        return _remade, (type(self), self._arguments, self.engine)
+        return _remade, (self._arguments, self.engine)
 
     def choose(self, engine: Any) -> None:
         """Set the engine of the runs: the requested one, or the faster one that supports them."""
@@ -73,6 +89,8 @@ class CampaignJob:
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each array of a run's outcome."""
+        if self.rule:
+            return dict.fromkeys(self.rule.FIELDS, ())
         robot, nx, nu = self.plant.robot, self.plant.state.nx, len(self.plan.initial)
         sizes = [(size,) for size in (robot.nq, robot.nv, nx, nu, nx, nu, *[len(KINDS)] * 3)]
         histories = [(len(self.steps), size) for size in (len(KINDS), nu)]
@@ -100,7 +118,7 @@ class CampaignJob:
             self._fly(drawn, out)
         else:
             for row in range(len(drawn)):
-                for key, values in self._one(drawn[row])._asdict().items():
+                for key, values in self._one(drawn[row]).items():
                     out[key][row] = values[0]
         return ChunkResult(dict(out), [])
 
@@ -116,7 +134,9 @@ class CampaignJob:
         tree, stopped = batch_tree(self.plant.robot), list[str]()
         assert tree is not None
         runs = self.dispersions.in_lanes(drawn, tree)
-        lanes = Lanes(self.plan, self.plant, runs, self.statistics(LANES))
+        state, path = self.plant.state, self._path
+        own = RunStatistics(self.plan, state, self.target, self.steps, path)
+        lanes = Lanes(self.plan, self.plant, runs, copy(self.rule) or own)
         for first in range(0, len(drawn), LANES):
             eight, their_out = (
                 {key: each[first : first + LANES] for key, each in arrays.items()}
@@ -124,11 +144,6 @@ class CampaignJob:
             )
             stopped = lanes.fly(eight, their_out, watcher)
         return lanes, stopped
-
-    def statistics(self, count: int) -> Statistics:
-        """Return the statistics of one run in Python, or of eight parallel runs."""
-        state, path = self.plant.state, self._path
-        return RunStatistics(self.plan, state, self.target, self.steps, path, count)
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
         """Return the plan of a run (k,), and its robot."""
@@ -138,13 +153,21 @@ class CampaignJob:
         return replace(plan, q=q, v=v, policy=policy, law=law, times=times), plant
 
     @np.errstate(over="ignore", invalid="ignore")  # a run that diverges overflows
-    def _one(self, drawn: Array) -> Any:
+    def _one(self, drawn: Array) -> dict[str, Array]:
         plan, plant = self.plan_of(drawn)
-        run = _recorded(plan, plant, every=1)
-        rows = run.q, self.plant.state.velocities(run.v), run.u, run.momentum, run.center
-        statistics = self.statistics(1)
-        statistics.add(0, [each[:, None] for each in rows], np.hstack(rows).ravel().tolist())
-        return statistics.outcome(run.steps, np.array([float(stop_of(run.stopped))]))
+        if self.rule is None:
+            run = _recorded(plan, plant, every=1)
+            return outcome_of(plan, self.plant.state, self.target, self.steps, run)
+        rule, velocities = copy(self.rule), self.plant.state.velocities
+        rule.reset()
+
+        def goes_on(t: float, q: Array, v: Array) -> float:
+            rule.add(round(t / plan.times.dt), [each[None, None] for each in (q, velocities(v))])
+            return float(not rule.over[0])
+
+        goes_on(0.0, plan.q, plan.v)
+        run = _recorded(replace(plan, events=(goes_on,)), plant, every=1)
+        return rule.outcome(run.steps, np.array([float(stop_of(run.stopped))]))
 
     def replay(self, drawn: Array) -> Motion:
         """Simulate a run (k,) again with the same arithmetic, and return its motion."""
@@ -210,11 +233,11 @@ def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:
     return run
 
 
-def _remade(kind: type[CampaignJob], arguments: tuple[Any, ...], engine: str) -> CampaignJob:
+def _remade(arguments: tuple[Any, ...], engine: str) -> CampaignJob:
     """Make a job in a worker, whose warnings nobody would see."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        job = kind(*arguments)
+        job = CampaignJob(*arguments)
     job.engine = engine
     return job
 

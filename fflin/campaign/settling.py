@@ -6,29 +6,27 @@ The norm belongs to the Lyapunov function of the linear loop that decays as the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
-from itertools import count
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fflin.analysis.names import rate_of
 from fflin.analysis.reduction import picked, regulated_part, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double
+from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.control.policies import StateFeedback
-from fflin.control.saturation import Saturation
 from fflin.dynamics.state import Frame, StateMap, states_of, unwound
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
-from fflin.simulation.plan import Plan
-from fflin.simulation.plant import Plant
 
 # Ratio of a run's error to its initial error at which it has settled, and has diverged.
 SETTLED, DIVERGED = 1e-3, 1e3
@@ -59,6 +57,11 @@ class Loop:
     def state(self) -> StateMap:
         """The whole state of the robot, in the model's axes."""
         return StateMap(self.robot, reference=self.lin.reference, frame=self.lin.frame)
+
+    @cached_property
+    def start(self) -> Array:
+        """The state (nx,) of the operating point."""
+        return self.state.to_state(self.lin.q, self.lin.v)
 
     @cached_property
     def watched(self) -> Array:
@@ -103,9 +106,7 @@ class Loop:
         self, rng: np.random.Generator, attitude: float, position: float, joint: float
     ) -> Array:
         """Return a state (nx,) displaced by [deg], [m] and [rad|m], the model's states alone."""
-        state, lin = self.state, self.lin
-        g = state.groups
-        x = state.to_state(lin.q, lin.v)
+        g, x = self.state.groups, self.start.copy()
         axis, along = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
         turn = np.radians(attitude) / 2.0
         q0 = np.sqrt(1.0 - float(x[g.q_b] @ x[g.q_b]))
@@ -137,76 +138,44 @@ class Loop:
         return replace(self, lin=replace(self.lin, frame=state.frame))
 
 
-class SettlingJob(CampaignJob):
-    """Runs of a loop from displaced states, until they settle or up to a horizon.
+def settling_runs(
+    loop: Loop, predicts: bool, limits: Any, joint: float, fine: int = 0
+) -> CampaignJob:
+    """Return runs of a loop from displaced states, until they settle or up to a horizon.
 
-    With `predicts`, they last three time constants and are compared with the linear loop. `fine`
-    is how often the steps have been shortened.
+    With `predicts`, they last three time constants and are compared with the linear loop. `joint`
+    is the largest displacement of a joint, and `fine` is how often the steps have been shortened.
     """
-
-    def __init__(
-        self, loop: Loop, predicts: bool, limits: Any, joint: float, fine: int = 0, engine: str = ""
-    ) -> None:
-        lin, decay = loop.lin, loop.decay
-        # Between samples, and where an input saturates, the robot moves without its loop.
-        free = linearize(loop.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
-        rates = [2.0 * free.A] if lin.dt else [free.A, loop.rate]
-        fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
-        horizon = (_CONSTANTS if predicts else _PATIENCE * math.log(1.0 / SETTLED)) / decay
-        pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
-        every = math.ceil(lin.dt * pace / _STEP) if lin.dt else 1
-        dt = lin.dt / every if lin.dt else _STEP / pace
-        if not horizon / dt <= _MOST_STEPS:
-            raise InputError(
-                f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
-                f"1/s: a run would take {horizon / dt:.3g} steps, expected at most "
-                f"{_MOST_STEPS:,}; give a gain whose poles are closer together, or add damping"
-            )
-        if not lin.dt:
-            every = max(1, int(horizon / dt / _CHECKS)) if predicts else 4
-        checks, finer = math.ceil(horizon / (dt * every) - 1e-9), _FINER**fine
-        dt, every = dt / finer, every * finer
-        options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
-        options |= {"limits": limits, "project": not predicts, "every": every}
-        deviations = dict.fromkeys(loop.state.names, 0.0)
-        policy = StateFeedback(lin, loop.K)
-        super().__init__(loop.robot, policy, deviations, 0, engine, options)
-        if limits is None:  # no input saturates, and thrusters may pull
-            most = np.full(len(self.plan.initial), np.inf)
-            self.plan = replace(self.plan, limits=Saturation(-most, most))
-        self.loop, self.every, self.fine = loop, every, fine
-        self._arguments = (loop, predicts, limits, joint, fine, engine)
-        self.step = _sampled(loop, dt, every) if predicts else None
-
-    def finer(self) -> SettlingJob:
-        """Return the same runs in shorter steps."""
-        loop, predicts, limits, joint, fine, _ = self._arguments
-        return SettlingJob(loop, predicts, limits, joint, fine + 1, self.engine)
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of each array of a run's outcome."""
-        return dict.fromkeys(Judged._fields, ())
-
-    def statistics(self, count: int) -> Settling:
-        """Return the statistics of one run in Python, or of eight parallel runs."""
-        return Settling(self, count)
-
-    def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
-        """Return the plan of a run, which ends once it has settled."""
-        plan, plant = super().plan_of(drawn)
-        loop, first, steps = self.loop, self.loop.size(drawn[self.loop.watched]), count(1)
-
-        def settled(_: float, q: Array, v: Array) -> float:
-            if next(steps) % self.every:
-                return 1.0
-            e = loop.errors(q[None], loop.state.velocities(v)[None])[1]
-            return float(loop.size(e[0]) - SETTLED * first)
-
-        return replace(plan, events=(settled,) if self.step is None else ()), plant
+    lin, decay = loop.lin, loop.decay
+    # Between samples, and where an input saturates, the robot moves without its loop.
+    free = linearize(loop.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
+    rates = [2.0 * free.A] if lin.dt else [free.A, loop.rate]
+    fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
+    horizon = (_CONSTANTS if predicts else _PATIENCE * math.log(1.0 / SETTLED)) / decay
+    pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
+    every = math.ceil(lin.dt * pace / _STEP) if lin.dt else 1
+    dt = lin.dt / every if lin.dt else _STEP / pace
+    if not horizon / dt <= _MOST_STEPS:
+        raise InputError(
+            f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
+            f"1/s: a run would take {horizon / dt:.3g} steps, expected at most "
+            f"{_MOST_STEPS:,}; give a gain whose poles are closer together, or add damping"
+        )
+    if not lin.dt:
+        every = max(1, int(horizon / dt / _CHECKS)) if predicts else 4
+    checks, finer = math.ceil(horizon / (dt * every) - 1e-9), _FINER**fine
+    dt, every = dt / finer, every * finer
+    options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
+    options |= {"limits": limits, "project": not predicts, "every": every}
+    # Without limits no input saturates, and thrusters may pull.
+    options |= {"unlimited": limits is None}
+    rule = Settling(loop, every, _transition(loop, dt, every) if predicts else None)
+    deviations = dict.fromkeys(loop.state.names, 0.0)
+    policy = StateFeedback(lin, loop.K)
+    return CampaignJob(loop.robot, policy, deviations, 0, "python", options, rule)
 
 
-def _sampled(loop: Loop, dt: float, every: int) -> Array:
+def _transition(loop: Loop, dt: float, every: int) -> Array:
     """Return the transition matrix of the linear loop from check to check.
 
     For a linear system CF4 is the classical method of order four, which multiplies by its stability
@@ -219,36 +188,35 @@ def _sampled(loop: Loop, dt: float, every: int) -> Array:
     return np.linalg.matrix_power(step, every)
 
 
-class Judged(NamedTuple):
-    """Results of runs: index into OUTCOMES (N,), and largest prediction error (N,)."""
-
-    outcome: Array
-    error: Array
-
-
 class Settling:
-    """Whether runs have settled, and their differences from the linear loop; see `Statistics`."""
+    """Rule by which runs have settled, and their differences from the linear loop.
 
+    It is applied every `every` steps. With the transition matrix `step` of the linear loop between
+    these checks, runs go on to their end and are compared with that loop.
+    """
+
+    # Index into OUTCOMES, and largest relative prediction error.
+    FIELDS: ClassVar[tuple[str, ...]] = ("outcome", "error")
     span = 128  # steps between checks of `over`
 
-    def __init__(self, job: SettlingJob, count: int) -> None:
-        self._job, self._loop, self._count = job, job.loop, count
+    def __init__(self, loop: Loop, every: int, step: Array | None) -> None:
+        self._loop, self.every, self._step = loop, every, step
         self.reset()
 
     def reset(self) -> None:
         """Begin with other runs."""
-        self._code, self._worst = np.zeros(self._count, dtype=int), np.zeros(self._count)
+        self._code, self._worst = np.zeros(1, dtype=int), np.zeros(1)
         self._next = 0  # first step that has not been added
 
     @property
-    def over(self) -> Any:
-        """Which runs (count,) may end before their time."""
-        return (self._code > 0) & (self._job.step is None)
+    def over(self) -> NDArray[np.bool_]:
+        """Which runs may end before their time."""
+        return (self._code > 0) & (self._step is None)
 
-    def add(self, first: int, rows: Sequence[Array], _: Any) -> None:
+    def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Add the rows (steps, count, ..) from step `first` on."""
         begin, self._next = max(first, self._next), first + len(rows[0])
-        checked = slice(begin - first + -begin % self._job.every, None, self._job.every)
+        checked = slice(begin - first + -begin % self.every, None, self.every)
         loop, (q, nu) = self._loop, (each[checked] for each in rows[:2])
         if not (shape := q.shape[:2])[0]:
             return
@@ -262,24 +230,44 @@ class Settling:
         code = np.select(ends, [1, 2, 3], 0)
         code = np.take_along_axis(code, (code > 0).argmax(axis=0)[None], axis=0)[0]
         self._code = np.where(self._code > 0, self._code, code)
-        if self._job.step is not None:
+        if self._step is not None:
             for each in e:
                 self._worst = np.maximum(self._worst, loop.size(each - self._predicted))
-                self._predicted = self._predicted @ self._job.step.T
+                self._predicted = self._predicted @ self._step.T
 
-    def outcome(self, _: int, stop: Array) -> Judged:
+    def outcome(self, _: int, stop: Array) -> dict[str, Array]:
         """Return the outcomes of the runs; `stop` are indices into STOPS."""
-        code = np.where(self._code > 0, self._code, np.array([0, 3, 2, 1])[stop.astype(int)])
+        code = np.where(self._code > 0, self._code, np.array([0, 3, 2, 0])[stop.astype(int)])
         error = self._worst / np.maximum(self._first, 1e-300)
-        return Judged(code.astype(float), np.where((stop > 0.0) | (code > 1), np.nan, error))
+        error = np.where((stop > 0.0) | (code > 1), np.nan, error)
+        return {"outcome": code.astype(float), "error": error}
 
 
-def settle(job: SettlingJob, rows: Any, runs: Any, **how: Any) -> dict[str, Array]:
-    """Return the outcomes of runs; those that diverge are repeated in shorter steps."""
-    arrays = completed(job, lru_cache(64)(partial(rows, runs)), len(runs), **how)
+def settle(
+    runs_of: Callable[[int], CampaignJob],
+    starts: Callable[[NDArray[np.intp]], Array],
+    runs: NDArray[np.intp],
+    engine: str | None = None,
+    fine: int = 0,
+    **how: Any,
+) -> dict[str, Array]:
+    """Return the outcomes of runs; those that diverge are repeated in shorter steps.
+
+    `runs_of` makes the runs in steps that have been shortened `fine` times, and `starts` returns
+    the deviations (N, nx) from which runs (N,) start.
+    """
+
+    def rows(start: int, stop: int) -> Draws:
+        some = runs[start:stop]
+        return Draws(starts(some), some.astype(float))
+
+    job = runs_of(fine)
+    job.choose(engine)
+    arrays = completed(job, rows, len(runs), **how)
     lost = np.flatnonzero(arrays["outcome"] == OUTCOMES.index("diverged"))
-    if len(lost) and job.fine < _FINEST:
-        again = settle(job.finer(), rows, runs[lost], **how | {"progress": None})
+    if len(lost) and fine < _FINEST:
+        how["progress"] = None
+        again = settle(runs_of, starts, runs[lost], engine, fine + 1, **how)
         for key, values in again.items():
             arrays[key][lost] = values
     return arrays

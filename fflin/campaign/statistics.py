@@ -7,21 +7,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import (
+    StateMap,
+    attitude_errors,
+    moving_errors,
+    states_of,
+    unwound,
+)
+from fflin.kernel import statistics as kernel_statistics
 from fflin.kernel.arguments import empty, laid_out, words_of
 from fflin.kernel.compiled import kernel
-from fflin.kernel.statistics import RUN_STATISTICS, note
 from fflin.kernel.tree import LANES
 from fflin.simulation.packing import no_law
 from fflin.simulation.plan import Plan
-from fflin.simulation.report import DWELL, SETTLED, THERE
+from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
+from fflin.simulation.run import Recording
 
 # Kinds of errors with their units; the error of a kind is its largest entry. Wheels and modes are
 # no joints.
@@ -77,13 +84,91 @@ def kinds_of(state: StateMap) -> NDArray[np.intp]:
     return kind
 
 
-class RunStatistics:
-    """Statistics of one run, or of eight parallel runs in compiled code; see `lanes.Statistics`.
+def outcome_of(
+    plan: Plan, state: StateMap, target: Array, steps: Array, run: Recording
+) -> dict[str, Array]:
+    """Return the outcome, as a row of each array of `Outcome`, of a run with a row for every step.
+
+    Errors are those from the state `target` (nx,), or from a moving one (steps + 1, nx). Histories
+    are kept at `steps`.
+    """
+    count, kind, nu = len(run.q), kinds_of(state), state.velocities(run.v)
+    moving = target.ndim == 2
+    target = target[:count] if moving else target
+    x = unwound(state, states_of(state, run.q, nu), target[0] if moving else target)
+    e = unwound(state, moving_errors(state.frame, x, target)) if moving else x - target
+    e, u = np.where(kind < 0, 0.0, np.abs(e)), np.abs(run.u)
+    others = [e[:, kind == of].max(axis=1, initial=0.0) for of in range(1, len(KINDS))]
+    sizes = np.column_stack([attitude_errors(x, target), *others])
+    settled, stop = settled_at(sizes), stop_of(run.stopped)
+    kept, last = steps[steps < count], slice(-1, None)
+    error_history = np.full((1, len(steps), len(KINDS)), np.inf)
+    input_history = np.zeros((1, len(steps), u.shape[1]))
+    error_history[0, : len(kept)], input_history[0, : len(kept)] = sizes[kept], run.u[kept]
+    return Outcome(
+        q=run.q[last],
+        v=run.v[last],
+        x=x[last],
+        u=run.u[last],
+        largest_x=e.max(axis=0, keepdims=True),
+        largest_u=u.max(axis=0, keepdims=True),
+        errors=sizes[last],
+        largest=sizes.max(axis=0, keepdims=True),
+        settle=np.where(is_late(settled, count) | (stop > 0), np.inf, settled * plan.times.dt)[
+            None
+        ],
+        error_history=error_history,
+        input_history=input_history,
+        stop=np.array([float(stop)]),
+        end=np.array([run.steps * plan.times.dt]),
+    )._asdict()
+
+
+def marks_of(
+    plan: Plan, state: StateMap, target: Array, steps: Array, path: Sequence[Array]
+) -> kernel_statistics.RunStatistics:
+    """Return what the kernel's statistics of a run read and write.
 
     Errors are those from the state `target` (nx,), or from a moving one (steps + 1, nx) whose q and
     nu are the arrays of `path`. Histories are kept at `steps`.
     """
+    robot, kinds, nu = state.robot, len(KINDS), len(plan.initial)
+    first = target if target.ndim == 1 else target[0]
+    x, y, z = first[:3].tolist()
+    attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
+    law, marks = no_law(state, plan.initial), empty(kernel_statistics.RUN_STATISTICS)
+    law.path.point.q[3:7] = quaternion_product(conjugate(state.origin_quaternion), attitude)
+    way, speed = path or (np.zeros(0), np.zeros(0))
+    return marks._replace(
+        robot=marks.robot._replace(
+            index=np.array([joint.idx_q for joint in robot.joints], dtype=np.intp),
+            circling=np.array([joint.unbounded for joint in robot.joints], dtype=bool),
+            scale=np.array([joint.scale for joint in robot.joints]),
+        ),
+        law=law._replace(near=first[state.groups.q_m]),
+        path=law.path,
+        home=first,
+        way=way,
+        speed=speed,
+        kind=kinds_of(state),
+        settled=SETTLED,
+        there=np.full(kinds, THERE),
+        steps=steps,
+        at=marks.at._replace(q=np.zeros(robot.nq), nu=np.zeros(state.nx // 2)),
+        sizes=np.zeros(kinds),
+        largest_x=np.zeros(state.nx),
+        largest_u=np.zeros(nu),
+        largest=np.zeros(kinds),
+        outside=np.full(kinds, -1.0),
+        errors=np.full(len(steps) * kinds, np.inf),
+        inputs=np.zeros(len(steps) * nu),
+    )
 
+
+class RunStatistics:
+    """Statistics of eight parallel runs in compiled code; see `lanes.Statistics`, `marks_of`."""
+
+    FIELDS: ClassVar[tuple[str, ...]] = Outcome._fields
     span = 2**20  # steps between checks of `over`
 
     def __init__(
@@ -93,72 +178,37 @@ class RunStatistics:
         target: Array,
         steps: Array,
         path: Sequence[Array],
-        count: int,
     ) -> None:
-        self._dt, self._state, self._steps, self._count = plan.times.dt, state, steps, count
-        self.over = np.zeros(count, dtype=bool)  # every run goes on to its end
-        robot, kinds, nu = state.robot, len(KINDS), len(plan.initial)
-        first = target if target.ndim == 1 else target[0]
-        x, y, z = first[:3].tolist()
-        attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
-        law, marks = no_law(state, plan.initial), empty(RUN_STATISTICS)
-        law.path.point.q[3:7] = quaternion_product(conjugate(state.origin_quaternion), attitude)
-        way, speed = path or (np.zeros(0), np.zeros(0))
-        marks = marks._replace(
-            robot=marks.robot._replace(
-                index=np.array([joint.idx_q for joint in robot.joints], dtype=np.intp),
-                circling=np.array([joint.unbounded for joint in robot.joints], dtype=bool),
-                scale=np.array([joint.scale for joint in robot.joints]),
-            ),
-            law=law._replace(near=first[state.groups.q_m]),
-            path=law.path,
-            home=first,
-            way=way,
-            speed=speed,
-            kind=kinds_of(state),
-            settled=SETTLED,
-            there=np.full(kinds, THERE),
-            steps=steps,
-            at=marks.at._replace(q=np.zeros(robot.nq), nu=np.zeros(state.nx // 2)),
-            sizes=np.zeros(kinds),
-            largest_x=np.zeros(state.nx),
-            largest_u=np.zeros(nu),
-            largest=np.zeros(kinds),
-            outside=np.full(kinds, -1.0),
-            errors=np.full(len(steps) * kinds, np.inf),
-            inputs=np.zeros(len(steps) * nu),
-        )
+        self._dt, self._state, self._steps = plan.times.dt, state, steps
+        self.over = np.zeros(LANES, dtype=bool)  # every run goes on to its end
+        marks = marks_of(plan, state, target, steps, path)
         self._fresh: list[tuple[Array, Array]] = []
-        if count == LANES:
-            self._marks = laid_out(marks, RUN_STATISTICS, lambda *pair: self._fresh.append(pair))
-            self._words = words_of(self._marks, RUN_STATISTICS)
-        else:
-            self._marks = as_lists(marks)
+        self._marks = laid_out(
+            marks, kernel_statistics.RUN_STATISTICS, lambda *pair: self._fresh.append(pair)
+        )
+        self._words = words_of(self._marks, kernel_statistics.RUN_STATISTICS)
 
     def reset(self) -> None:
         """Begin with eight other runs."""
         for lanes, initial in self._fresh:
             lanes[:] = initial
 
-    def add(self, first: int, rows: Sequence[Array], raw: Any) -> None:
+    def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Add the rows (steps, count, ..) of q, nu, u, .. from step `first` on, also as `raw`."""
-        if self._count == LANES:
-            take = kernel("statistics", "take", "the run statistics")
-            take(self._words, raw, first, len(rows[0]))
-        else:
-            note(self._marks, raw, first, len(rows[0]))
+        take = kernel("statistics", "take", "the run statistics")
+        take(self._words, raw, first, len(rows[0]))
         self._last = [each[-1] for each in rows[:3]]
 
-    def outcome(self, done: int, stop: Array) -> Outcome:
+    def outcome(self, done: int, stop: Array) -> dict[str, Array]:
         """Return the outcomes of the runs after so many steps; `stop` are indices into STOPS."""
         (q, nu, u), marks = self._last, self._marks
 
         def by_run(values: Any, *shape: int) -> Array:
             shape = shape or (len(values),)
-            return np.moveaxis(np.reshape(values, (*shape, self._count)), -1, 0)
+            return np.moveaxis(np.reshape(values, (*shape, LANES)), -1, 0)
 
         settled = by_run(marks.outside) + 1.0
-        late = (stop != 0.0)[:, None] | (settled > (1.0 - DWELL) * (done + 1))
+        late = (stop != 0.0)[:, None] | is_late(settled, done + 1)
         return Outcome(
             q=q,
             v=self._state.spread(nu),
@@ -172,13 +222,5 @@ class RunStatistics:
             error_history=by_run(marks.errors, len(self._steps), len(KINDS)),
             input_history=by_run(marks.inputs, len(self._steps), u.shape[1]),
             stop=stop,
-            end=np.full(self._count, done * self._dt),
-        )
-
-
-def as_lists(value: Any) -> Any:
-    """Return nested named tuples of arrays with lists, whose entries Python reads faster."""
-    if isinstance(value, tuple):
-        made: Any = type(value)
-        return made._make(map(as_lists, value))
-    return value.tolist() if isinstance(value, np.ndarray) else value
+            end=np.full(LANES, done * self._dt),
+        )._asdict()

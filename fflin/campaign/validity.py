@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.intervals import until_failure
@@ -18,8 +19,7 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, number, share, whole
 from fflin.batch.run import Progress, check_workers
 from fflin.batch.workers import OwnWorkers
-from fflin.campaign.dispersions import Draws
-from fflin.campaign.settling import OUTCOMES, Loop, SettlingJob, checked_loop, settle
+from fflin.campaign.settling import OUTCOMES, Loop, checked_loop, settle, settling_runs
 from fflin.dynamics.names import Frame, refuse_orbit
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -245,26 +245,29 @@ def validity(
     loops = {loop.lin.frame: loop} | {each: loop.fed_back_in(each) for each in frames}
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
-    counts = {True: len(_LEVELS) * _DIRECTIONS, False: samples}  # runs that predict, random runs
-    total, done, found = len(loops) * sum(counts.values()), 0, list[Validity]()
-    # Every job is made first, so that a wrong argument is refused before anything is compiled.
-    jobs = {
-        (frame, predicts): SettlingJob(each, predicts, limits, largest["joint"])
-        for frame, each in loops.items()
-        for predicts in counts
+    # Level and random stream of each run that predicts, and of each random run.
+    sets = {
+        True: (np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
+        False: (levels, _DIRECTIONS + np.arange(samples)),
     }
-    for job in jobs.values():
-        job.choose(engine)
+    runs_of = {
+        (frame, predicts): partial(settling_runs, each, predicts, limits, largest["joint"])
+        for frame, each in loops.items()
+        for predicts in sets
+    }
+    for make in runs_of.values():  # a wrong argument is refused before anything is compiled
+        make().choose(engine)
+    total, done, found = len(loops) * (len(_LEVELS) * _DIRECTIONS + samples), 0, list[Validity]()
     with OwnWorkers(workers) if workers else nullcontext(executor) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         for frame, each in loops.items():
             arrays = {}
-            for predicts, count in counts.items():
-                rows = partial(_displaced, each, largest, seed, None if predicts else levels)
+            for predicts, (at, streams) in sets.items():
+                starts = partial(_starts, each, largest, seed, at, streams)
                 counted = progress and partial(_report, progress, done, total)
-                job = jobs[frame, predicts]
-                arrays[predicts] = settle(job, rows, np.arange(count), progress=counted, **how)
-                done += count
+                runs, how["progress"] = np.arange(len(at)), counted
+                arrays[predicts] = settle(runs_of[frame, predicts], starts, runs, engine, **how)
+                done += len(at)
             error = arrays[True]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
             outcomes = tuple(OUTCOMES[int(code)] for code in arrays[False]["outcome"])
             found.append(_judged(each, largest, levels, error, outcomes, confidence))
@@ -272,18 +275,20 @@ def validity(
     return replace(own, frames={each.frame: each for each in more})
 
 
-def _displaced(
-    loop: Loop, largest: dict[str, float], seed: int, levels: Array | None, runs: Any, *at: int
-) -> Draws:
-    """Return the displaced initial states of some runs, each from its own random stream."""
-    drawn, runs = [], runs[slice(*at)]
-    for run in runs.tolist():
-        stream, level = run // len(_LEVELS), _LEVELS[run % len(_LEVELS)]
-        if levels is not None:
-            stream, level = _DIRECTIONS + run, levels[run]
+def _starts(
+    loop: Loop,
+    largest: dict[str, float],
+    seed: int,
+    levels: Array,
+    streams: NDArray[np.intp],
+    runs: NDArray[np.intp],
+) -> Array:
+    """Return deviations of the initial states of some runs, each from its own random stream."""
+    x = []
+    for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-        drawn.append(loop.displaced(rng, **_scaled(largest, float(level))))
-    return Draws(np.array(drawn) - loop.state.to_state(loop.lin.q, loop.lin.v), runs)
+        x.append(loop.displaced(rng, **_scaled(largest, level)))
+    return np.array(x) - loop.start
 
 
 def _report(progress: Progress, before: int, total: int, done: int, _: int) -> None:

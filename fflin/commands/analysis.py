@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.tables import counted, headed
-from fflin.commands import DONE
+from fflin.base.tables import counted
 from fflin.commands.arguments import (
     OUTPUT,
+    PAGE,
     POINT,
+    RECORD,
     Commands,
     add,
+    add_figure,
     add_output_file,
     add_point,
     add_robot,
@@ -23,11 +26,9 @@ from fflin.commands.arguments import (
     count_of,
     group_of,
     number,
-    output_file,
 )
 from fflin.commands.points import linear_model, load_robot, once, placed
-from fflin.commands.tracking import say
-from fflin.commands.visual import add_figure, check_figure, draw
+from fflin.commands.results import Report, figure_of
 
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
@@ -45,7 +46,7 @@ def add_commands(commands: Commands) -> None:
         "frame plot",
     )
     add_point(analyze)
-    add_figure(analyze, "plot the modes")
+    add_figure(analyze, "the modes")
     modes = command(
         commands,
         "modes",
@@ -56,9 +57,9 @@ def add_commands(commands: Commands) -> None:
         "frame plot html",
     )
     add_point(modes)
-    add_figure(modes, "plot frequencies, damping and shapes")
+    add_figure(modes, "frequencies, damping and shapes")
     pages = group_of(modes, OUTPUT)
-    add(pages, "--html", "write a page that plays the mode shapes", output_file)
+    add(pages, "--html", "write a page that plays the mode shapes", PAGE)
     _add_sensitivity(commands)
     _add_uncertain(commands)
 
@@ -83,8 +84,8 @@ def _add_sensitivity(commands: Commands) -> None:
         "show only the parameters of this kind, link or pattern, such as mass, link_3, *.density",
         metavar="NAME",
     )
-    what = "save dA, dB, df0 for each parameter to FILE: .npz, .mat or .json"
-    add_output_file(group_of(sensitivity, OUTPUT), what, "Sensitivity")
+    what = "dA, dB, df0 for each parameter"
+    add_output_file(group_of(sensitivity, OUTPUT), what, RECORD, "Sensitivity")
 
 
 def _add_uncertain(commands: Commands) -> None:
@@ -112,8 +113,8 @@ def _add_uncertain(commands: Commands) -> None:
         repeatable=True,
         required=True,
     )
-    what = "save A, B1 .. D22 and the blocks to FILE: .npz, .mat or .json"
-    add_output_file(group_of(uncertain, OUTPUT), what, "LFT")
+    what = "A, B1 .. D22 and the blocks"
+    add_output_file(group_of(uncertain, OUTPUT), what, RECORD, "LFT")
 
 
 def _range(text: str) -> tuple[str, Any]:
@@ -128,14 +129,12 @@ def _range(text: str) -> tuple[str, Any]:
     return name, {"range": found, "tied": True} if tied else found
 
 
-def _analyze(arguments: argparse.Namespace) -> int:
+def _analyze(arguments: argparse.Namespace) -> Report:
     from fflin.analysis.controllability import controllability, observability
     from fflin.analysis.modes import modes
 
-    check_figure(arguments.plot)
     _, lin = linear_model(arguments)
-    found = modes(lin)
-    moved, shown = controllability(lin), observability(lin)
+    moved, shown, found = controllability(lin), observability(lin), modes(lin)
     parts = {
         "inputs": str(moved),
         "momentum": _momentum(lin),
@@ -149,34 +148,32 @@ def _analyze(arguments: argparse.Namespace) -> int:
         counted(len(found.unstable), "unstable pole"),
     ]
     sections = (f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items())
-    print("\n\n".join([headed("analyze", ", ".join(head)), *sections]))
-    draw(arguments.plot, "plot_modes", found)
-    return DONE
+    result = {"controllability": moved, "observability": shown, "modes": found}
+    text = "\n\n".join([", ".join(head), *sections])
+    return Report(lin.robot, result, text, {arguments.plot: figure_of("plot_modes", found)})
 
 
-def _modes(arguments: argparse.Namespace) -> int:
+def _modes(arguments: argparse.Namespace) -> Report:
     from fflin.analysis.effective_masses import effective_masses
     from fflin.analysis.modes import modes
 
-    check_figure(arguments.plot)
-    if arguments.html:
-        from fflin.base.writing import check_place
-
-        check_place(arguments.html, (".html",))
     robot, lin = linear_model(arguments)
     found = modes(lin)
-    print(headed("modes", str(found)))
+    result: dict[str, Any] = {"modes": found}
+    parts = [str(found)]
     if any(robot.stiffness.values()):
-        print(f"\n{effective_masses(lin)}")
+        result["effective_masses"] = effective_masses(lin)
+        parts.append(str(result["effective_masses"]))
     if robot.orbit and not found.equilibrium:
-        print("\nequilibria in orbit: --equilibrium, --relative-equilibrium")
-    draw(arguments.plot, "plot_modes", found)
-    if arguments.html:
+        parts.append("equilibria in orbit: --equilibrium, --relative-equilibrium")
+
+    def page(path: Path) -> None:
         from fflin.view.visualize import visualize
 
-        visualize(robot, found, html=arguments.html)
-        print(f"wrote {arguments.html}: {arguments.html.stat().st_size / 1e6:.2f} MB")
-    return DONE
+        visualize(robot, found, html=path)
+
+    files = {arguments.plot: figure_of("plot_modes", found), arguments.html: page}
+    return Report(robot.name, result, "\n\n".join(parts), files)
 
 
 def _momentum(lin: LinearModel) -> str:
@@ -205,16 +202,16 @@ def _momentum(lin: LinearModel) -> str:
     return folded(text.splitlines())
 
 
-def _sensitivity(arguments: argparse.Namespace) -> int:
-    from fflin.uncertainty.sensitivity import sensitivity
+def _sensitivity(arguments: argparse.Namespace) -> Report:
+    from fflin.uncertainty.sensitivity import sensitivity, sensitivity_record
 
     _, lin = linear_model(arguments)
     found = sensitivity(lin if arguments.dt is None else lin.discretize(arguments.dt))
-    say("sensitivity", found, arguments, found.table(arguments.top, arguments.only))
-    return DONE
+    text = found.table(arguments.top, arguments.only)
+    return Report(lin.robot, sensitivity_record(found), text, {arguments.output_file: found.save})
 
 
-def _uncertain(arguments: argparse.Namespace) -> int:
+def _uncertain(arguments: argparse.Namespace) -> Report:
     from fflin.dynamics.points import base_of
     from fflin.uncertainty.uncertain import uncertain
 
@@ -224,5 +221,4 @@ def _uncertain(arguments: argparse.Namespace) -> int:
         warnings.warn(text, FflinWarning, stacklevel=2)
     base, joints = base_of(robot.point), robot.point.get("joints")
     lft = uncertain(robot, ranges).lft(placed(robot, "--joint", arguments.joint, base, joints))
-    say("uncertain", lft, arguments)
-    return DONE
+    return Report(robot.name, lft, str(lft), {arguments.output_file: lft.save})

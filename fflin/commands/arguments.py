@@ -8,8 +8,12 @@ import math
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+if TYPE_CHECKING:
+    from fflin.commands.results import Report
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 Container: TypeAlias = "argparse._ActionsContainer"
@@ -56,9 +60,24 @@ def input_name(text: str) -> str:
     return text
 
 
-def output_file(text: str) -> Path:
-    """Read the path of an output file."""
-    return input_file(text)
+@dataclass(frozen=True)
+class OutputFile:
+    """Reader of the path of an output file, with the endings that it may have."""
+
+    endings: tuple[str, ...]
+
+    def __call__(self, text: str) -> Path:
+        """Read the path."""
+        return input_file(text)
+
+    def __str__(self) -> str:
+        *first, last = self.endings
+        return f"{', '.join(first)} or {last}" if first else last
+
+
+RECORD, TABLE = OutputFile((".npz", ".mat", ".json")), OutputFile((".npz", ".mat", ".json", ".csv"))
+ROWS, FIGURE = OutputFile((".npz", ".h5")), OutputFile((".png", ".pdf", ".svg"))
+PAGE, PICTURE, ANIMATION = (OutputFile((f".{ending}",)) for ending in ("html", "png", "gif"))
 
 
 def assignment(text: str) -> tuple[str, float]:
@@ -90,7 +109,6 @@ def lock(text: str) -> tuple[str, float | None]:
 _REPEATABLE = " (repeatable)"
 _METAVARS: dict[Any, str] = {
     input_file: "FILE",
-    output_file: "FILE",
     input_name: "FILE.toml",
     assignment: "NAME=VALUE",
     joint_or_all: "[NAME=]VALUE",
@@ -103,15 +121,16 @@ _METAVARS: dict[Any, str] = {
 def command(
     commands: Commands,
     name: str,
-    run: Callable[[argparse.Namespace], int],
+    run: Callable[[argparse.Namespace], Report],
     summary: str,
     *,
     example: str,
     common: str = "",
 ) -> argparse.ArgumentParser:
-    """Add a command.
+    """Add a command and its option --json.
 
-    Its help ends with `example`. ``--help`` lists the `common` options, by default all options.
+    Its help ends with `example`. ``--help`` lists the `common` options and --json, by default all
+    options.
     """
     command: argparse.ArgumentParser = commands.add_parser(
         name,
@@ -122,7 +141,8 @@ def command(
     )
     about = "show the common options; --help all describes every option"
     command.add_argument("-h", "--help", nargs="?", metavar="all", action=_Help, help=about)
-    command.set_defaults(run=run, command=command, common=common.split())
+    command.set_defaults(run=run, command=command, common=[*common.split(), "json"] * bool(common))
+    switch(group_of(command, OUTPUT), "--json", "print the results as one JSON object")
     return command
 
 
@@ -193,7 +213,8 @@ def add(
     if isinstance(metavar, tuple):
         more["nargs"] = len(metavar)
     if "choices" not in more or metavar:
-        more["metavar"] = metavar or _METAVARS.get(type)
+        file = "FILE" if isinstance(type, OutputFile) else None
+        more["metavar"] = metavar or _METAVARS.get(type, file)
     group.add_argument(name, help=help, type=type, **more)
 
 
@@ -209,12 +230,19 @@ def yes_or_no(group: Container, name: str, help: str) -> None:
 
 def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[Path]]:
     """Return the input files and the output files that the arguments name."""
-    given: dict[Any, list[Path]] = {input_file: [], input_name: [], output_file: []}
+    inputs: list[Path] = []
     for action in arguments.command._actions:
         value = getattr(arguments, action.dest, None)
-        if action.type in given and value is not None:
-            given[action.type] += map(Path, value if isinstance(value, list) else [value])
-    return given[input_file] + given[input_name], given[output_file]
+        if action.type in (input_file, input_name) and value is not None:
+            inputs += map(Path, value if isinstance(value, list) else [value])
+    return inputs, [path for path, _ in outputs_of(arguments)]
+
+
+def outputs_of(arguments: argparse.Namespace) -> list[tuple[Path, OutputFile]]:
+    """Return the output files that the arguments name, with their readers."""
+    actions = arguments.command._actions
+    given = ((getattr(arguments, action.dest, None), action.type) for action in actions)
+    return [(path, kind) for path, kind in given if isinstance(kind, OutputFile) and path]
 
 
 def add_robot(command: argparse.ArgumentParser) -> None:
@@ -379,16 +407,21 @@ def add_system(command: argparse.ArgumentParser) -> None:
     )
 
 
-def add_output_file(group: Container, what: str, *kinds: str) -> None:
-    """Add -o FILE with the help `what`, which lists the endings.
+def add_output_file(
+    group: Container, what: str, endings: OutputFile, *kinds: str, force: str = ""
+) -> None:
+    """Add -o FILE.
 
     With the `kinds` of results that are written there, add --force too; see `require_own_kind`.
     """
-    group.add_argument("-o", "--output-file", metavar="FILE", type=output_file, help=what)
+    what = f"save {what} to FILE: {endings}"
+    group.add_argument("-o", "--output-file", metavar="FILE", type=endings, help=what)
     if kinds:
-        switch(
-            group,
-            "--force",
-            "allow -o to replace a file that does not contain the same kind of result",
-        )
+        force = "allow -o to replace a file that does not contain the same kind of result"
         group.set_defaults(kinds=kinds)
+    switch(group, "--force", force)
+
+
+def add_figure(command: argparse.ArgumentParser, what: str) -> None:
+    """Add --plot FILE."""
+    add(group_of(command, OUTPUT), "--plot", f"plot {what} to FILE: {FIGURE}", FIGURE)

@@ -15,9 +15,10 @@ from typing import Any, NoReturn
 
 from fflin.base import __version__
 from fflin.base.errors import FflinError, FflinWarning, FileError, one_line
-from fflin.base.writing import files_of_command, place
+from fflin.base.writing import check_ending, check_place, files_of_command, place
 from fflin.commands import BAD_INPUT, DONE
-from fflin.commands.arguments import files_of
+from fflin.commands.arguments import FIGURE, files_of, outputs_of
+from fflin.commands.results import finish
 
 # The commands by task, in the order of the help, each with its module.
 TASKS = {
@@ -85,8 +86,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = _parser(argv[0] if argv else "").parse_args(argv)
         with files_of_command(*files_of(arguments)):
-            require_own_kind(arguments)
-            code: int = arguments.run(arguments)
+            check_outputs(arguments)
+            code = finish(arguments.run(arguments), arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
         for line in held:
@@ -134,6 +135,18 @@ def _parser(asked: str) -> argparse.ArgumentParser:
         group = parser.add_argument_group(task)._group_actions
         group += [left[name] for name in names if name in left]
     return parser
+
+
+def check_outputs(arguments: argparse.Namespace) -> None:
+    """Refuse output files that cannot be written, before any computation."""
+    for path, kind in outputs_of(arguments):
+        check_place(path)  # first, since it says that an output is an input
+        check_ending(path, kind.endings)
+        if kind is FIGURE:
+            from fflin.base.figures import require_matplotlib
+
+            require_matplotlib()
+    require_own_kind(arguments)
 
 
 def require_own_kind(arguments: argparse.Namespace) -> None:

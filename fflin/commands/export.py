@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 
 from fflin.base.errors import FileError
-from fflin.base.tables import headed
-from fflin.commands import DONE
 from fflin.commands.arguments import (
     OUTPUT,
     Commands,
@@ -16,6 +14,7 @@ from fflin.commands.arguments import (
     input_file,
     input_name,
 )
+from fflin.commands.results import Report
 
 
 def add_commands(commands: Commands) -> None:
@@ -47,7 +46,7 @@ def add_commands(commands: Commands) -> None:
     add(group, "--real", real, choices=("double", "float"), default="double")
 
 
-def _export(arguments: argparse.Namespace) -> int:
+def _export(arguments: argparse.Namespace) -> Report:
     from fflin.commands.cli import kind_of
     from fflin.control.gain import Gain
     from fflin.control.gain_schedule import GainSchedule
@@ -73,6 +72,5 @@ def _export(arguments: argparse.Namespace) -> int:
     )
     name, real = arguments.name, arguments.real
     test = f"cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm && ./{name}_test"
-    print(headed("export", f"{law!r} in C99, with numbers of type {real}"))
-    print(f"wrote {folder}; to test it there: {test}")
-    return DONE
+    text = f"{law!r} in C99, with numbers of type {real}\nto test it in {folder}: {test}"
+    return Report(law.robot, {"name": name, "real": real, "folder": str(folder)}, text)

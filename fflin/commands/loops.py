@@ -162,8 +162,9 @@ def _add_controllers(group: Container) -> None:
     add(
         group,
         "--limits",
-        "saturate the inputs at the efforts of the URDF, at max and min of the inputs and at wheel "
-        "speeds (urdf, default), or at no limits except --limit (none)",
+        "saturate the inputs at the limits of the robot (urdf, default), or at --limit alone "
+        "(none). The limits are the efforts of the URDF, max and min of the inputs, and the speeds "
+        "of the wheels",
         choices=("urdf", "none"),
         default="urdf",
     )

@@ -9,13 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fflin.base.errors import FflinError, FflinWarning, FileError, InputError
-from fflin.base.tables import headed
-from fflin.commands import DONE, FELL_SHORT
+from fflin.base.writing import check_ending
 from fflin.commands.arguments import (
     OUTPUT,
     POINT,
+    RECORD,
+    TABLE,
     Commands,
+    OutputFile,
     add,
+    add_figure,
     add_output_file,
     add_point,
     add_pose,
@@ -25,11 +28,10 @@ from fflin.commands.arguments import (
     group_of,
     input_name,
     number,
-    switch,
 )
 from fflin.commands.points import configuration_of, linear_model, load_robot, velocity_of
-from fflin.commands.tracking import add_trajectory, check_along, linearize_along
-from fflin.commands.visual import add_figure, check_figure, draw
+from fflin.commands.results import Report, figure_of
+from fflin.commands.tracking import add_trajectory, check_along, checked, linearize_along
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
@@ -58,10 +60,10 @@ def add_commands(commands: Commands) -> None:
     )
     urdf = "path of a URDF, or name of a robot in `fflin robots`"
     init.add_argument("robot", metavar="URDF", type=input_name, help=urdf)
-    written = group_of(init, OUTPUT)
-    what = "output file; by default the URDF's name with the ending .toml, in the current folder"
-    add_output_file(written, what)
-    switch(written, "--force", "replace an existing file")
+    what = "the robot file (by default the URDF's name with .toml, in the current folder)"
+    add_output_file(
+        group_of(init, OUTPUT), what, OutputFile((".toml",)), force="replace an existing file"
+    )
     _add_linearize(commands)
     _add_check(commands)
 
@@ -87,14 +89,9 @@ def _add_linearize(commands: Commands) -> None:
         dest="tool",
     )
     add_trajectory(linearize)
-    add_output_file(
-        made,
-        "save to FILE: .npz, .mat, .json, or .csv (one per matrix: NAME.A.csv, ...)",
-        "LinearModel",
-        "LinearTrajectory",
-        "ToolModel",
-    )
-    add_figure(linearize, "plot the magnitudes of the entries of A and B")
+    what = "A, B, C, D (with .csv one file per matrix: NAME.A.csv, ...)"
+    add_output_file(made, what, TABLE, "LinearModel", "LinearTrajectory", "ToolModel")
+    add_figure(linearize, "the magnitudes of the entries of A and B")
 
 
 def _add_check(commands: Commands) -> None:
@@ -112,10 +109,10 @@ def _add_check(commands: Commands) -> None:
     shown = group_of(check, OUTPUT)
     tolerance = "relative tolerance of all errors; by default each error has its own"
     add(shown, "--tolerance", tolerance, number, "X")
-    add_figure(check, "plot the errors and their tolerances")
+    add_figure(check, "the errors and their tolerances")
 
 
-def _robots(_: argparse.Namespace) -> int:
+def _robots(_: argparse.Namespace) -> Report:
     from fflin.robot.catalog import find_robot, list_robots
     from fflin.robot.loading import load
     from fflin.robot.summary import robot_list
@@ -131,31 +128,57 @@ def _robots(_: argparse.Namespace) -> int:
             found = find_robot(name)
             reason = str(error).replace(f"{found.path.parent}{os.sep}", "")
             entries.append((name, reason, found.origin))
-    print(headed("robots", robot_list(entries)))
-    return DONE
+    robots = {
+        name: {"error": robot} if isinstance(robot, str) else {"n": robot.n, "mass": robot.mass}
+        for name, robot, _ in entries
+    }
+    return Report(None, {"robots": robots}, robot_list(entries))
 
 
-def _info(arguments: argparse.Namespace) -> int:
+def _info(arguments: argparse.Namespace) -> Report:
     from dataclasses import replace
 
     import numpy as np
 
     from fflin.commands.model_text import inputs_report
-    from fflin.control.authority import point_report
+    from fflin.control.authority import mass_properties, point_report
+    from fflin.dynamics.actuation import Actuation
+    from fflin.dynamics.state import StateMap
+    from fflin.robot.limits import limits_of
     from fflin.robot.summary import robot_info
 
     robot = load_robot(arguments)
     q = configuration_of(robot, arguments, robot.point)
     v = velocity_of(robot, arguments, robot.point, "velocity")
     at_point = point_report(robot, q, np.zeros(robot.nv) if v is None else v)
-    print(headed("info", robot_info(robot, at_point)))
-    default = replace(robot, inputs=()).inputs
-    if arguments.inputs is not None or robot.limits or robot.inputs != default:
-        print(f"\n{inputs_report(robot)}")
-    return DONE
+    text = robot_info(robot, at_point)
+    if (
+        arguments.inputs is not None
+        or robot.limits
+        or robot.inputs != replace(robot, inputs=()).inputs
+    ):
+        text += f"\n\n{inputs_report(robot)}"
+    state = StateMap(robot)
+    inputs = Actuation(state)
+    center, inertia = mass_properties(robot, q)
+    result = {
+        "mass": robot.mass,
+        "center_of_mass": center,
+        "inertia": inertia,
+        "principal_moments": np.linalg.eigvalsh(inertia),
+        "joint_names": robot.joint_names,
+        "wheels": robot.wheels,
+        "state_names": state.names,
+        "state_units": state.units,
+        "input_names": inputs.names,
+        "input_units": inputs.units,
+        "limits": limits_of(robot),
+        "notes": robot.notes,
+    }
+    return Report(robot.name, result, text)
 
 
-def _init(arguments: argparse.Namespace) -> int:
+def _init(arguments: argparse.Namespace) -> Report:
     from fflin.base.writing import check_place, write_whole
     from fflin.robot.catalog import find_robot
     from fflin.robot.loading import load
@@ -165,7 +188,7 @@ def _init(arguments: argparse.Namespace) -> int:
     if found.path.suffix.lower() == ".toml":
         raise InputError(f"{found.path} is already a robot file; give a URDF")
     target = arguments.output_file or Path(f"{found.name}.toml")
-    check_place(target, (".toml",))
+    check_place(target)
     if target.exists() and not arguments.force:
         raise FileError(f"{target} already exists; give another name with -o, or add --force")
     urdf = found.name
@@ -176,47 +199,39 @@ def _init(arguments: argparse.Namespace) -> int:
         robot = load(arguments.robot)
     write_whole({target: draft(robot, urdf).encode()})
     load(target)  # warns of settings that the file leaves open
-    print(f"init: wrote {target}; try: fflin simulate {target}")
-    return DONE
+    text = f"robot file of '{robot.name}'; try: fflin simulate {target}"
+    return Report(robot.name, {}, text, {target: None})
 
 
-def _linearize(arguments: argparse.Namespace) -> int:
+def _linearize(arguments: argparse.Namespace) -> Report:
     if arguments.tool and (arguments.trajectory or not arguments.output_file):
         raise InputError(
             "--for saves a model at a point; give it with -o FILE and without --trajectory"
         )
+    if arguments.output_file and (arguments.tool or arguments.trajectory):
+        check_ending(arguments.output_file, RECORD.endings)
     if arguments.trajectory:
         return linearize_along(arguments)
-    if arguments.output_file:
-        from fflin.base.writing import check_place
-        from fflin.linear.files import FORMATS
-
-        check_place(arguments.output_file, FORMATS)
-    check_figure(arguments.plot)
     _, lin = linear_model(arguments)
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
+    model = lin.to(arguments.tool) if arguments.tool else lin
     if arguments.output_file:
-        model = lin.to(arguments.tool) if arguments.tool else lin
-        model.save(arguments.output_file)
         nx, nu = model.B.shape
-        print(f"linearize: wrote {arguments.output_file}: {nx} states, {nu} inputs")
+        text = f"{lin.robot}: {nx} states, {nu} inputs"
     else:
         from fflin.commands.model_text import model_report
 
-        print(headed("linearize", model_report(lin)))
-    draw(arguments.plot, "plot_matrices", lin)
-    return DONE
+        text = model_report(lin)
+    files = {arguments.output_file: model.save, arguments.plot: figure_of("plot_matrices", lin)}
+    return Report(lin.robot, model, text, files)
 
 
-def _check(arguments: argparse.Namespace) -> int:
+def _check(arguments: argparse.Namespace) -> Report:
     if arguments.trajectory:
         return check_along(arguments)
     from fflin.linear.check import check
 
-    check_figure(arguments.plot)
     robot, lin = linear_model(arguments)
     found = check(robot, lin, tolerance=arguments.tolerance)
-    print(headed("check", str(found)))
-    draw(arguments.plot, "plot_check", found)
-    return DONE if found.ok else FELL_SHORT
+    return checked(robot, found, str(found), {arguments.plot: figure_of("plot_check", found)})

@@ -3,37 +3,30 @@
 from __future__ import annotations
 
 import argparse
-import json
+from functools import cache
 from typing import Any
 
-from fflin.base.tables import headed
-from fflin.commands import DONE
 from fflin.commands.arguments import (
     OUTPUT,
+    ROWS,
     Commands,
     add,
+    add_figure,
     add_output_file,
     command,
     count_of,
     group_of,
     input_file,
     number,
-    switch,
     whole,
 )
 from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
+from fflin.commands.results import Report, figure_of
 from fflin.commands.sweeps import executor_of, going_on
-from fflin.commands.visual import (
-    add_figure,
-    add_pictures,
-    check_figure,
-    check_pictures,
-    show_motion,
-)
+from fflin.commands.visual import add_pictures, check_pictures, pictures
 
 _ROWS = 240  # of errors and inputs for a figure
-_PICTURES = ("html", "png", "gif")
 _PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
 
 
@@ -46,7 +39,7 @@ def add_commands(commands: Commands) -> None:
         "simulate a loop many times with random parameters; show quantiles, success rates, the "
         "worst runs and their causes",
         example="fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png",
-        common="runs seed until width confidence workers goal worst json joint rpy trajectory "
+        common="runs seed until width confidence workers goal worst joint rpy trajectory "
         "gain schedule duration inputs output-file plot",
     )
     add_loop(montecarlo)
@@ -85,28 +78,19 @@ def add_commands(commands: Commands) -> None:
         repeatable=True,
     )
     add(shown, "--worst", "list the K worst runs", whole, "K", default=3)
-    switch(shown, "--json", "print the results as JSON")
-    add_figure(montecarlo, "plot quantile bands over time, histograms and the worst runs")
-    add_output_file(
-        shown,
-        "save the runs to FILE: .h5 (HDF5) or .npz; the runs are collected in FILE.part, from "
-        "which the same command resumes",
-    )
-    switch(shown, "--force", "replace the file of -o even if another call wrote it")
+    add_figure(montecarlo, "quantile bands over time, histograms and the worst runs")
+    what = "the runs, which are collected in FILE.part, from which the same command resumes,"
+    force = "replace the file of -o even if another call wrote it"
+    add_output_file(shown, what, ROWS, force=force)
     add_pictures(montecarlo, "that plays the worst run, with the paths of other runs as thin lines")
 
 
-def _montecarlo(arguments: argparse.Namespace) -> int:
-    from fflin.batch.store import output_path
+def _montecarlo(arguments: argparse.Namespace) -> Report:
     from fflin.campaign.monte_carlo import monte_carlo
-    from fflin.campaign.plots import plot_campaign
     from fflin.campaign.report import campaign_record, worst_runs
     from fflin.campaign.spreads import load_dispersions
 
     path = arguments.output_file
-    check_figure(arguments.plot)
-    if path:
-        output_path(path)
     dispersions = load_dispersions(arguments.dispersions)
     robot = load_robot(arguments)
     check_pictures(robot, arguments)
@@ -117,25 +101,11 @@ def _montecarlo(arguments: argparse.Namespace) -> int:
         options |= {"executor": executor, "progress": progress, "out": path}
         options["overwrite"] = arguments.force
         campaign = monte_carlo(robot, loop.policy, dispersions, **options)
-    lines = [f"wrote {path}"] if path else []
-    try:
-        if arguments.plot:
-            plot_campaign(campaign, arguments.plot)
-            lines.append(f"wrote {arguments.plot}")
-        if any(getattr(arguments, name) for name in _PICTURES):
-            worst = campaign.replay(campaign.worst(1)[0])
-            lines += show_motion(robot, worst, arguments, campaign)
-    finally:
-        if arguments.json:
-            print(json.dumps(campaign_record(campaign, arguments.worst), indent=2))
-        else:
-            print(
-                "\n".join(
-                    [
-                        headed("montecarlo", str(campaign)),
-                        *worst_runs(campaign, arguments.worst),
-                        *lines,
-                    ]
-                )
-            )
-    return DONE
+    worst = cache(lambda: campaign.replay(campaign.worst(1)[0]))
+    files = {
+        path: None,
+        arguments.plot: figure_of("plot_campaign", campaign),
+        **pictures(robot, worst, arguments, campaign),
+    }
+    text = "\n".join([str(campaign), *worst_runs(campaign, arguments.worst)])
+    return Report(robot.name, campaign_record(campaign, arguments.worst), text, files)

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import argparse
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
 from fflin.base.errors import InputError
-from fflin.base.tables import headed
-from fflin.commands import DONE
 from fflin.commands.arguments import (
     CONTROLLER,
     OUTPUT,
+    PAGE,
+    RECORD,
     TRAJECTORY,
     Commands,
     add,
+    add_figure,
     add_frame,
     add_output_file,
     add_point,
@@ -26,14 +28,13 @@ from fflin.commands.arguments import (
     group_of,
     input_file,
     number,
-    output_file,
     whole,
 )
 from fflin.commands.loops import along
 from fflin.commands.points import linear_model, load_robot, once
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
+from fflin.commands.results import Report, figure_of
 from fflin.commands.tracking import add_trajectory
-from fflin.commands.visual import add_figure, check_figure, draw
 
 _ERRORS = "attitude [deg], position [m], joints, turning (omega_b), moving (v_b) or rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
@@ -84,7 +85,7 @@ def _add_validity(commands: Commands) -> None:
         nargs="+",
         default=(),
     )
-    add_figure(validity, "plot the results")
+    add_figure(validity, "the results")
 
 
 def _add_funnel(commands: Commands) -> None:
@@ -95,7 +96,7 @@ def _add_funnel(commands: Commands) -> None:
         "measure from which errors the regulator along a trajectory still reaches a goal",
         example="fflin funnel arm.toml --trajectory plan.csv --schedule gains.npz "
         "--goal attitude=1",
-        common="trajectory schedule goal within weights q r knots samples seed confidence threads "
+        common="trajectory schedule goal within weights q r knots samples seed threads "
         "step limits limit frame inputs output-file plot html",
     )
     add_robot(funnel)
@@ -135,25 +136,21 @@ def _add_funnel(commands: Commands) -> None:
     add(runs, "--confidence", "confidence level of the intervals", number, "P", default=0.95)
     add(runs, "--threads", "number of threads; by default one for each core", count_of)
     add(runs, "--step", "integration step [s]; chosen automatically by default", number, "H")
-    add(
-        shown, "--html", "write a page that plays the motion with the funnel as a tube", output_file
-    )
-    add_figure(funnel, "plot the funnel")
-    what = "save the funnel to FILE: .npz, .mat or .json"
-    add_output_file(shown, what, "Funnel")
+    add(shown, "--html", "write a page that plays the motion with the funnel as a tube", PAGE)
+    add_figure(funnel, "the funnel")
+    add_output_file(shown, "the funnel", RECORD, "Funnel")
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 
 _FREE = "as large as it takes; --limits urdf cuts them"
 
 
-def _validity(arguments: argparse.Namespace) -> int:
+def _validity(arguments: argparse.Namespace) -> Report:
     from fflin.base.process import Progress
     from fflin.batch.workers import OwnWorkers
     from fflin.campaign.validity import validity
 
     robot, lin = linear_model(arguments)
-    check_figure(arguments.plot)
     lin = regulated_part(lin, arguments)
     gain = gain_of(lin, arguments)
     judged = lin.discretize(arguments.dt) if arguments.dt else lin
@@ -176,25 +173,18 @@ def _validity(arguments: argparse.Namespace) -> int:
             )
     finally:
         bar.close()
-    print(headed("validity", str(found)))
+    text = str(found)
     if cut or any(name in lin.limits for name in lin.input_names):
-        print("inputs were " + ("cut to the limits of the robot" if cut else _FREE))
-    draw(arguments.plot, "plot_validity", found)
-    return DONE
+        text += "\ninputs were " + ("cut to the limits of the robot" if cut else _FREE)
+    return Report(robot.name, found, text, {arguments.plot: figure_of("plot_validity", found)})
 
 
-def _funnel(arguments: argparse.Namespace) -> int:
+def _funnel(arguments: argparse.Namespace) -> Report:
     from fflin.base.process import Progress
-    from fflin.base.record import FORMATS
-    from fflin.base.writing import check_place
     from fflin.campaign.funnel import funnel
 
     if arguments.trajectory is None and arguments.schedule is None:
         raise InputError("neither --trajectory nor --schedule is given; give one of them, or both")
-    check_figure(arguments.plot)
-    for path, endings in ((arguments.html, (".html",)), (arguments.output_file, FORMATS)):
-        if path:
-            check_place(path, endings)
     robot = load_robot(arguments)
     policy, _ = along(robot, arguments)
     given = once("--limit", arguments.limit)
@@ -208,15 +198,16 @@ def _funnel(arguments: argparse.Namespace) -> int:
         found = funnel(robot, policy, goal, progress=bar.update, **kept)
     finally:
         bar.close()
-    print(headed("funnel", str(found)))
-    draw(arguments.plot, "plot_funnel", found)
-    if arguments.output_file:
-        found.save(arguments.output_file)
-        print(f"wrote {arguments.output_file}")
-    if arguments.html:
+
+    def page(path: Path) -> None:
         from fflin.simulation.simulate import simulate
         from fflin.view.visualize import visualize
 
-        visualize(robot, simulate(robot, policy, **options), html=arguments.html, funnel=found)
-        print(f"wrote {arguments.html}: {arguments.html.stat().st_size / 1e6:.2f} MB")
-    return DONE
+        visualize(robot, simulate(robot, policy, **options), html=path, funnel=found)
+
+    files = {
+        arguments.plot: figure_of("plot_funnel", found),
+        arguments.output_file: found.save,
+        arguments.html: page,
+    }
+    return Report(robot.name, found, str(found), files)

@@ -8,13 +8,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityError
-from fflin.base.tables import headed
-from fflin.commands import DONE
 from fflin.commands.arguments import (
     CONTROLLER,
     OUTPUT,
+    RECORD,
     Commands,
     add,
+    add_figure,
     add_output_file,
     add_point,
     assignment,
@@ -25,7 +25,7 @@ from fflin.commands.arguments import (
     yes_or_no,
 )
 from fflin.commands.points import linear_model, once
-from fflin.commands.visual import add_figure, check_figure, draw
+from fflin.commands.results import Report, figure_of
 
 if TYPE_CHECKING:
     from fflin.control.gain import Gain
@@ -41,15 +41,12 @@ def add_commands(commands: Commands) -> None:
         "design a linear quadratic regulator; show gain, poles, residual and margins",
         example="fflin lqr canadarm2 -o gain.npz",
         common="joint velocity equilibrium inputs frame weights q r bryson dt reduce "
-        "wheel-speeds output-file json plot",
+        "wheel-speeds output-file plot",
     )
     add_point(lqr)
     add_weights(lqr)
-    what = "save the gain to FILE: .npz, .mat or .json"
-    shown = group_of(lqr, OUTPUT)
-    add_output_file(shown, what, "Gain")
-    switch(shown, "--json", "print the gain as JSON, with the keys of a .json file of -o")
-    add_figure(lqr, "plot the poles, and the loop of each input with its margins,")
+    add_output_file(group_of(lqr, OUTPUT), "the gain", RECORD, "Gain")
+    add_figure(lqr, "the poles, and the loop of each input with its margins,")
 
 
 def add_weights(command: argparse.ArgumentParser) -> None:
@@ -149,28 +146,12 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     return gain
 
 
-def _lqr(arguments: argparse.Namespace) -> int:
-    check_figure(arguments.plot)
-    _, lin = linear_model(arguments)
-    if arguments.output_file:
-        from fflin.base.record import FORMATS
-        from fflin.base.writing import check_place
-
-        check_place(arguments.output_file, FORMATS)
+def _lqr(arguments: argparse.Namespace) -> Report:
     from fflin.control.gain import one_sided
 
+    _, lin = linear_model(arguments)
     gain = gain_of(regulated_part(lin, arguments), arguments)
     if pulling := one_sided(gain):  # a simulation reports how much of it is cut
         warnings.warn(pulling, FflinWarning, stacklevel=2)
-    if arguments.output_file:
-        gain.save(arguments.output_file)
-    if arguments.json:
-        from fflin.base.record import json_text
-
-        print(json_text(gain), end="")
-    else:
-        print(headed("lqr", str(gain)))
-        if arguments.output_file:
-            print(f"\nwrote {arguments.output_file}")
-    draw(arguments.plot, "plot_loops", gain, report=not arguments.json)
-    return DONE
+    files = {arguments.output_file: gain.save, arguments.plot: figure_of("plot_loops", gain)}
+    return Report(gain.robot, gain, str(gain), files)

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import chosen, input_keys
-from fflin.base.tables import headed
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     OUTPUT,
     SIMULATION,
+    TABLE,
     Commands,
     add,
+    add_figure,
     add_output_file,
     command,
     count_of,
@@ -22,21 +24,13 @@ from fflin.commands.arguments import (
 )
 from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
-from fflin.commands.visual import (
-    add_figure,
-    add_pictures,
-    check_figure,
-    check_pictures,
-    show_motion,
-)
+from fflin.commands.results import Report
+from fflin.commands.visual import add_pictures, check_pictures, pictures
 
 if TYPE_CHECKING:
     from fflin.control.policies import StateFeedback
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
-
-# The options that name an output file.
-_OUTPUTS = ("output_file", "plot", "html", "png", "gif")
 
 
 def add_commands(commands: Commands) -> None:
@@ -45,7 +39,7 @@ def add_commands(commands: Commands) -> None:
         commands,
         "simulate",
         _simulate,
-        "simulate the nonlinear robot with a regulator to a target or along a trajectory",
+        "simulate the robot with a regulator to a target or along a trajectory",
         example="fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html "
         "--plot loop.png",
         common="joint rpy velocity target-joint target-rpy trajectory weights q r gain schedule "
@@ -58,7 +52,7 @@ def add_commands(commands: Commands) -> None:
         "number of steps between saved rows; chosen automatically for long runs",
         count_of,
     )
-    add_figure(simulate, "plot the nonlinear and the linear motion")
+    add_figure(simulate, "the nonlinear and the linear motion")
     shown = group_of(simulate, OUTPUT)
     add(
         shown,
@@ -67,19 +61,14 @@ def add_commands(commands: Commands) -> None:
         metavar="NAME",
         repeatable=True,
     )
-    add_output_file(shown, "save the motion to FILE: .npz, .mat, .json or .csv", "Motion")
+    add_output_file(shown, "the motion", TABLE, "Motion")
     add_pictures(simulate)
 
 
-def _simulate(arguments: argparse.Namespace) -> int:
-    from fflin.base.writing import check_place
-    from fflin.simulation.motion import FORMATS
-    from fflin.simulation.report import motion_report
+def _simulate(arguments: argparse.Namespace) -> Report:
+    from fflin.simulation.report import motion_record, motion_report
 
     robot = load_robot(arguments)
-    if arguments.output_file:
-        check_place(arguments.output_file, FORMATS)
-    check_figure(arguments.plot)
     check_pictures(robot, arguments)
     if arguments.show:
         from fflin.linear.linearization import linearize
@@ -91,32 +80,18 @@ def _simulate(arguments: argparse.Namespace) -> int:
     except InputError as error:
         hint = " (--dt)" if "time between samples" in str(error) else ""
         raise InputError(f"{error}{hint}") from None
-    interrupted = motion.stopped.startswith("interrupted")
-    left = _leave_earlier(arguments) if interrupted else []
-
-    # Printed after the files are written, so that a closed pipe does not prevent them.
-    lines = [headed("simulate", motion_report(motion))]
-    try:
-        if arguments.output_file:
-            motion.save(arguments.output_file)
-            lines.append(f"wrote {arguments.output_file}")
-        if arguments.plot:
-            motion.plot(arguments.plot, show=arguments.show or None)
-            lines.append(f"wrote {arguments.plot}")
-        lines += show_motion(robot, motion, arguments)
-    finally:
-        print("\n".join(lines))
-    if interrupted:
-        raise KeyboardInterrupt("; ".join([motion.stopped, *left]))
-    return FELL_SHORT if motion.stopped else DONE
-
-
-def _leave_earlier(arguments: argparse.Namespace) -> list[str]:
-    """Do not replace earlier files by a part of a motion; return a line for each."""
-    files = {name: path for name in _OUTPUTS if (path := getattr(arguments, name))}
-    earlier = {name: path for name, path in files.items() if path.exists()}
-    vars(arguments).update(dict.fromkeys(earlier))
-    return [f"{path} is left as it was" for path in earlier.values()]
+    return Report(
+        robot.name,
+        motion_record(motion),
+        motion_report(motion),
+        {
+            arguments.output_file: motion.save,
+            arguments.plot: partial(motion.plot, show=arguments.show or None),
+            **pictures(robot, lambda: motion, arguments),
+        },
+        FELL_SHORT if motion.stopped else DONE,
+        motion.stopped if motion.stopped.startswith("interrupted") else "",
+    )
 
 
 def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:

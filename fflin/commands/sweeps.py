@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FileError, InputError, MissingPackageError
-from fflin.commands import DONE
 from fflin.commands.arguments import (
     OUTPUT,
     POINT,
+    ROWS,
     Commands,
     add,
     add_frame,
@@ -33,6 +33,7 @@ from fflin.commands.arguments import (
     whole,
 )
 from fflin.commands.points import configuration_of, load_robot, once, velocity_of
+from fflin.commands.results import Report
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -118,12 +119,8 @@ def add_commands(commands: Commands) -> None:
     dask = "distribute the work over the workers of a dask scheduler"
     add(work, "--dask", dask, metavar="ADDRESS")
     switch(work, "--yes", "permit results of more than 10 GB")
-    add_output_file(
-        group_of(sweep, OUTPUT),
-        "save to FILE: .h5 (HDF5) or .npz; the models are collected in FILE.part, from which the "
-        "same command resumes",
-        "LinearBatch",
-    )
+    what = "the models, which are collected in FILE.part, from which the same command resumes,"
+    add_output_file(group_of(sweep, OUTPUT), what, ROWS, "LinearBatch")
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
@@ -148,7 +145,7 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
     return name, (number(low), number(high))
 
 
-def _sweep(arguments: argparse.Namespace) -> int:
+def _sweep(arguments: argparse.Namespace) -> Report:
     import pinocchio as pin
 
     from fflin.batch.store import check_room, output_path, part_of, readable
@@ -158,7 +155,6 @@ def _sweep(arguments: argparse.Namespace) -> int:
     path = arguments.output_file
     if path is None:
         raise InputError("-o is missing; give a file .h5 or .npz for the models")
-    output_path(path)
     robot = load_robot(arguments)
     # A file of configurations has its own velocities.
     at_rest: dict[str, Any] = {}
@@ -191,8 +187,10 @@ def _sweep(arguments: argparse.Namespace) -> int:
             work |= {"executor": executor, "progress": progress}
             batch = sweep(robot, q, v, u, **options, **work, out=path)
     states, inputs = len(batch.state_names), len(batch.input_names)
-    print(f"sweep: wrote {path}: {len(batch):,} points, {states} states, {inputs} inputs")
-    return DONE
+    text = f"{robot.name}: {len(batch):,} points, {states} states, {inputs} inputs"
+    names = ("state_names", "state_units", "input_names", "input_units", "frame")
+    result = {"points": len(batch), **{name: getattr(batch, name) for name in names}}
+    return Report(robot.name, result, text, {path: None})
 
 
 def _points(

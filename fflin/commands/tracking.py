@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import InputError
-from fflin.base.tables import headed
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     CONTROLLER,
     OUTPUT,
+    RECORD,
     TRAJECTORY,
     Commands,
     add,
@@ -26,9 +27,11 @@ from fflin.commands.arguments import (
 )
 from fflin.commands.points import load_robot, once
 from fflin.commands.regulator import add_weights
+from fflin.commands.results import Report
 
 if TYPE_CHECKING:
     from fflin.control.gain_schedule import GainSchedule
+    from fflin.linear.check import Check
     from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.robot.robot import Robot
 
@@ -57,8 +60,7 @@ def add_commands(commands: Commands) -> None:
         assignment,
         repeatable=True,
     )
-    what = "save the gains to FILE: .npz, .mat or .json"
-    add_output_file(group_of(tvlqr, OUTPUT), what, "GainSchedule")
+    add_output_file(group_of(tvlqr, OUTPUT), "the gains", RECORD, "GainSchedule")
 
 
 def add_trajectory(command: argparse.ArgumentParser, *, required: bool = False) -> None:
@@ -67,9 +69,9 @@ def add_trajectory(command: argparse.ArgumentParser, *, required: bool = False) 
     add(
         group,
         "--trajectory",
-        "use the trajectory in FILE: .npz, .mat, .json, or .csv with named columns, as "
-        "fflin.Trajectory.load reads it. --frame gives the axes of the data; by default the frame "
-        "named in the file, or local if the file names none",
+        "use the trajectory in FILE: .npz, .mat, .json or .csv; see fflin.Trajectory.load. --frame "
+        "gives the axes of the data; by default the frame named in the file, or local if the file "
+        "names none",
         input_file,
         required=required,
     )
@@ -102,26 +104,30 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
     return linearize_trajectory(robot, motion, strict=arguments.strict)
 
 
-def linearize_along(arguments: argparse.Namespace) -> int:
+def linearize_along(arguments: argparse.Namespace) -> Report:
     """Show or save the models along a trajectory."""
     along = models_along(arguments)
-    if getattr(arguments, "dt", None) is not None:
+    if arguments.dt is not None:
         along = along.discretize(arguments.dt)
-    say("linearize", along, arguments)
-    return DONE
+    return Report(along.robot.name, along, str(along), {arguments.output_file: along.save})
 
 
-def check_along(arguments: argparse.Namespace) -> int:
+def check_along(arguments: argparse.Namespace) -> Report:
     """Check the models along a trajectory."""
     from fflin.linear.check import held_to
 
     along = models_along(arguments)
     found = held_to(arguments.tolerance, along.check())
-    print(f"{headed('check', str(found))}\n\n{along}")
-    return DONE if found.ok else FELL_SHORT
+    return checked(along.robot, found, f"{found}\n\n{along}")
 
 
-def _tvlqr(arguments: argparse.Namespace) -> int:
+def checked(robot: Robot, found: Check, text: str, files: Any = MappingProxyType({})) -> Report:
+    """Return the report of a check."""
+    result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
+    return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)
+
+
+def _tvlqr(arguments: argparse.Namespace) -> Report:
     if arguments.reduce:
         raise InputError(
             "--reduce does not apply along a trajectory, because the finite-horizon cost always "
@@ -129,8 +135,7 @@ def _tvlqr(arguments: argparse.Namespace) -> int:
         )
     along = models_along(arguments)
     schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
-    say("tvlqr", schedule, arguments)
-    return DONE
+    return Report(along.robot.name, schedule, str(schedule), {arguments.output_file: schedule.save})
 
 
 def schedule_of(
@@ -147,12 +152,3 @@ def schedule_of(
         Q, R, _, rule = rule_weights(steady_end(along), arguments.weights, given, pace=pace)
         options |= {"Q": Q, "R": R, "weights": None, "rule": rule}
     return tvlqr(along, Qf=Qf, **options)
-
-
-def say(command: str, made: Any, arguments: argparse.Namespace, text: str = "") -> None:
-    """Save a result if -o is given, and print it."""
-    if arguments.output_file:
-        made.save(arguments.output_file)
-    print(headed(command, text or str(made)))
-    if arguments.output_file:
-        print(f"wrote {arguments.output_file}")

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fflin.commands import DONE
 from fflin.commands.arguments import (
+    ANIMATION,
     OUTPUT,
+    PAGE,
+    PICTURE,
     POINT,
     ROBOT,
     Commands,
@@ -21,11 +24,11 @@ from fflin.commands.arguments import (
     command,
     group_of,
     number,
-    output_file,
     switch,
     yes_or_no,
 )
 from fflin.commands.points import configuration_of, load_robot
+from fflin.commands.results import Report
 
 if TYPE_CHECKING:
     from fflin.campaign.campaign import Campaign
@@ -61,15 +64,15 @@ def add_pictures(
 ) -> None:
     """Add the options of pages, pictures and animations of a motion."""
     group = group_of(command, OUTPUT)
-    add(group, "--html", f"write a page {page}", output_file)
+    add(group, "--html", f"write a page {page}", PAGE)
     add(
         group,
         "--png",
         "write a picture (needs Chromium): a strip of four images, or of images at the times of "
         "--times",
-        output_file,
+        PICTURE,
     )
-    add(group, "--gif", "write an animation (needs Chromium)", output_file)
+    add(group, "--gif", "write an animation (needs Chromium)", ANIMATION)
     add(group, "--times", "times of the pictures [s]", number, "T", nargs="+")
     _add_scene(group)
     add(group, "--fps", "frames per second of playback", number, "FPS", default=30.0)
@@ -92,35 +95,8 @@ def _add_scene(group: Container) -> None:
     )
 
 
-def add_figure(command: argparse.ArgumentParser, what: str) -> None:
-    """Add --plot FILE."""
-    text = f"{what} to FILE: .png, .pdf or .svg"
-    add(group_of(command, OUTPUT), "--plot", text, output_file)
-
-
-def check_figure(path: Path | None) -> None:
-    """Refuse a figure that cannot be drawn or written, before any computation."""
-    if path is None:
-        return
-    from fflin.base.figures import FORMATS, require_matplotlib
-    from fflin.base.writing import check_place
-
-    check_place(path, FORMATS)
-    require_matplotlib()
-
-
-def draw(path: Path | None, figure: str, drawn: object, *, report: bool = True) -> None:
-    """Draw with the public function of this name and report the file, if a path is given."""
-    if path is not None:
-        import fflin
-
-        getattr(fflin, figure)(drawn, path)
-        if report:
-            print(f"wrote {path}")
-
-
 def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
-    """Refuse the options that `show_motion` refuses, before the simulation."""
+    """Refuse the options that `pictures` refuses, before the simulation."""
     from fflin.view.visualize import check_outputs, check_rates, check_times, check_tool
 
     if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
@@ -134,21 +110,25 @@ def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
         check_times(arguments.times, 0.0, duration)
 
 
-def show_motion(
-    robot: Robot, motion: Motion, arguments: argparse.Namespace, cloud: Campaign | None = None
-) -> list[str]:
-    """Write the files of the options of `add_pictures`; return a line for each."""
-    files = {name: path for name in _FILES if (path := getattr(arguments, name))}
-    if not files:
-        return []
-    from fflin.view.visualize import visualize
-
+def pictures(
+    robot: Robot,
+    motion: Callable[[], Motion],
+    arguments: argparse.Namespace,
+    cloud: Campaign | None = None,
+) -> dict[Path | None, Callable[[Path], Any]]:
+    """Return the files of the options of `add_pictures`, with the functions that write them."""
     how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *_SHOWN)}
-    visualize(robot, motion, **files, **how, cloud=cloud)
-    return [f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB" for path in files.values()]
+
+    def show(path: Path) -> None:
+        from fflin.view.visualize import visualize
+
+        kind: Any = {path.suffix.removeprefix("."): path}
+        visualize(robot, motion(), **kind, **how, cloud=cloud)
+
+    return {getattr(arguments, name): show for name in _FILES}
 
 
-def _view(arguments: argparse.Namespace) -> int:
+def _view(arguments: argparse.Namespace) -> Report:
     from fflin.robot.fields import combined
     from fflin.view.live import Live
     from fflin.view.visualize import visualize
@@ -162,4 +142,4 @@ def _view(arguments: argparse.Namespace) -> int:
     if not arguments.no_open:
         live.open()
     live.wait()
-    return DONE
+    return Report(robot.name, {}, f"{robot.name}: the view is closed")

@@ -32,6 +32,12 @@ def write_csv(path: Path, traj: Any) -> None:
     write_table(path, names, rows, (traj.hold, traj.frame))
 
 
+def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
+    """Return the names with their units, such as ``t [s]``; none for a figure without dimension."""
+    pairs = zip(names, units, strict=True)
+    return [name if unit in ("", "1") else f"{name} [{unit}]" for name, unit in pairs]
+
+
 def write_table(path: Path, names: Sequence[str], rows: Array, last: Sequence[str] = ()) -> None:
     """Write named columns, and behind them what is the same in every row."""
     table = io.StringIO()

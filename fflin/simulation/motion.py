@@ -16,7 +16,7 @@ from fflin.base.record import Design
 from fflin.base.validation import Array, instance
 from fflin.base.writing import as_path, check_ending
 from fflin.dynamics.state import attitude_errors, moving_errors
-from fflin.linear.trajectory_files import write_table
+from fflin.linear.trajectory_files import labels, write_table
 from fflin.robot.orbit import CircularOrbit
 from fflin.simulation.report import Passed, Saturated, limited, motion_report, passed, saturated
 
@@ -275,7 +275,9 @@ class Motion(Design):
     def save(self, path: str | Path) -> None:
         """Save the motion to a .npz, .mat, .json or .csv file, atomically.
 
-        A .csv file contains only the times, states and inputs, and cannot be loaded.
+        A .csv file is a table of times, states and inputs for other programs. The first line has
+        the names with units, such as ``omega_b.x [rad/s]`` and ``u.tau_b.x [N m]``. `load` cannot
+        read it.
 
         Raises
         ------
@@ -289,7 +291,8 @@ class Motion(Design):
             return
         record.require_finite({"t": self.t, "x": self.x, "u": self.u})
         names = ["t", *self.state_names, *(f"u.{name}" for name in self.input_names)]
-        write_table(target, names, np.column_stack((self.t, self.x, self.u)))
+        columns = labels(names, ["s", *self.state_units, *self.input_units])
+        write_table(target, columns, np.column_stack((self.t, self.x, self.u)))
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the motion as `plot_motion` does, and save the figure if a path is given."""

@@ -6,6 +6,7 @@ from textwrap import shorten
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid
@@ -129,6 +130,21 @@ def _shown(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 1000.0 else f"{value:.0f}"
 
 
+def settled_at(sizes: Array) -> NDArray[np.intp]:
+    """Return the row from which errors (N, ..) have settled; N for errors that have not."""
+    outside = sizes > np.maximum(SETTLED * sizes.max(axis=0), THERE)
+    first = len(sizes) - outside[::-1].argmax(axis=0)
+    return np.where(outside.any(axis=0), first, 0)
+
+
+def is_late(settled: Array | NDArray[np.intp] | int, count: int) -> Any:
+    """Whether errors settle so late in a run of `count` rows that they count as not settled.
+
+    An error that passes through zero is small for a moment.
+    """
+    return settled > (1.0 - DWELL) * count
+
+
 class Course(NamedTuple):
     """History (N,) of the size of one kind of error, and whether the policy feeds it back."""
 
@@ -140,13 +156,12 @@ class Course(NamedTuple):
     @property
     def settled(self) -> int:
         """The row from which on it has settled; N where it has not."""
-        outside = np.flatnonzero(self.size > max(SETTLED * float(self.size.max()), THERE))
-        return int(outside[-1]) + 1 if len(outside) else 0
+        return int(settled_at(self.size))
 
     @property
     def late(self) -> bool:
-        """Whether it has not settled: what flies through its target is there for a moment."""
-        return self.settled > (1.0 - DWELL) * len(self.size)
+        """Whether it has not settled."""
+        return bool(is_late(self.settled, len(self.size)))
 
     @property
     def last(self) -> str:
@@ -208,6 +223,40 @@ def motion_report(motion: Any) -> str:
         where = f"{size} in {motion.state_names[most]}"
         parts.append(f"largest difference from the linear model: {where}")
     return "\n".join(parts)
+
+
+def motion_record(motion: Any) -> dict[str, Any]:
+    """Return the figures of the report by name."""
+    t = motion.t
+    errors = {
+        each.title: {
+            "unit": each.unit,
+            "initial": each.size[0],
+            "largest": each.size.max(),
+            "final": each.size[-1],
+            "settled": None if each.late else t[each.settled],
+        }
+        for each in courses(motion)
+    }
+    return {
+        "stopped": motion.stopped,
+        "duration": t[-1],
+        "rows": len(t),
+        "frame": motion.frame,
+        "engine": motion.engine,
+        "errors": errors,
+        "state_names": motion.state_names,
+        "state_units": motion.state_units,
+        "x": motion.x[-1],
+        "input_names": motion.input_names,
+        "input_units": motion.input_units,
+        "largest_inputs": np.abs(motion.u).max(axis=0),
+        "limits_exceeded": motion.passed,
+        "saturated": motion.saturated,
+        "energy": motion.energy[[0, -1]],
+        "momentum_drift": motion.momentum_drift.max(),
+        "notes": motion.notes,
+    }
 
 
 def _phases(motion: Any) -> list[list[str]]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.record import write_record
+from fflin.base.record import Record, write_record
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, FrozenArrays, as_double, numbers, whole
 from fflin.base.writing import as_path
@@ -264,14 +264,18 @@ class Sensitivity:
         FileError
             If the file has another ending or cannot be written.
         """
-        every = self.parameters.values()
-        record = record_of(self.lin) | {
-            "parameters": list(self.names),
-            "units": [one.unit for one in every],
-            "values": np.array([one.value for one in every]),
-            **dict(zip(("dA", "dB", "dC", "dD", "df0", "dy0"), self._all, strict=True)),
-        }
-        write_record(as_path(path), record, sealed=self.lin.verified)
+        write_record(as_path(path), sensitivity_record(self), sealed=self.lin.verified)
+
+
+def sensitivity_record(found: Sensitivity) -> Record:
+    """Return what a file holds of a `Sensitivity`."""
+    every = found.parameters.values()
+    return record_of(found.lin) | {
+        "parameters": list(found.names),
+        "units": [one.unit for one in every],
+        "values": np.array([one.value for one in every]),
+        **dict(zip(("dA", "dB", "dC", "dD", "df0", "dy0"), found._all, strict=True)),
+    }
 
 
 def sensitivity(lin: LinearModel) -> Sensitivity:

@@ -1,5 +1,6 @@
 """Campaigns: the runs are those of `simulate`, equal for any workers, and statistics that hold."""
 
+import csv
 import itertools
 import os
 import sys
@@ -11,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+import scipy.io
 from scipy import stats
 from scipy.linalg import expm
 
@@ -421,6 +423,28 @@ def test_it_is_saved_and_loaded_to_the_last_bit(campaign, ending, tmp_path):
     (tmp_path / f"runs{ending}").write_bytes(content)
     with any_wording(), pytest.raises(fflin.FileError):
         fflin.Campaign.load(tmp_path / f"runs{ending}")
+
+
+def test_its_tables_have_every_figure_with_its_unit(tmp_path):
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    given, options = {"q_b": 0.02}, {"runs": 3, "duration": 0.2, "dt": 0.05, "engine": "python"}
+    campaign = fflin.monte_carlo(robot, policy, given, **options)
+    for ending in ("csv", "mat"):
+        campaign.save(tmp_path / f"runs.{ending}")
+    names, *rows = csv.reader((tmp_path / "runs.csv").read_text().splitlines())
+    saved = scipy.io.loadmat(tmp_path / "runs.mat", simplify_cells=True)
+    assert saved["columns"].tolist() == names
+    values = np.array(rows, dtype=float)
+    np.testing.assert_array_equal(saved["runs"], values)
+    columns = dict(zip(names, values.T, strict=True))
+    shown = {"attitude [deg]": "attitude", "settle joints [s]": "settle joints", "end [s]": "end"}
+    shown |= {"worst tau_b.x [N m]": "worst tau_b.x", "omega_b.z [rad/s]": "omega_b.z"}
+    shown |= {f"drawn {name}": f"drawn {name}" for name in campaign.names}
+    for column, name in shown.items():
+        np.testing.assert_array_equal(columns[column], campaign.values(name))
+    assert (columns["stop"] == 0.0).all()
 
 
 @pytest.mark.exhaustive

@@ -8,10 +8,12 @@ import pytest
 
 import fflin
 from fflin.campaign.runs import CampaignJob
-from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, kinds_of
+from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, kinds_of, marks_of, outcome_of
 from fflin.dynamics.state import attitude_errors, moving_errors, states_of, unwound
+from fflin.kernel.statistics import note
 from fflin.kernel.tree import LANES
 from fflin.simulation.report import DWELL, SETTLED, THERE
+from fflin.simulation.run import Recording
 from tests.support.robots import LINKS, MIMIC, free_body
 
 STEPS = 90
@@ -77,18 +79,44 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
         robot, rng = made(tmp_path), np.random.default_rng(3)
         options = {"duration": 0.01 * (STEPS - 1), "dt": 0.01, "frame": frame, "histories": 11}
         job = CampaignJob(robot, None, {"q_b.x": 0.01}, 0, "python", options)
-        state, target, path = job.plant.state, job.target, []
+        state, target = job.plant.state, job.target
         q, nu, u = (each[:, 0] for each in rows_of(state, rng, len(job.plan.initial)))
         if follows:
             star = [each[:, 0] for each in rows_of(state, rng, 0)[:2]]
-            target, path = states_of(state, *star), [each.ravel() for each in star]
-        found = RunStatistics(job.plan, state, target, job.steps, path, 1)
-        rows = np.hstack((q, nu, u, np.zeros((STEPS, 9)))).ravel().tolist()
-        found.add(0, [each[:, None] for each in (q, nu, u)], rows)
-        outcome = found.outcome(STEPS - 1, np.zeros(1))
+            target = states_of(state, *star)
+        rest = [np.zeros((STEPS, size)) for size in (6, 3)]
+        t, v = job.plan.times.dt * np.arange(STEPS), state.spread(nu)
+        run = Recording(t, q, v, u, *rest, STEPS - 1, "", "python")
+        outcome = outcome_of(job.plan, state, target, job.steps, run)
         for name, expected in defined(job, target, q, nu, u, 0.0).items():
-            value = getattr(outcome, name)[0]
+            value = outcome[name][0]
             np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-10, err_msg=name)
+        # The kernel's statistics, uncompiled.
+        path = [each.ravel() for each in star] if follows else []
+        marks = as_lists(marks_of(job.plan, state, target, job.steps, path))
+        rows = np.hstack((q, nu, u, np.zeros((STEPS, 9))))
+        for first, last in itertools.pairwise((0, 1, 33, STEPS)):
+            note(marks, rows[first:last].ravel().tolist(), first, last - first)
+        expected = defined(job, target, q, nu, u, 0.0)
+        settled = (np.array(marks.outside) + 1.0) * 0.01
+        settled[settled > 0.01 * (1.0 - DWELL) * STEPS] = np.inf
+        for name, value in (
+            ("largest_x", marks.largest_x),
+            ("largest_u", marks.largest_u),
+            ("errors", marks.sizes),
+            ("largest", marks.largest),
+            ("error_history", np.reshape(marks.errors, (-1, len(KINDS)))),
+            ("settle", settled),
+            ("x", marks.law.x),
+        ):
+            np.testing.assert_allclose(value, expected[name], rtol=1e-12, atol=1e-10)
+
+
+def as_lists(value):
+    """Nested named tuples of arrays with lists, as the kernel runs uncompiled on a run."""
+    if isinstance(value, tuple):
+        return type(value)._make(map(as_lists, value))
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 @pytest.mark.compiled
@@ -113,7 +141,7 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
     rows = np.concatenate((q, nu, u, np.zeros((STEPS, LANES, 9))), axis=2).transpose(0, 2, 1)
     stop, ends = np.arange(LANES) % 3.0, []
     for cuts in ([0, STEPS], [0, 1, 33, STEPS]):
-        lanes = RunStatistics(job.plan, state, home, job.steps, way, LANES)
+        lanes = RunStatistics(job.plan, state, home, job.steps, way)
         lanes.reset()
         for first, last in itertools.pairwise(cuts):
             some = [each[first:last] for each in (q, nu, u)]
@@ -126,9 +154,9 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
         ]
         for name in Outcome._fields:
             expected = np.array([each[name] for each in plain])
-            found = getattr(ends[-1], name)
+            found = ends[-1][name]
             assert found.shape == expected.shape
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-10, err_msg=name)
-    assert np.isfinite(ends[0].settle).any() and (ends[0].largest[:, :2] > 0.1).all()
-    for one, other in zip(*ends, strict=True):
-        assert np.array_equal(one, other)
+    assert np.isfinite(ends[0]["settle"]).any() and (ends[0]["largest"][:, :2] > 0.1).all()
+    for name, one in ends[0].items():
+        assert np.array_equal(one, ends[1][name])

@@ -22,7 +22,7 @@ import fflin
 from fflin.base.intervals import clopper_pearson
 from fflin.batch.workers import OwnWorkers
 from fflin.campaign.dispersions import Draws
-from fflin.campaign.settling import Loop, SettlingJob
+from fflin.campaign.settling import Loop, settling_runs
 from fflin.campaign.validity import _LEVELS, _crossing, _slope
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.run import go
@@ -77,7 +77,7 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
     lin, gain = held(robot)
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(1), 40.0, 0.3, 0.5)
-    job = SettlingJob(loop, False, None, 1.0)
+    job = settling_runs(loop, False, None, 1.0)
     plan, plant = job.plan_of(x - lin.x0)
     times = plan.times._replace(dt=0.02, steps=200, every=1)
     run = go(replace(plan, times=times), plant, Conserved(robot, plan.q))
@@ -186,8 +186,8 @@ def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
     lin, gain = held(robot)
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(3), 0.0, 0.4, 0.0)
-    job = SettlingJob(loop, False, None, 0.0, engine="python")
-    job.every, times, e = 1, job.plan.times, x - lin.x0
+    job = settling_runs(loop, False, None, 0.0)
+    job.rule.every, times, e = 1, job.plan.times, x - lin.x0
     step, sizes = expm(loop.rate * times.dt), []
     for _ in range(times.steps):
         sizes.append(loop.size(e))

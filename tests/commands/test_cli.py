@@ -198,7 +198,8 @@ def test_linearize_for_a_tool_saves_what_python_gives(tmp_path):
         *("linearize", "cubesat", "--rpy", "20", "10", "0", "--velocity", "omega_b.z=0.2"),
         *("--for", "drake", "-o", str(tmp_path / "a.mat")),
     )
-    assert code == 0 and out.endswith("a.mat: 13 states, 6 inputs\n")
+    lines = ["linearize: cubesat: 13 states, 6 inputs", f"wrote {tmp_path / 'a.mat'}"]
+    assert code == 0 and out.splitlines() == lines
     saved = fflin.ToolModel.load(tmp_path / "a.mat")
     robot = fflin.load("cubesat")
     turned = pin.SE3(pin.rpy.rpyToMatrix(*np.radians((20.0, 10.0, 0.0))), np.zeros(3))

@@ -6,7 +6,7 @@ import os
 import pytest
 
 from fflin.commands import cli
-from fflin.commands.arguments import input_file, input_name, output_file
+from fflin.commands.arguments import OutputFile, input_file, input_name
 from tests.support.commands import run
 from tests.support.messages import any_wording
 
@@ -25,7 +25,7 @@ def pairs():
     """Yield (command, option that is read, option that is written) for all of them."""
     for name, actions in commands():
         reads = [each for each in actions if each.type in (input_file, input_name)]
-        writes = [each for each in actions if each.type is output_file]
+        writes = [each for each in actions if isinstance(each.type, OutputFile)]
         for read, write in itertools.product(reads, writes):
             yield pytest.param(name, actions, read, write, id=f"{name} {read.dest} {write.dest}")
 
@@ -58,16 +58,16 @@ def test_no_output_is_what_an_option_reads(
 
 
 def test_every_option_that_takes_a_file_says_whether_it_is_written():
-    kinds = {input_file, input_name, output_file}
     count = 0
     for name, actions in commands():
         for action in actions:
             metavar, words = str(action.metavar), action.help or ""
             takes = any(word in metavar for word in ("FILE", "ROBOT", "URDF", "DISPERSIONS"))
-            assert takes == (action.type in kinds), (name, action.dest)
+            reads = action.type in (input_file, input_name)
+            assert takes == (reads or isinstance(action.type, OutputFile)), (name, action.dest)
             if takes:
                 writes = words.startswith(("write", "save", "plot", "output file"))
-                assert writes == (action.type is output_file), (name, action.dest)
+                assert writes == isinstance(action.type, OutputFile), (name, action.dest)
                 count += 1
     assert count > 40
 

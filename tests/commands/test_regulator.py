@@ -1,6 +1,5 @@
 """fflin lqr."""
 
-import json
 import re
 import warnings
 
@@ -166,10 +165,3 @@ def test_what_the_limits_cannot_hold_in_gravity_is_said_and_not_refused(capsys):
         code, out, err = run(capsys, "servicer_7dof", *options)
     assert code == 0 and says(err, "tau_m.panel_left")
     assert says(out, "tau_m.panel_left, tau_m.panel_right")
-
-
-def test_lqr_prints_the_json_of_its_file(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(["lqr", "planar_detumble", "--json", "-o", "gain.json"]) == 0
-    out = capsys.readouterr().out
-    assert out == (tmp_path / "gain.json").read_text() and json.loads(out)["kind"] == "Gain"

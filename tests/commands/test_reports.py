@@ -23,7 +23,7 @@ COMMANDS = {
     "uncertain": (("--vary", "base.mass=0.2"), r"1 parameter"),
     "simulate": (("--rpy", 5, 0, 0), "settled after .*; saturated inputs: none"),
     "validity": (("--samples", 3), "within 10 %"),
-    "init": (("--force", "-o", "own.toml"), r"wrote own\.toml"),
+    "init": (("--force", "-o", "own.toml"), r"try: fflin simulate own\.toml"),
 }
 MOST = 24  # rows of a table: about a screen
 

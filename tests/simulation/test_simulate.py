@@ -385,8 +385,12 @@ def test_csv_has_names_and_rows(tmp_path):
     motion = fflin.simulate(robot, duration=0.1, dt=0.05)
     motion.save(tmp_path / "m.csv")
     lines = (tmp_path / "m.csv").read_text().splitlines()
-    assert lines[0].split(",")[:3] == ["t", "q_b.x", "q_b.y"]
+    names = lines[0].split(",")
+    assert names[:3] == ["t [s]", "q_b.x", "q_b.y"] and "omega_b.x [rad/s]" in names
+    assert names[-1] == f"u.{motion.input_names[-1]} [{motion.input_units[-1]}]"
     assert len(lines) == 4
+    values = np.array([line.split(",") for line in lines[1:]], dtype=float)
+    np.testing.assert_array_equal(values, np.column_stack((motion.t, motion.x, motion.u)))
 
 
 @pytest.mark.parametrize(

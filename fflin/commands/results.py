@@ -1,0 +1,133 @@
+"""Result of a command: the files that it writes, and its report as text or as JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from fflin.base import __version__
+from fflin.base.tables import first_paragraph, headed
+from fflin.commands import DONE
+
+# Files whose size is reported.
+_PAGES = (".html", ".gif")
+
+
+@dataclass(frozen=True)
+class Report:
+    """Report of a command.
+
+    Attributes
+    ----------
+    robot : str or None
+        Name of the robot.
+    result : object
+        Result of the library, or a mapping, whose fields --json prints.
+    text : str
+        Report without --json. Its first paragraph is the entry "result" of --json.
+    files : mapping
+        {path: function that writes the file, or None if it is written}. A path None is ignored.
+    code : int
+        Exit code.
+    interrupted : str
+        Reason of an interruption, or "". Existing files are not replaced after an interruption.
+    """
+
+    robot: str | None
+    result: Any
+    text: str
+    files: Mapping[Path | None, Callable[[Path], Any] | None] = field(default_factory=dict)
+    code: int = DONE
+    interrupted: str = ""
+
+
+def finish(report: Report, arguments: argparse.Namespace) -> int:
+    """Write the files of a report, print it, and return the exit code."""
+    command, said = arguments.command.prog.split()[-1], [report.interrupted]
+    written: list[Path] = []
+    # The report is printed after the files are written, so that a closed pipe does not prevent
+    # them, and also if one of them cannot be written.
+    try:
+        for path, write in report.files.items():
+            if path is None:
+                continue
+            if report.interrupted and path.exists():
+                said.append(f"{path} is left as it was")
+                continue
+            if write:
+                write(path)
+            written.append(path)
+    finally:
+        if arguments.json:
+            print(json.dumps(_record(command, report, written), allow_nan=False))
+        else:
+            print("\n".join([headed(command, report.text), *map(_wrote, written)]))
+    if report.interrupted:
+        raise KeyboardInterrupt("; ".join(said))
+    return report.code
+
+
+def figure_of(name: str, drawn: object) -> Callable[[Path], Any]:
+    """Return a function that draws with the public function of this name and saves the figure."""
+
+    def save(path: Path) -> None:
+        import fflin
+
+        getattr(fflin, name)(drawn, path)
+
+    return save
+
+
+def _wrote(path: Path) -> str:
+    size = f": {path.stat().st_size / 1e6:.2f} MB" if path.suffix in _PAGES else ""
+    return f"wrote {path}{size}"
+
+
+def _record(command: str, report: Report, files: list[Path]) -> dict[str, Any]:
+    """Return what --json prints: the entries of every command, then the fields of the result."""
+    head = {
+        "fflin": __version__,
+        "command": command,
+        "robot": report.robot,
+        "result": first_paragraph(report.text),
+        "files": [str(path) for path in files],
+    }
+    return head | {key: x for key, x in plain(report.result).items() if key not in head}
+
+
+def plain(value: Any) -> Any:
+    """Return a value of JSON: arrays as lists, results as objects, and null if not finite."""
+    import numpy as np
+
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, complex):
+        value = {"real": value.real, "imag": value.imag}
+    value = _fields(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(x) for key, x in value.items() if str(key)[0] != "_"}
+    if isinstance(value, list | tuple):
+        return [plain(x) for x in value]
+    return value if not isinstance(value, float) or math.isfinite(value) else None
+
+
+def _fields(value: Any) -> Any:
+    """Return the fields of a result, as its file has them if it can be saved."""
+    from fflin.base.record import Design, record_of
+    from fflin.linear.files import record_of as record_of_model
+    from fflin.linear.model import LinearModel
+
+    if isinstance(value, LinearModel):
+        return record_of_model(value)
+    if isinstance(value, Design):
+        return record_of(value)
+    if is_dataclass(value):
+        own = {each.name: getattr(value, each.name) for each in fields(value)}
+        # The model of a result is a result of its own.
+        return {key: x for key, x in own.items() if not isinstance(x, LinearModel)}
+    return value._asdict() if hasattr(value, "_asdict") else value

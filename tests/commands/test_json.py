@@ -1,0 +1,167 @@
+"""With --json every command prints one object of one schema, with the figures of the Python API."""
+
+import json
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.commands import cli
+from tests.support.commands import run
+
+HEAD = ["fflin", "command", "robot", "result", "files"]
+ROBOT = "planar_detumble"
+
+
+def of_modes(modes):
+    return [mode.pole for mode in modes.modes]
+
+
+def complex_of(each):
+    return complex(each["real"], each["imag"])
+
+
+class Python:
+    """The same robot in Python."""
+
+    def __init__(self, folder):
+        self.folder, self.robot = folder, fflin.load(ROBOT)
+        self.lin = fflin.linearize(self.robot)
+        self.gain = fflin.lqr(self.lin)
+        self.loop = fflin.StateFeedback(self.lin, self.gain.K)
+        self.plan = fflin.Trajectory.load(folder / "plan.npz", self.robot)
+        self.along = fflin.linearize_trajectory(self.robot, self.plan)
+        self.short = {"duration": 0.4, "dt": 0.02, "limits": "urdf"}
+        turn = fflin.velocity(self.robot, {"omega_b.z": 0.01})
+        self.motion = fflin.simulate(self.robot, self.loop, v0=turn, **self.short)
+        spread = fflin.load_dispersions(folder / "u.toml")
+        self.campaign = fflin.monte_carlo(self.robot, self.loop, spread, runs=9, **self.short)
+        self.region = fflin.validity(self.robot, self.lin, self.gain, samples=3)
+        ranges = {"base.mass": 0.2}
+        self.lft = fflin.uncertain(self.robot, ranges).lft()
+
+
+# Of each command: what it is given, and pairs of a figure that it prints and that of Python.
+CASES = {
+    "robots": ("", lambda x, py: [(x["robots"][ROBOT]["mass"], py.robot.mass)]),
+    "info": (
+        ROBOT,
+        lambda x, py: [(x["mass"], py.robot.mass), (len(x["state_names"]), len(py.lin.A))],
+    ),
+    "init": (f"{ROBOT} -o own.toml", lambda x, py: []),
+    "linearize": (ROBOT, lambda x, py: [(x["A"], py.lin.A), (x["B"], py.lin.B)]),
+    "check": (ROBOT, lambda x, py: [(len(x["rows"]), len(py.check.rows))]),
+    "analyze": (
+        ROBOT,
+        lambda x, py: [
+            (x["controllability"]["dimension"], fflin.controllability(py.lin).dimension),
+            (x["observability"]["dimension"], fflin.observability(py.lin).dimension),
+        ],
+    ),
+    "modes": (
+        f"{ROBOT} --stiffness joint_1=3",
+        lambda x, py: [
+            (list(map(complex_of, (m["pole"] for m in x["modes"]["modes"]))), of_modes(py.sprung))
+        ],
+    ),
+    "validity": (
+        f"{ROBOT} --samples 3",
+        lambda x, py: [
+            (list(x["holds"].values()), list(py.region.holds.values())),
+            (x["rate"], py.region.rate),
+        ],
+    ),
+    "sensitivity": (
+        ROBOT,
+        lambda x, py: [(x["dA"][0], fflin.sensitivity(py.lin)[x["parameters"][0]].dA)],
+    ),
+    "uncertain": (
+        f"{ROBOT} --vary base.mass=0.2",
+        lambda x, py: [(x["A"], py.lft.A), (x["D11"], py.lft.D11)],
+    ),
+    "funnel": (
+        f"{ROBOT} --trajectory plan.npz --goal attitude=1 --knots 2 --samples 4 --threads 1",
+        lambda x, py: [(x["P"], py.funnel.P), (x["tried"], py.funnel.tried)],
+    ),
+    "lqr": (ROBOT, lambda x, py: [(x["K"], py.gain.K), (x["P"], py.gain.P)]),
+    "tvlqr": (
+        f"{ROBOT} --trajectory plan.npz",
+        lambda x, py: [(x["K"], py.schedule.K), (x["t"], py.schedule.t)],
+    ),
+    "simulate": (
+        f"{ROBOT} --velocity omega_b.z=0.01 --duration 0.4 --step 0.02",
+        lambda x, py: [
+            (x["x"], py.motion.x[-1]),
+            (x["errors"]["attitude"]["final"], py.motion.attitude_error[-1]),
+            (x["energy"], py.motion.energy[[0, -1]]),
+        ],
+    ),
+    "export": ("gain.npz -o flight", lambda x, py: []),
+    "sweep": (f"{ROBOT} --random 3 -o many.npz", lambda x, py: [(x["points"], 3)]),
+    "montecarlo": (
+        f"{ROBOT} u.toml --runs 9 --duration 0.4 --step 0.02",
+        lambda x, py: [
+            (x["quantiles"]["attitude"]["0.5"], py.campaign.quantile("attitude", 0.5)),
+            (x["worst"], py.campaign.worst(3)),
+        ],
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("json")
+    (folder / "u.toml").write_text('[dispersions]\n"q_m" = 0.05\n"omega_b.z" = 0.02\n')
+    robot = fflin.load(ROBOT)
+    fflin.lqr(fflin.linearize(robot)).save(folder / "gain.npz")
+    spin = fflin.velocity(robot, {"omega_b.z": 0.05})
+    fflin.simulate(robot, v0=spin, duration=1.0).trajectory().save(folder / "plan.npz")
+    there = Python(folder)
+    there.check = fflin.check(robot, there.lin)
+    there.schedule = fflin.tvlqr(there.along)
+    there.sprung = fflin.modes(fflin.linearize(fflin.load(ROBOT, stiffness={"joint_1": 3.0})))
+    goal = {"knots": 2, "samples": 4, "threads": 1, "limits": "urdf"}
+    there.funnel = fflin.funnel(robot, there.schedule, {"attitude": 1.0}, **goal)
+    return there
+
+
+@pytest.mark.parametrize("command", CASES)
+def test_json_has_one_schema_and_the_figures_of_python(command, python):
+    words, figures = CASES[command]
+    code, out, err = run(command, *words.split(), "--json", cwd=python.folder)
+    assert code == 0 and "error" not in err and out.count("\n") == 1
+    said = json.loads(out, parse_constant=pytest.fail)  # NaN is no JSON
+    assert list(said)[: len(HEAD)] == HEAD
+    assert (said["fflin"], said["command"]) == (fflin.__version__, command)
+    assert said["robot"] == (None if command == "robots" else ROBOT)
+    assert said["result"] and "\n" not in said["result"]
+    for shown, there in figures(said, python):
+        # Relative to the largest: two runs of an integrator differ by its rounding.
+        assert np.shape(shown) == np.shape(there)
+        assert np.abs(np.subtract(shown, there)).max() <= 1e-9 * np.abs(there).max()
+    for name in said["files"]:
+        assert (python.folder / name).stat().st_size
+
+
+def test_every_command_but_view_is_tried():
+    assert {*cli._MODULES} - {"view"} == {*CASES}
+
+
+def test_the_first_paragraph_of_the_text_is_the_result(python):
+    text, said = (run("lqr", ROBOT, *more)[1] for more in ((), ("--json",)))
+    assert f"lqr: {json.loads(said)['result']}" == " ".join(text.split("\n")[0].split())
+
+
+def test_an_error_leaves_stdout_empty_and_a_failed_check_prints_json(python):
+    assert run("lqr", "nosuch", "--json")[:2] == (2, "")
+    code, out, _ = run("check", ROBOT, "--tolerance", 1e-30, "--json")
+    assert code == 1 and json.loads(out)["ok"] is False
+    worst = max(row["error"] for row in json.loads(out)["rows"])
+    assert json.loads(out)["max_error"] == worst > 0.0
+
+
+def test_what_is_not_finite_is_null():
+    from fflin.commands.results import plain
+
+    assert plain({"a": np.array([1.0, np.inf]), "_b": 1}) == {"a": [1.0, None]}
+    assert plain(np.array([1.0 + 2.0j])) == [{"real": 1.0, "imag": 2.0}]
