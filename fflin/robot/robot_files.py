@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
 from fflin.base.names import stands_for_any
 from fflin.base.toml_file import NAME, NUMBER, NUMBERS, TRUTH, VECTOR, Kind, TomlFile, flat
-from fflin.robot.appendages import Appendage, FlexibleAppendage, Slosh
 from fflin.robot.catalog import find_inputs, find_robot
+from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
 from fflin.robot.fields import FIELDS, Field
 from fflin.robot.inputs import KINDS, Input, Vector3
 from fflin.robot.outputs import parse_output

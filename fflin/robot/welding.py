@@ -14,12 +14,12 @@ import pinocchio as pin
 from fflin.base.errors import InputError, unknown
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
-from fflin.robot.equipment import with_inputs
+from fflin.robot.equipment.assembly import with_inputs
+from fflin.robot.equipment.mounting import carry_over
 from fflin.robot.inputs import ReactionWheel, named_inputs
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame
 from fflin.robot.mass_properties import LinkMass
 from fflin.robot.model_checks import joint_of
-from fflin.robot.mounting import carry_over
 from fflin.robot.outputs import JointOutput
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
-from fflin.robot.appendages import FlexibleAppendage, Slosh
+from fflin.robot.equipment.appendages import FlexibleAppendage, Slosh
 from fflin.robot.joints import find_frame
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.xml import Element

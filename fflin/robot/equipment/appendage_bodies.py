@@ -17,11 +17,11 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array
-from fflin.robot.appendages import Appendage, FlexibleAppendage, Slosh, rigid_inertia
+from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh, rigid_inertia
+from fflin.robot.equipment.mounting import Mounted, difference, inertia_of
+from fflin.robot.equipment.wheels import turned_to
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.mass_properties import Piece, as_inertia
-from fflin.robot.mounting import Mounted, difference, inertia_of
-from fflin.robot.wheels import turned_to
 
 # An eigenvalue of M_rr - L L^T below minus this share of the largest of M_rr is negative.
 _NEGATIVE = 1e-9

@@ -22,8 +22,8 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, FrozenArrays, as_double, number, positive
+from fflin.robot.equipment.mounting import about_origin, inertia_of
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
-from fflin.robot.mounting import about_origin, inertia_of
 
 # First root of J_1'(x) = 0: k R of the first lateral mode of a circular cylinder.
 _FIRST_ROOT = 1.8411837813406593
@@ -208,7 +208,7 @@ class FlexibleAppendage(Appendage):
         UnknownNameError
             If a unit is unknown.
         """
-        from fflin.robot.nastran import read_superelement
+        from fflin.robot.equipment.nastran import read_superelement
 
         found = read_superelement(op4, asm, origin=origin, modes=modes, length=length, mass=mass)
         return cls(
