@@ -6,7 +6,6 @@ from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,6 +18,7 @@ from fflin.control.differential_riccati import Coefficients, imbalance
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same
+from fflin.linear.flow import cubic
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
@@ -255,25 +255,31 @@ class Interpolant:
     def __init__(
         self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float, sign: float
     ) -> None:
-        from scipy.interpolate import CubicHermiteSpline, CubicSpline
-
-        A, B, Q, R = model
         self.first, self.last = float(t[0]), float(t[-1])
-        self._P, self.K, self._dt, self._sign = P, K, dt, sign
+        self._t, self._P, self.K, self._dt, self._sign = t, P, K, dt, sign
         if dt:
             # A little early, since clocks are rounded.
             self.starts = [self.first, *(t[1:] - 1e-9 * dt).tolist()]
             return
         self.starts = t[:-1].tolist()
-        across = (0, 2, 1)
-        drift, spent = P @ A, K.transpose(across) @ R @ K
-        rate = sign * (drift + drift.transpose(across) + Q - spent)
-        self._cubics = CubicHermiteSpline(t, P, rate, extrapolate=False)
-        powers, of_B = self._cubics.c[::-1], CubicSpline(t, B).c[::-1]
-        pieces = np.zeros((7, *of_B[0].transpose(across).shape))
-        for power, reach in enumerate(np.linalg.solve(R, of_B.transpose(0, 1, 3, 2))):
-            pieces[power : power + 4] += reach @ powers
-        self.pieces = pieces.transpose(1, 0, 2, 3).reshape(len(t) - 1, 7, -1)
+        A, self._B, Q, self._R = model
+        drift, spent = P @ A, K.mT @ self._R @ K
+        rate = sign * (drift + drift.mT + Q - spent)
+        h = np.diff(t)[:, None, None]
+        # Powers of the fraction of the interval that is over.
+        self._cubics = cubic(P[:-1], P[1:], h * rate[:-1], h * rate[1:])
+
+    @cached_property
+    def pieces(self) -> Array:
+        """Coefficients (M - 1, 7, nu nx) of K between knots, of powers of the time since a knot."""
+        from scipy.interpolate import CubicSpline
+
+        powers = self._cubics / np.diff(self._t)[:, None, None, None] ** np.arange(4)[:, None, None]
+        of_B = CubicSpline(self._t, self._B).c[::-1]
+        pieces = np.zeros((7, *of_B[0].mT.shape))
+        for power, reach in enumerate(np.linalg.solve(self._R, of_B.mT)):
+            pieces[power : power + 4] += reach @ powers.swapaxes(0, 1)
+        return pieces.swapaxes(0, 1).reshape(len(self._t) - 1, 7, -1)
 
     def gain(self, t: float) -> Array:
         """Return R^-1 B' P (nu, nx), of B and P at a time within the knots."""
@@ -289,14 +295,17 @@ class Interpolant:
     def cost(self, t: float) -> Array:
         """Return P (nx, nx) at a time within the knots."""
         k = bisect_right(self.starts, t) - 1
-        return self._P[k] if self._dt else self._cubics(t)
+        if self._dt:
+            return self._P[k]
+        s = (t - self._t[k]) / (self._t[k + 1] - self._t[k])
+        P: Array = np.tensordot(s ** np.arange(4), self._cubics[k], 1)
+        return P
 
-    def residual(self, at: Callable[[float], Coefficients]) -> float:
+    def residual(self, at: Callable[[Array], Coefficients]) -> float:
         """Return the largest relative residual of the differential equation midway."""
-        worst, ends = 0.0, [*self.starts, self.last]
-        for t in (0.5 * (a + b) for a, b in pairwise(ends)):
-            P, (A, S, Q) = self._cubics(t), at(t)
-            drift = P @ A
-            terms = np.array((drift, drift.T, -P @ S @ P, Q, -self._sign * self._cubics(t, 1)))
-            worst = max(worst, imbalance(terms))
-        return worst
+        h, (first, second, third, fourth) = np.diff(self._t), self._cubics.swapaxes(0, 1)
+        P = first + 0.5 * second + 0.25 * third + 0.125 * fourth
+        rate = (second + third + 0.75 * fourth) / h[:, None, None]
+        A, S, Q = at(self._t[:-1] + 0.5 * h)
+        drift = P @ A
+        return imbalance(np.array((drift, drift.mT, -P @ S @ P, Q, -self._sign * rate)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -50,11 +49,11 @@ def tvlqr(
 
     The differential Riccati equation is :math:`-\dot P = A^T P + P A - P B R^{-1} B^T P + Q`, with
     :math:`P(T) = Q_f`. It is solved backwards from knot to knot by maps
-    :math:`P_0 = W + T^T P_1 (E + G P_1)^{-1} T`. Here E is the identity, and W and G are positive
-    semidefinite. Each map is computed from a short matrix exponential by doubling, so P stays
-    positive semidefinite over any horizon. The method is of fourth order along a changing
-    trajectory and exact along a constant one. Knots are added until halving and interpolation
-    agree to 1e-7.
+    :math:`P_0 = W + T^T P_1 (I + G P_1)^{-1} T` with positive semidefinite W and G. Each map is
+    computed from a short matrix exponential by doubling, so P stays positive semidefinite over any
+    horizon. The method is of fourth order along a changing trajectory and exact along a constant
+    one. Knots are added until the estimated errors of the steps and of the interpolation of P are
+    below 1e-7.
 
     With `sample`, the regulator is sampled: a computer measures e at the samples and holds
     :math:`\delta u` between them. The cost remains the integral above, evaluated by (10.1) and
@@ -127,10 +126,9 @@ def tvlqr(
     fields |= {"Q": Q, "R": R, "Qf": Qf, "weights": rule, "knots": traj.t}
     fields |= {"verified": traj.verified, "dt": dt}
 
-    @cache
-    def at(t: float) -> riccati.Coefficients:
-        A, B = traj.matrices(t)
-        return riccati.Coefficients(A, riccati.spread(B, R), Q)
+    def at(times: Array) -> riccati.Coefficients:
+        A, B = traj.matrices_at(times)
+        return riccati.Coefficients(A, riccati.spread(B, R), np.broadcast_to(Q, A.shape))
 
     with riccati.bounded_by("smaller weights or a larger R"):
         if sample is not None:
@@ -140,8 +138,7 @@ def tvlqr(
             A, B = np.split(np.array([whole for _, whole in stages]), [len(Q)], axis=2)
         else:
             t, P = riccati.solve_back(at, traj.t, Qf)
-            models = [traj.matrices(float(x)) for x in t]
-            A, B = (np.array([model[k] for model in models]) for k in (0, 1))
+            A, B = traj.matrices_at(t)
             K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
             residual = Interpolant(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
     return GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=residual, **fields)
@@ -159,10 +156,10 @@ def held_stages(
 ) -> Iterator[tuple[Array, Array]]:
     """Yield the samples that `samples_back` takes, from first to last."""
     nx, W = len(Q), block_diag(Q, R)
-    for steps, whole in transitions(traj, traj.matrices, dt):
+    for steps, whole in transitions(traj, dt):
         total, way = np.zeros_like(W), np.eye(len(W))
-        for F, h, step, _ in steps:
-            total += way.T @ held_cost(F, W, h) @ way
+        for cost, step in zip(held_cost(steps.F, W, steps.h), steps.maps, strict=True):
+            total += way.T @ cost @ way
             way[:nx] = step @ way
         yield total, whole
 
@@ -297,29 +294,30 @@ def tvkalman(
     noise, columns = disturbance(traj, W, G)
     through = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
 
-    @cache
-    def at(t: float) -> riccati.Coefficients:
-        (A, _), (C, by) = traj.matrices(t), traj.between(t, traj.C, through)
-        intensity = by @ noise @ by.T
-        return riccati.Coefficients(A.T, riccati.spread(C.T, V), 0.5 * (intensity + intensity.T))
+    def at(times: Array) -> riccati.Coefficients:
+        pairs = zip(*(traj.between(t, traj.C, through) for t in times.tolist()), strict=True)
+        C, by = map(np.array, pairs)
+        intensity = by @ noise @ by.mT
+        spread = riccati.spread(C.mT, V)
+        A, _ = traj.matrices_at(times)
+        return riccati.Coefficients(A.mT, spread, 0.5 * (intensity + intensity.mT))
 
     names: Any = ("state_names", "input_names", "output_names", "verified")
     fields: dict[str, Any] = {key: getattr(traj, key) for key in names}
     fields |= {"robot": traj.robot.name, "V": V, "dt": dt}
     if asks_steady(P0, "P0", "a covariance"):
-        P = _steady_filter(traj, at(float(traj.t[0])).Q, V, dt)
+        P = _steady_filter(traj, at(traj.t[:1]).Q[0], V, dt)
     else:
         P = weight("P0", P0, traj.state_names)
     with riccati.bounded_by("a smaller W or a larger V"):
         if sample is not None:
-            return FilterSchedule(**fields, **_sampled_filter(traj, dt, lambda t: at(t).Q, V, P))
-        times, found = riccati.solve_back(lambda time: at(-time), -traj.t[::-1], P)
+            return FilterSchedule(**fields, **_sampled_filter(traj, dt, at, V, P))
+        times, found = riccati.solve_back(lambda times: at(-times), -traj.t[::-1], P)
     t, P = -times[::-1], found[::-1]
-    own, clock = (traj.C, traj.D, traj.y), t.tolist()
-    rows = zip(*((*traj.matrices(x), *traj.between(x, *own)) for x in clock), strict=True)
-    fields |= dict(zip("ABCDy", map(np.array, rows), strict=True))
-    L = np.linalg.solve(V, fields["C"] @ P).transpose(0, 2, 1)
-    fields |= {"t": t, "L": L, "P": P, "W": np.array([at(float(x)).Q for x in t])}
+    rows = zip(*(traj.between(x, traj.C, traj.D, traj.y) for x in t.tolist()), strict=True)
+    fields |= dict(zip("ABCDy", (*traj.matrices_at(t), *map(np.array, rows)), strict=True))
+    L = np.linalg.solve(V, fields["C"] @ P).mT
+    fields |= {"t": t, "L": L, "P": P, "W": at(t).Q}
     made = FilterSchedule(residual=np.inf, **fields)
     return replace(made, residual=made.interpolant.residual(at))
 
@@ -337,18 +335,24 @@ def _steady_filter(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Arr
 
 
 def _sampled_filter(
-    traj: LinearTrajectory, dt: float, intensity: Callable[[float], Array], V: Array, P: Array
+    traj: LinearTrajectory,
+    dt: float,
+    at: Callable[[Array], riccati.Coefficients],
+    V: Array,
+    P: Array,
 ) -> dict[str, Any]:
     """Return what the schedule of a filter has whose measurements are sampled."""
     at_samples, nx, disturbed = along(traj.resampled(dt)), len(P), list[Array]()
-    held = list(transitions(traj, traj.matrices, dt))
+    held = list(transitions(traj, dt))
 
     def stages() -> Iterator[tuple[Array, Array]]:
         for C, (steps, whole) in zip(at_samples.C, held, strict=False):
             W = np.zeros((nx, nx))
-            for F, h, step, (first, second) in steps:
-                mixed = HEAVY * intensity(first) + LIGHT * intensity(second)
-                W = step[:, :nx] @ W @ step[:, :nx].T + held_cost(F[:nx, :nx].T, mixed, h)
+            first, second = (at(times).Q for times in steps.nodes.T)
+            mixed = HEAVY * first + LIGHT * second
+            added = held_cost(steps.F[:, :nx, :nx].mT, mixed, steps.h)
+            for step, each in zip(steps.maps[:, :, :nx], added, strict=True):
+                W = step @ W @ step.T + each
             disturbed.append(W)
             yield block_diag(W, V), np.hstack((whole[:, :nx].T, C.T))
 

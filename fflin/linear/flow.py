@@ -112,6 +112,18 @@ class Flow:
         q: Array = pin.integrate(self._model, self._q[k], powers.dot(turns[k]))
         return q, powers.dot(speeds[k]), self._in_base_axes(q, self._input(k, s))
 
+    def points(self, times: Array) -> tuple[Array, Array, Array]:
+        """Return q, v and u (k, ..) at times (k,), as `at` does at one time."""
+        placements = [placed(self._t, t) for t in times.tolist()]
+        k, s = np.array([k for k, _ in placements]), np.array([s for _, s in placements])
+        powers, (turns, speeds) = s[:, None] ** np.arange(4), self.cubics
+        steps = np.einsum("ij,ijk->ik", powers, turns[k])
+        pairs = zip(self._q[k], steps, strict=True)
+        q = np.array([pin.integrate(self._model, *pair) for pair in pairs])
+        u = np.array([self._input(*each) for each in placements])
+        u = self._aba.actuation.rows_in_base_axes(q, u)
+        return q, np.einsum("ij,ijk->ik", powers, speeds[k]), u
+
     def input(self, t: float) -> Array:
         """Return the inputs (nu,) just after a time, in the frame's axes."""
         return self._input(*placed(self._t, t))
@@ -145,8 +157,8 @@ class Flow:
             for pair, speed in zip(pairwise(q), v[1:], strict=True)
         ]
         return (
-            _cubic(np.zeros_like(way), way, h * v[:-1], h * slopes),
-            _cubic(v[:-1], v[1:], h * begin[:-1], h * end),
+            cubic(np.zeros_like(way), way, h * v[:-1], h * slopes),
+            cubic(v[:-1], v[1:], h * begin[:-1], h * end),
         )
 
 
@@ -167,7 +179,7 @@ def placed(t: Array, time: float) -> tuple[int, float]:
     return k, 0.0 if share < _NEAR else min(share, 1.0)
 
 
-def _cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
-    """Return the coefficients (N - 1, 4, nv) of cubics over [0, 1] from values and derivatives."""
+def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
+    """Return the coefficients (N - 1, 4, ..) of cubics over [0, 1] from values and derivatives."""
     way = last - first
     return np.stack((first, rate, 3 * way - 2 * rate - end_rate, rate + end_rate - 2 * way), axis=1)

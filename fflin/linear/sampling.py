@@ -12,18 +12,22 @@ GAUSS = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 HEAVY, LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
 
 
-def held_exponential(A: Array, driven: Array, h: float) -> tuple[Array, Array]:
-    r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) of B = `driven`."""
-    n, k = driven.shape
+def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, Array]:
+    r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) of B = `driven`.
+
+    Rows of matrices (.., n, n) and (.., n, k) may be given, with the times h (..) of each.
+    """
+    n, k = driven.shape[-2:]
+    h = np.asarray(h)[..., None, None]
     with np.errstate(over="ignore", invalid="ignore"):
         if not (A @ A).any():
             return np.eye(n) + A * h, driven * h + A @ driven * (h * h / 2.0)
         from scipy.linalg import expm
 
-        block = np.zeros((n + k, n + k))
-        block[:n, :n], block[:n, n:] = A, driven
+        block = np.zeros((*A.shape[:-2], n + k, n + k))
+        block[..., :n, :n], block[..., :n, n:] = A, driven
         exponential = expm(block * h)
-        return exponential[:n, :n], exponential[:n, n:]
+        return exponential[..., :n, :n], exponential[..., :n, n:]
 
 
 def held_slopes(A: Array, driven: Array, h: float, dA: Array, d_driven: Array) -> tuple[Array, ...]:
@@ -39,30 +43,30 @@ def held_slopes(A: Array, driven: Array, h: float, dA: Array, d_driven: Array) -
     return slope[:n, :n], slope[:n, n:]
 
 
-def held_cost(F: Array, W: Array, h: float) -> Array:
-    """Return the integral of e^(F' t) W e^(F t) over [0, h]."""
+def held_cost(F: Array, W: Array, h: float | Array) -> Array:
+    """Return the integral of e^(F' t) W e^(F t) over [0, h]; of rows (.., n, n) for times (..)."""
     # The exponential rounds relative to its largest block, so that W is scaled to the size of F.
-    square = F @ F
+    square, h, n = F @ F, np.asarray(h)[..., None, None], F.shape[-1]
     if not (square @ F).any():
-        total, step = np.zeros_like(W), np.float64(h)
-        terms = (np.eye(len(F)), F, 0.5 * square)
+        total = np.zeros(F.shape)
+        terms = (np.eye(n), F, 0.5 * square)
         with np.errstate(over="ignore", invalid="ignore"):
             for i, left in enumerate(terms):
                 for j, right in enumerate(terms):
-                    total += left.T @ W @ right * (step ** (i + j + 1) / (i + j + 1))
-            return 0.5 * (total + total.T)
+                    total += left.mT @ W @ right * (h ** (i + j + 1) / (i + j + 1))
+            return 0.5 * (total + total.mT)
     from scipy.linalg import expm
 
-    n = len(F)
-    doublings = math.ceil(math.log2(max(2.0 * h * float(np.linalg.norm(F, 1)), 1.0)))
-    block = np.zeros((2 * n, 2 * n))
-    size = float(np.linalg.norm(W, 1)) / float(np.linalg.norm(F, 1)) or 1.0
-    block[:n, :n], block[:n, n:], block[n:, n:] = -F.T, W / size, F
+    rate, weight = (float(np.abs(X).sum(axis=-2).max()) for X in (F, W))
+    doublings = math.ceil(math.log2(max(2.0 * float(h.max()) * rate, 1.0)))
+    block = np.zeros((*F.shape[:-2], 2 * n, 2 * n))
+    size = weight / rate or 1.0
+    block[..., :n, :n], block[..., :n, n:], block[..., n:, n:] = -F.mT, W / size, F
     with np.errstate(over="ignore", invalid="ignore"):
         exponential = expm(block * (h / 2**doublings))
-        step = exponential[n:, n:]
-        total = step.T @ exponential[:n, n:]
+        step = exponential[..., n:, n:]
+        total = step.mT @ exponential[..., :n, n:]
         for _ in range(doublings):
-            total = total + step.T @ total @ step
+            total = total + step.mT @ total @ step
             step = step @ step
-        return 0.5 * size * (total + total.T)
+        return 0.5 * size * (total + total.mT)

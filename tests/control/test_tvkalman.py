@@ -59,8 +59,11 @@ def test_double_integrators_have_the_closed_form_of_kalman_and_bucy():
 
 def test_it_is_the_regulator_of_the_dual_system_backwards(moving, monkeypatch):
     # Matrices that are no robot's, linear between the knots.
-    linear = lambda traj, t: traj.between(t, traj.A, traj.B)  # noqa: E731
-    monkeypatch.setattr(fflin.LinearTrajectory, "matrices", linear)
+    def linear(traj, times):
+        rows = (traj.between(float(t), traj.A, traj.B) for t in times)
+        return tuple(map(np.array, zip(*rows, strict=True)))
+
+    monkeypatch.setattr(fflin.LinearTrajectory, "matrices_at", linear)
     rng = np.random.default_rng(0)
     nx, nu = moving.B.shape[1:]
     C = rng.normal(size=(nu, nx)) + moving.t[:, None, None] * rng.normal(size=(nu, nx))

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.control.differential_riccati import Coefficients, solve_back, step_back
+from fflin.control.differential_riccati import Coefficients, Passage, passage, solve_back
 from fflin.linear.sampling import GAUSS
 from tests.support.messages import says
 from tests.support.motions import motion
@@ -122,14 +122,15 @@ def test_a_step_is_of_order_four():
     nodes = 0.5 + np.array([-1.0, 1.0]) * 3.0**0.5 / 6.0
 
     def at(t):
+        t = np.asarray(t)[:, None, None]
         B = (1 - t) * B0 + t * B1
-        return Coefficients((1 - t) * A0 + t * A1, B @ B.T, np.eye(4))
+        return Coefficients((1 - t) * A0 + t * A1, B @ B.mT, np.tile(np.eye(4), (len(t), 1, 1)))
 
     def solved(steps):
         P, h = np.eye(4), 1.0 / steps
         for k in range(steps, 0, -1):
-            a = (k - 1) * h
-            P = step_back(*(at(a + c * h) for c in nodes), P, h)
+            early, late = (at([(k - 1 + c) * h]) for c in nodes)
+            P = Passage(*(x[0] for x in passage(early, late, np.array([h])))).back(P)
         return P
 
     exact = solved(256)
@@ -142,12 +143,9 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
     """Over one interval the weight of a node, which is negative, makes S negative at first."""
 
     def at(t):
-        return Coefficients(
-            np.zeros((1, 1)), np.array([[np.exp(12.0 * (1.0 - t))]]), 1e-6 * np.eye(1)
-        )
+        S = np.exp(12.0 * (1.0 - t))[:, None, None]
+        return Coefficients(0.0 * S, S, 0.0 * S + 1e-6)
 
-    with pytest.raises(np.linalg.LinAlgError):
-        step_back(*(at(c) for c in GAUSS), 1e3 * np.eye(1), 1.0)
     times, values = solve_back(at, np.array([0.0, 1.0]), 1e3 * np.eye(1))
     found = solve_ivp(
         lambda t, P: np.exp(12.0 * (1.0 - t)) * P * P - 1e-6,
@@ -157,6 +155,8 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
         rtol=1e-10,
         atol=1e-14,
     )
+    single = passage(*(at(np.array([c])) for c in GAUSS), np.ones(1))
+    assert np.abs(single.back(1e3 * np.eye(1)) / found.y[0, -1] - 1.0).max() > 0.1
     assert times[0] == 0.0
     assert values[0, 0, 0] == pytest.approx(found.y[0, -1], rel=1e-5)
 
@@ -339,6 +339,22 @@ def test_a_schedule_keeps_its_trajectory(tumbling, tmp_path):
     assert (motion.q == traj.q).all()
     assert (motion.u == traj.u).all()
     assert (motion.hold, motion.frame, again.dt) == ("previous", "local", 0.5)
+
+
+@pytest.mark.parametrize("sample", [None, 0.1])
+def test_models_between_knots_are_computed_in_batches(moving, monkeypatch, sample):
+    calls = []
+    for name in ("__call__", "along"):
+        whole = getattr(fflin.Linearizer, name)
+
+        def counted(*given, whole=whole):
+            calls.append(len(given))
+            return whole(*given)
+
+        monkeypatch.setattr(fflin.Linearizer, name, counted)
+    Q, R = weights(moving)
+    fflin.tvlqr(moving, Q, R, 1.0, sample=sample)
+    assert 2 <= len(calls) < 20
 
 
 def test_asking_for_a_gain_solves_nothing(moving, monkeypatch):

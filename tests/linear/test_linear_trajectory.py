@@ -216,7 +216,7 @@ def test_a_step_of_the_transition_is_of_order_four(monkeypatch):
     errors = []
     for parts in (1, 2, 4):
         monkeypatch.setattr(linear_trajectory, "_MOST_PARTS", parts)
-        found = next(linear_trajectory.transitions(along, along.matrices, 0.2))[1]
+        found = next(linear_trajectory.transitions(along, 0.2))[1]
         errors.append(np.abs(found - exact).max())
     assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx([4.0, 4.0], abs=0.5)
 
