@@ -8,7 +8,6 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from fflin.base.rotation import product_matrix
 from fflin.base.validation import Array
 from fflin.campaign.dispersions import noise_generator
 from fflin.campaign.statistics import STOPS, stop_of
@@ -24,7 +23,7 @@ from fflin.simulation.packing import (
 )
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
-from fflin.simulation.run import ending_of
+from fflin.simulation.run import ending_of, stop_conditions
 
 _DIVERGED = float(STOPS.index("diverged"))
 
@@ -96,9 +95,11 @@ class Lanes:
         if "seed" in runs and len(law.added) == len(law.y):
             law = law._replace(added=np.zeros(SLOTS * len(law.y)))
         # All starts are given with the base on the side of the chart where this is positive.
-        stop = parts.stop._replace(sign=np.abs(parts.stop.sign))
+        stop = stop_conditions(plan)
+        stop = stop._replace(sign=[abs(stop.sign[0])])
+        self._ending = ending_of(plan, stop)
         self._plan, self._state, self._statistics = plan, plant.state, statistics
-        self._loop = CompiledLoop(parts._replace(law=law, stop=stop))
+        self._loop = CompiledLoop(parts._replace(law=law, stop=parts.stop._replace(sign=stop.sign)))
         robot, point = self._loop.parts.robot, self._loop.parts.point
         # Noise has room for so many samples alone.
         self._rows = self._loop.rows(SLOTS if len(law.added) > len(law.y) else plan.times.steps)
@@ -109,7 +110,6 @@ class Lanes:
             **{key: getattr(robot.loads, key) for key in robot.loads._fields},
             **robot.faults._asdict(),
         }
-        self._turn = product_matrix(plant.state.origin_quaternion)[3]
 
     # A motion that diverges overflows before it is stopped: that is no reason to warn.
     @np.errstate(over="ignore", invalid="ignore")
@@ -148,11 +148,9 @@ class Lanes:
             statistics.add(first, seen, taken)
             if watcher:
                 watcher(first, seen)
-            lost = ~(point.nu**2 < loop.parts.stop.squares[:, None]).all(axis=0)
-            if plan.chart:
-                lost |= self._turn @ point.q[3:7] < 0.0
-            for lane in (lost[:count] & going).nonzero()[0]:
-                told[lane] = self._said(runs["q"][lane], lane, done)
+            v = self._state.spread(point.nu.T)
+            for lane in going.nonzero()[0]:
+                told[lane] = self._ending(done * plan.times.dt, point.q[:, lane], v[lane])
             stop = np.array([float(stop_of(each)) if each else 0.0 for each in told])
             ending = going & ((stop > 0.0) | (done == steps) | statistics.over[:count])
             if not ending.any():
@@ -213,10 +211,3 @@ class Lanes:
         """Return the momentum (6,) and centre of mass (3,) that the first run conserves."""
         momentum, center = kept_at(self._loop.parts, t)
         return momentum, center
-
-    def _said(self, q: Array, lane: int, done: int) -> str:
-        """Say why a run ends where it is, or nothing."""
-        point = self._loop.parts.point
-        ending = ending_of(replace(self._plan, q=q))
-        v = self._state.spread(point.nu[:, lane])
-        return ending(done * self._plan.times.dt, point.q[:, lane].copy(), v)

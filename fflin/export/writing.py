@@ -134,7 +134,7 @@ class _Texts:
         self.error = _DOUBLE_ERROR if real == "double" else law.operations * 2.0**-24
         bounds = self.error * np.max([case.scale for case in self.cases], axis=0)
         sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, law.input_units, strict=False)]
-        inputs, robot = (law.input_names, law.input_units), law.robot
+        robot = law.robot
         self.kind = "state" if isinstance(law, StateLaw) else "output"
         self.title = f"{law.title} of '{robot.name if robot else 'unknown'}'"
         self.words = {
@@ -148,10 +148,9 @@ class _Texts:
             "pinocchio_version": pin.__version__,
             "sample_time": f"{law.dt!r} s" if law.dt else "none, the law is continuous in time",
             "error": f"{self.error:.2g}",
-            "tolerances": _listed(law.input_names, sizes, ""),
+            "tolerances": _listed("u", law.input_names, sizes),
             "inputs": f"{len(law.low)}",
-            "input_rows": _listed(*inputs, ""),
-            "input_list": _listed(*inputs, "u"),
+            "input_list": _listed("u", law.input_names, law.input_units),
             **{key: self.array(getattr(law, key)) for key in ("u0", "low", "high")},
             "row": "0",
         }
@@ -215,9 +214,8 @@ class _Texts:
         words = {
             **{"joints": f"{n}", "joints_max": f"{max(n, 1)}", "states": f"{nx}"},
             **{"rows": f"{rows}", "gains": f"{len(law.K)}"},
-            "state_columns": _listed(state.names, state.units, ""),
-            "state_list": _listed(state.names, state.units, "x"),
-            "joint_list": _listed(state.names[6 : 6 + n], state.units[6 : 6 + n], "joints"),
+            "state_list": _listed("x", state.names, state.units),
+            "joint_list": _listed("joints", state.names[6 : 6 + n], state.units[6 : 6 + n]),
             "reference": self.array(law.placements),
             "x0": self.array(law.x0),
             "K": self.array(law.K),
@@ -253,8 +251,7 @@ class _Texts:
         by, ny = law.terms, len(law.names)
         return {
             **{"states": f"{len(by.A)}", "states_max": f"{max(len(by.A), 1)}", "outputs": f"{ny}"},
-            "output_columns": _listed(law.names, law.units, ""),
-            "output_list": _listed(law.names, law.units, "y"),
+            "output_list": _listed("y", law.names, law.units),
             **{key: self.array(_at_least_one(getattr(by, key))) for key in "ABCD"},
             "y0": self.array(by.y0),
             "continuous": _whole(law.continuous),
@@ -272,12 +269,8 @@ class _Texts:
                 raise InputError("the law has numbers too large for a float; take real='double'")
             values = narrow.astype(float)
         end = "F" if self.real == "float" else ""
-        shown = (f"{x!r}{end}" if np.isfinite(x) else _open(x) for x in values.tolist())
-        return "{" + ", ".join(shown) + "}"
-
-
-def _open(bound: float) -> str:
-    return "NO_LIMIT" if bound > 0.0 else "-NO_LIMIT"
+        shown = ", ".join(f"{x!r}{end}" for x in values.tolist())
+        return "{" + shown.replace(f"inf{end}", "NO_LIMIT") + "}"
 
 
 def _at_least_one(matrix: Array) -> Array:
@@ -295,9 +288,9 @@ def _plain(text: str) -> str:
     return re.sub(r"[^\w .,+^()\[\]/-]", "_", text, flags=re.ASCII)
 
 
-def _listed(names: Sequence[str], units: Sequence[str], array: str) -> str:
-    """Return lines of a comment: index, name and unit of each entry."""
+def _listed(array: str, names: Sequence[str], units: Sequence[str]) -> str:
+    """Return lines of a comment: index, name and unit of each entry of an array."""
     return "\n".join(
-        f" *   {f'{array}[{k}]' if array else k}  {_plain(name)} [{_plain(unit) or '-'}]"
+        f" *   {array}[{k}]  {_plain(name)} [{_plain(unit) or '-'}]"
         for k, (name, unit) in enumerate(zip(names, units, strict=True))
     )

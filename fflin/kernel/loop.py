@@ -16,14 +16,13 @@ from fflin.kernel.conservation import (
     kept_at,
     start_at,
 )
-from fflin.kernel.displacements import displace, turn_back
+from fflin.kernel.displacements import attitude, displace, quaternion_times, turn_back
 from fflin.kernel.forward import (
     MECHANICS,
     POINT,
     accelerate,
     apply_faults,
     configure,
-    seen,
     turn_held,
 )
 from fflin.kernel.lanes import below, called, compiled, inlined, listed, load, store
@@ -43,7 +42,10 @@ class Method(namedtuple("Method", "h origin way speed nodes weights moments tang
 
 
 class StopConditions(namedtuple("StopConditions", "squares sign")):
-    """When to stop: squares of speeds (6 + n,), and the sign (1,) of q0 in the chart, or 0."""
+    """When to stop: squares of rates (6 + n,), and the sign (1,) of q0 in the chart, or 0.
+
+    The engine in Python has the rates in the order of v (nv,).
+    """
 
 
 class Stages(namedtuple("Stages", "rates along total first second u")):
@@ -101,11 +103,12 @@ def _record(rows, row, point, reference, t):
 
 
 @inlined
-def _goes_on(robot, stop, point):
-    """Whether all is finite, within bounds, and in the chart."""
-    good = below(-(load(stop.sign, 0) * seen(robot, point.q)[1]), 1e-300)
+def goes_on(stop, origin, q, rates):
+    """Whether all rates are finite and within bounds, and the base is in the chart of an origin."""
+    scalar = quaternion_times(attitude(origin), attitude(q))[1]
+    good = below(-(load(stop.sign, 0) * scalar), 1e-300)
     for index in range(len(stop.squares)):
-        rate = load(point.nu, index)
+        rate = load(rates, index)
         good = good and below(rate * rate, load(stop.squares, index))
     return good
 
@@ -190,7 +193,7 @@ def go_on(of, clock, last, every, rows, work):
         if of.project:
             impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
-        if not _goes_on(robot, of.stop, point):
+        if not goes_on(of.stop, robot.origin, point.q, point.nu):
             break
 
 

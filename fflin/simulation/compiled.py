@@ -19,7 +19,7 @@ from fflin.robot.joints import ROOT
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
-from fflin.simulation.run import Recording, ending_of, go
+from fflin.simulation.run import Recording, ending_of, go, stop_conditions
 
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
@@ -118,7 +118,7 @@ def _fly(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
     noise, clock = noise_of(plan), np.zeros(1, dtype=np.intp)
     rows, space = np.empty((times.rows, loop.width)), loop.rows(times.rows)
     room = len(space) // loop.width * every  # in steps
-    ending, bar = ending_of(plan), Progress(plan.progress)
+    ending, bar = ending_of(plan, stop_conditions(plan)), Progress(plan.progress)
     stopped, length = "", _FIRST_SLICE
     try:
         while not stopped and clock[0] < times.steps:

@@ -14,7 +14,6 @@ from fflin.control.channel import channel_of
 from fflin.control.linear_controller import LinearController, measured_at
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
-from fflin.dynamics.points import LARGEST_SPEED
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, conservation, forward, loop, policies
 from fflin.kernel.arguments import empty, laid_out, words_of
@@ -25,7 +24,8 @@ from fflin.robot.limits import limits_of
 from fflin.simulation.conservation import Conserved, MomentumReference
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant, triads
-from fflin.simulation.times import LARGEST_TURN, Times
+from fflin.simulation.run import stop_conditions
+from fflin.simulation.times import Times
 
 SLOTS = 128  # samples whose noise is there at a time, and steps of a campaign
 _MEMORY = 2**22  # [bytes] of rows that are there at a time
@@ -36,8 +36,7 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.A
     h, state, method = plan.times.dt, plant.state, plan.method
     size, (way, speed) = 6 + state.robot.n, method.shares(h)
     start = MomentumReference(conserved, method, h, plan.q, plan.v)
-    squares = np.full(state.robot.nv, LARGEST_SPEED**2)
-    squares[plan.turning] = (LARGEST_TURN / h) ** 2
+    stop = stop_conditions(plan)
     mechanics = mechanics_of(plant, tree)
     return loop.Arguments(
         robot=mechanics,
@@ -64,10 +63,7 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.A
         ),
         project=plan.project,
         pushed=not plant.isolated(driven=plan.law is not None),
-        stop=loop.StopConditions(
-            squares=state.velocities(squares),
-            sign=np.array([np.sign(plan.chart.scalar(plan.q)) if plan.chart else 0.0]),
-        ),
+        stop=stop._replace(squares=state.velocities(stop.squares)),
         point=forward.Point(
             q=plan.q,
             nu=state.velocities(plan.v),

@@ -11,6 +11,7 @@ from fflin.base.process import Progress
 from fflin.base.validation import Array
 from fflin.control.channel import Channel
 from fflin.dynamics.points import LARGEST_SPEED
+from fflin.kernel.loop import StopConditions, goes_on
 from fflin.simulation.conservation import Conserved, MomentumReference
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
@@ -20,6 +21,7 @@ from fflin.simulation.times import LARGEST_TURN
 Advance: TypeAlias = Callable[[float, Array, Array, Array], tuple[Array, Array]]
 
 _LOOK = 16  # steps between looks at the clock
+_LARGEST_SAID = 1e3  # [rad] per step, beyond which the number says no more
 
 
 class Recording(NamedTuple):
@@ -41,7 +43,7 @@ class Recording(NamedTuple):
 def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
     """Run a plan to its end; `plant` and `conserved` are of the robot that moves."""
     times, q, v = plan.times, plan.q, plan.v
-    dt, slow, channel = times.dt, times.slow, plan.channel()
+    dt, channel = times.dt, plan.channel()
     reference = MomentumReference(conserved, plan.method, dt, q, v)
     advance = _advance(plan, plant, conserved, reference, channel)
     t_of = np.empty(times.rows)
@@ -59,7 +61,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
             plan.callback(t, q.copy(), v.copy(), u.copy())
 
     step, stopped, project, bar = 0, "", plan.project, Progress(plan.progress)
-    ending, watched = ending_of(plan), bool(plan.chart or plan.events)
+    ending = ending_of(plan, stop_conditions(plan))
     try:
         for step in range(times.steps):
             t = step * dt
@@ -70,11 +72,8 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
             t = (step + 1) * dt
             if project:
                 conserved.impose(q, v, reference.momentum, reference.center(t))
-            # The square is above that of any turn, and not finite where an entry is not.
-            if watched or not float(v.dot(v)) < slow:
-                stopped = ending(t, q, v)
-                if stopped:
-                    break
+            if stopped := ending(t, q, v):
+                break
             if step % _LOOK == 0:
                 bar.update(step + 1, times.steps)
     except KeyboardInterrupt:
@@ -126,26 +125,32 @@ def _advance(
     return asked
 
 
-def ending_of(plan: Plan) -> Callable[[float, Array, Array], str]:
+def stop_conditions(plan: Plan) -> StopConditions:
+    """Return when a run ends, with squares of rates in the order of v (nv,)."""
+    squares = np.full(len(plan.v), LARGEST_SPEED**2)
+    squares[plan.turning] = (LARGEST_TURN / plan.times.dt) ** 2
+    sign = float(np.sign(plan.chart.scalar(plan.q))) if plan.chart else 0.0
+    return StopConditions(squares=squares, sign=[sign])
+
+
+def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array], str]:
     """Return a function that gives the reason for which a run ends; empty if it continues."""
-    chart = plan.chart
-    scalar = chart.scalar(plan.q) if chart else 1.0
+    # The entries of a list are read faster than the entries of an array.
+    stop = stop._replace(squares=stop.squares.tolist())
+    anywhere = stop._replace(sign=[0.0])
+    turned = plan.chart.origin_quaternion if plan.chart else (0.0, 0.0, 0.0, 1.0)
+    origin = [0.0, 0.0, 0.0, *map(float, turned)]
 
     def ending(t: float, q: Array, v: Array) -> str:
-        nonlocal scalar
-        turn = float(np.abs(v[plan.turning]).max(initial=0.0)) * plan.times.dt
-        diverged = f"diverged at t = {t:g} s in steps of {plan.times.dt:g} s"
-        if not np.abs(v).max() < LARGEST_SPEED or turn > 1e3:
-            return diverged
-        if not turn < LARGEST_TURN:
-            return f"{diverged}: a joint or the base turns by {turn:.2g} rad per step"
-        if chart:
-            before, scalar = scalar, chart.scalar(q)
-            if before * scalar < 0.0:
-                return (
-                    f"left the chart at t = {t:g} s: the base turned by 180 deg from the reference"
-                )
-        return _event(plan, t, q, v)
+        place, rates = q.tolist(), v.tolist()
+        if goes_on(stop, origin, place, rates):
+            return _event(plan, t, q, v)
+        if goes_on(anywhere, origin, place, rates):
+            return f"left the chart at t = {t:g} s: the base turned by 180 deg from the reference"
+        dt, turn = plan.times.dt, float(np.abs(v[plan.turning]).max()) * plan.times.dt
+        detail = f": a joint or the base turns by {turn:.2g} rad per step"
+        known = LARGEST_TURN <= turn <= _LARGEST_SAID
+        return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}"
 
     return ending
 

@@ -11,9 +11,9 @@ static const ${name}_real A[${NAME}_MEMORY_MAX][${NAME}_MEMORY_MAX] = $A;
 static const ${name}_real B[${NAME}_MEMORY_MAX][${NAME}_OUTPUTS] = $B;
 
 /* One row per input:
-$input_rows
+$input_list
  * C: one column per entry of z, D: one column per output:
-$output_columns
+$output_list
  */
 static const ${name}_real C[${NAME}_INPUTS][${NAME}_MEMORY_MAX] = $C;
 static const ${name}_real D[${NAME}_INPUTS][${NAME}_OUTPUTS] = $D;

@@ -17,9 +17,9 @@ static const ${name}_real x0[$rows][${NAME}_STATES] = $x0;
 static const ${name}_real u0[$rows][${NAME}_INPUTS] = $u0;
 
 /* Gains. One row per input:
-$input_rows
+$input_list
  * One column per state:
-$state_columns
+$state_list
  */
 static const ${name}_real K[$gains][${NAME}_INPUTS][${NAME}_STATES] = $K;
 
