@@ -79,6 +79,8 @@ def _equipped(robot: Any, inputs: Any, appendages: Sequence[Appendage]) -> Any:
     if parts:
         _require_new_names(model, wheels, modes)
         model = with_mounted(model, bodies, parts)
+        for part in parts:
+            model.addJointFrame(model.getJointId(part.name))
         placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
         followers = tuple(
