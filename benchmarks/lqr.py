@@ -22,7 +22,7 @@ import scipy
 from scipy.linalg import solve_continuous_are
 
 import fflin
-from fflin.control.riccati import Riccati, solve
+from fflin.control.optimal.riccati import Riccati, solve
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from conftest import BUNDLED, random_tree

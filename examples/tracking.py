@@ -4,7 +4,7 @@ import fflin
 
 robot = fflin.load("astrobee_arm")
 goal = fflin.configuration(robot, {"arm_proximal": 0.6, "arm_distal": -0.8})
-trajectory = fflin.plan(robot, (goal, None), 30.0)
+trajectory = fflin.plan(robot, (goal, None), 30.0, knots=31)
 along = fflin.linearize_trajectory(robot, trajectory)
 policy = fflin.TrajectoryFeedback(trajectory, fflin.tvlqr(along, sample=0.1))
 

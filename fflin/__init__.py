@@ -49,12 +49,8 @@ _PUBLIC = {
         "linear.check": ["check", "Check"],
     },
     "Analysis": {
-        "analysis.controllability": [
-            "controllability",
-            "Controllability",
-            "observability",
-            "Observability",
-        ],
+        "analysis.controllability": ["controllability", "Controllability"],
+        "analysis.observability": ["observability", "Observability"],
         "analysis.gramians": ["gramians", "Gramians"],
         "analysis.modes": ["modes", "Modes", "Mode"],
         "analysis.effective_masses": ["effective_masses", "EffectiveMasses"],

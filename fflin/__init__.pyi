@@ -61,8 +61,8 @@ from fflin.linear.check import Check as Check
 # Analysis
 from fflin.analysis.controllability import controllability as controllability
 from fflin.analysis.controllability import Controllability as Controllability
-from fflin.analysis.controllability import observability as observability
-from fflin.analysis.controllability import Observability as Observability
+from fflin.analysis.observability import observability as observability
+from fflin.analysis.observability import Observability as Observability
 from fflin.analysis.gramians import gramians as gramians
 from fflin.analysis.gramians import Gramians as Gramians
 from fflin.analysis.modes import modes as modes

@@ -114,11 +114,11 @@ NUMBERS = ("nan", "inf", "1e300", "-1e300", "1e-300", "-1", "0", "x", "", "9" * 
 OPTIONS = {
     "linearize": ("--dt", "--stiffness", "--damping", "--gravity"),
     "check": ("--stiffness", "--damping", "--rpy", "--position", "--tolerance"),
-    "lqr": ("--dt", "--stiffness"),
+    "lqr": ("--sample", "--stiffness"),
     "modes": ("--stiffness", "--damping"),
     "sensitivity": ("--dt", "--top"),
     "uncertain": ("--vary",),
-    "simulate": ("--duration", "--step", "--delay", "--limit", "--rpy", "--q", "--dt"),
+    "simulate": ("--duration", "--dt", "--delay", "--limit", "--rpy", "--q", "--sample"),
     "sweep": ("--random", "--seed", "--grid", "--range"),
     "montecarlo": ("--runs", "--seed", "--width", "--confidence", "--worst", "--duration"),
 }

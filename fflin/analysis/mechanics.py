@@ -57,7 +57,7 @@ def checked(lin: LinearModel) -> LinearModel:
 def warn_of_stiffness(lin: LinearModel) -> None:
     """Warn if a vibration is so fast that orbital effects are within its rounding error."""
     nv, size = len(lin.M), np.sqrt(lin.M.diagonal())
-    fastest = float((np.abs(slopes(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
+    fastest = float((np.abs(rate_matrix(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
     if 0.0 < lin.mean_motion < _SLOWEST * fastest:
         warnings.warn(
             f"orbital effects on '{lin.robot}' at {lin.mean_motion:.3g} rad/s are within the "
@@ -73,7 +73,7 @@ def state_sizes(lin: LinearModel) -> Array:
     return np.tile(np.sqrt(lin.M.diagonal()), 2)
 
 
-def slopes(lin: LinearModel) -> Array:
+def rate_matrix(lin: LinearModel) -> Array:
     """Return A, or (A - E)/dt of a sampled model, which has the same invariant subspaces."""
     return (lin.A - np.eye(len(lin.A))) / lin.dt if lin.dt else lin.A
 
@@ -123,7 +123,7 @@ class SecondOrder:
     def poles(self) -> tuple[Values, Margin]:
         """The poles that are not zero, one of each pair, as eigenvalues approximate them."""
         rigid, margin = self._null(self.K, self.D)
-        still, other = self._null(self.K)
+        unloaded, other = self._null(self.K)
         R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
         part = self.restricted(R / self.size[:, None])
         r = len(part.M)
@@ -131,7 +131,7 @@ class SecondOrder:
             return np.zeros(0, dtype=complex), margin & other
         L = np.linalg.inv(np.linalg.cholesky(part.M))
         K, D = L @ part.K.values @ L.T, L @ part.D.values @ L.T
-        zeros = still.shape[1] - rigid.shape[1]
+        zeros = unloaded.shape[1] - rigid.shape[1]
         if D.any():
             fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
             A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])
@@ -152,7 +152,7 @@ def second_order(lin: LinearModel) -> SecondOrder:
     """Return the forces of a continuous model, or those that a sampled one shows as it stands."""
     # The product with M leaves rounding where there is no spring, damper or input. It is put to
     # zero by one floor for springs and one for dampers, per unit of energy, and one for each input.
-    nv, M, X = len(lin.M), lin.M, slopes(lin)
+    nv, M, X = len(lin.M), lin.M, rate_matrix(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
     spread = 4.0 * nv * EPS * np.abs(rates)
@@ -182,7 +182,7 @@ def at_rest(lin: LinearModel) -> LinearModel | None:
     # That is the continuous one where positions change at the rates of velocities alone, which also
     # tells the structure of what was sampled from it; or a sampled one without forces.
     source, nv = lin.generator or lin, len(lin.M)
-    X = slopes(source)
+    X = rate_matrix(source)
     if X[:nv, :nv].any() or (source.dt and X[nv:].any()):
         return None
     return source
@@ -223,7 +223,7 @@ class ConservedMomenta:
 def conserved(lin: LinearModel) -> ConservedMomenta:
     """Find the conserved momenta (9.2): :math:`W M [A_{21}, A_{22}, B_2] = 0`."""
     lin = lin.generator or lin  # it conserves the same momenta
-    nv, X, system = len(lin.M), slopes(lin), second_order(lin)
+    nv, X, system = len(lin.M), rate_matrix(lin), second_order(lin)
     size = system.size
     pushes = stacked([[system.K.T], [system.D.T], [system.S.T]])
     free, margin = null_space(pushes @ np.diag(1.0 / size), states=2)

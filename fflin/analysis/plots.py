@@ -10,10 +10,10 @@ import numpy as np
 
 from fflin.analysis.modes import Mode, Modes
 from fflin.analysis.ranks import Values
-from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, drawing, letters_of
 from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted, rounding
+from fflin.base.validation import instance
 from fflin.linear.check import Check, Row
 from fflin.linear.model import LinearModel
 
@@ -43,8 +43,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     >>> lin = fflin.linearize(fflin.load("planar_detumble"))
     >>> figure = fflin.plot_matrices(lin, "matrices.png")
     """
-    if not isinstance(lin, LinearModel):
-        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     nx, nu = lin.B.shape
     cell = max(0.24 * min(1.0, 24.0 / nx), min(0.12, 12.0 / nx))  # inches
     size = (4.2 + cell * (nx + nu), 2.6 + cell * nx)
@@ -66,8 +65,8 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
             image = ax.imshow(sizes, cmap="viridis_r", norm=norm)
             ax.grid(visible=False)
             ax.spines[:].set_visible(True)
-            _name(ax.xaxis, ax.secondary_xaxis("top").xaxis, *columns, letters)
-            _name(ax.yaxis, ax.secondary_yaxis("right").yaxis, *rows, letters)
+            _name(ax, "x", *columns, letters)
+            _name(ax, "y", *rows, letters)
             ax.tick_params("x", rotation=90)
         axes[0].child_axes[1].set_yticks([])
         axes[1].set_yticks([])
@@ -82,27 +81,22 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def _name(
-    axis: Any,
-    opposite: Any,
-    names: Sequence[str],
-    keys: Sequence[str],
-    units: Sequence[str],
-    letters: float,
-) -> None:
-    """Name rows or columns on one side and their groups on the other, with lines between these."""
-    axis.set_ticks(range(len(names)), [n.rpartition(".")[2] for n in names], fontsize=letters)
-    found, side = runs(keys, units), "x" if axis.axis_name == "x" else "y"
+def _name(axes: Axes, side: str, names: Sequence[str], keys: Any, units: Any, size: float) -> None:
+    """Name rows ("y") or columns ("x") on one side and their groups on the other, with lines."""
+    across = side == "x"
+    axis = axes.xaxis if across else axes.yaxis
+    axis.set_ticks(range(len(names)), [name.rpartition(".")[2] for name in names], fontsize=size)
+    opposite = axes.secondary_xaxis("top").xaxis if across else axes.secondary_yaxis("right").yaxis
+    found = runs(keys, units)
     opposite.set_ticks(
         [(first + last) / 2.0 for first, last, _, _ in found],
-        [f"{group}{chr(10) if side == 'x' else ' '}[{of}]" for _, _, group, of in found],
+        [f"{group}{chr(10) if across else ' '}[{of}]" for _, _, group, of in found],
         # Three axes of the base are the narrowest group that stands beside others.
-        fontsize=max(4.0, min(7.0, 0.9 * letters)) if side == "x" else 7.0,
+        fontsize=max(4.0, min(7.0, 0.9 * size)) if across else 7.0,
     )
     opposite.set_tick_params(length=0)
     for first, *_ in found[1:]:
-        line = axis.axes.axvline if side == "x" else axis.axes.axhline
-        line(first - 0.5, color="#888888", lw=0.6)
+        (axes.axvline if across else axes.axhline)(first - 0.5, color="#888888", lw=0.6)
 
 
 def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
@@ -121,10 +115,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     >>> robot = fflin.load("servicer_7dof", stiffness=springs)
     >>> figure = fflin.plot_modes(fflin.modes(fflin.linearize(robot)), "modes.png")
     """
-    if not isinstance(modes, Modes):
-        raise InputError(
-            f"modes is a {type(modes).__name__}, expected Modes, as fflin.modes returns"
-        )
+    instance("modes", modes, Modes, "Modes, as fflin.modes returns")
     count, half = len(modes.modes), len(modes.state_names) // 2
     names, units = modes.state_names[:half], modes.state_units[:half]
     title = (
@@ -211,10 +202,7 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     >>> lin = fflin.linearize(robot)
     >>> figure = fflin.plot_check(fflin.check(robot, lin), "check.png")
     """
-    if not isinstance(check, Check):
-        raise InputError(
-            f"check is a {type(check).__name__}, expected a Check, as fflin.check returns"
-        )
+    instance("check", check, Check, "a Check, as fflin.check returns")
     rows = [row for row in check.rows if row.error != 0.0]
     tests = list(dict.fromkeys(row.test for row in rows))
     labels = {row: _block_of(row) for row in rows}
@@ -231,11 +219,9 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
         axes.set_yticks(range(len(names)), names, fontsize=8)
         axes.set(xscale="log", ylim=(max(len(names), 1) - 0.5, -0.5))
         axes.set_xlabel("relative error (dot) and tolerance (bar)")
-        verdict = (
-            f"FAILED: {len(bad)} of {len(check.rows)} exceed their tolerance"
-            if bad
-            else (f"OK: {len(check.rows)} errors within tolerance")
-        )
+        verdict = f"OK: {len(check.rows)} errors within tolerance"
+        if bad:
+            verdict = f"FAILED: {len(bad)} of {len(check.rows)} exceed their tolerance"
         exact = len(check.rows) - len(rows)
         axes.set_title(f"{check.title}\n{verdict}; {exact} are zero, not drawn", loc="left")
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)

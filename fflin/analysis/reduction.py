@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from fflin.analysis.mechanics import checked, conserved, floating_inertia, second_order, slopes
+from fflin.analysis.mechanics import checked, conserved, floating_inertia, rate_matrix, second_order
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin, Noisy, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError, listed
@@ -138,7 +138,7 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     (('q_m.joint_1', 'q_m.joint_2'), 6)
     """
     whole = checked(lin)
-    wheels = leaving(whole, wheel_speeds)
+    wheels = removed_wheels(whole, wheel_speeds)
     lin = without(whole, wheels) if len(wheels) else whole
     momenta = conserved(lin)
     z, T = momenta.selected, momenta.T
@@ -149,13 +149,13 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
             f"the operating point is not an equilibrium: |f0| is {np.abs(lin.f0).max():.3g} and "
             "drives states that the reduction removes; linearise at rest"
         )
-    stays = picked(lin.state_names, whole.state_names)
+    in_whole = selection(lin.state_names, whole.state_names)
     reduced = ReducedModel(
         **part_of(lin, np.eye(len(T))[z], T, momenta.rates.T @ lin.M @ momenta.rates),
-        T=stays.T @ T,
-        S=stays[z],
-        momenta=momenta.momenta @ stays,
-        coordinates=momenta.coordinates @ stays,
+        T=in_whole.T @ T,
+        S=in_whole[z],
+        momenta=momenta.momenta @ in_whole,
+        coordinates=momenta.coordinates @ in_whole,
         margin=momenta.margin,
         notes=undecided(lin, momenta.margin, "kept by the reduction", len(z)),
     )
@@ -262,8 +262,8 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     return at[angle], at[angle & speed]
 
 
-def leaving(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
-    """Return the wheels (k,) that leave a design (9.5)."""
+def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
+    """Return the wheels (k,) that a design leaves out (9.5)."""
     # Inputs that turn nothing at rest may still spin wheels: as many as they do so independently
     # can be momenta. By default these stay where something else turns the base.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
@@ -284,8 +284,8 @@ def leaving(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
 
 def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
     """Return the model of the states that are regulated; `lin` itself where it has no wheels."""
-    # What is `leaving` leaves it, the angles of other wheels too where nothing depends on them, so
-    # that there are fewer positions than rates; and the base's position where no input pushes it.
+    # It lacks the `removed_wheels`, and the angles of other wheels on which nothing depends: there
+    # may be fewer positions than rates. It lacks the base's position if no input pushes it.
     if not wheel_inputs(lin):
         return lin
     source, nv = lin.generator or lin, len(lin.M)
@@ -294,8 +294,8 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     columns = [*base, *(i + nv for i in base)]
     if np.abs(np.delete(source.A[:, columns], columns, axis=0)).max(initial=0.0) > _ROUNDING:
         base = []  # in axes that turn one direction is part of the others
-    left = np.union1d(base, leaving(lin, wheel_speeds)).astype(np.intp)
-    part = without(lin, left)
+    removed = np.union1d(base, removed_wheels(lin, wheel_speeds)).astype(np.intp)
+    part = without(lin, removed)
     angles = {lin.state_names[i] for i in ignorable_wheels(lin)[0]}
     rest = [name for name in part.state_names if name not in angles]
     if len(rest) == len(part.M):
@@ -305,7 +305,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
 
 def damped_wheels(part: LinearModel) -> str:
     """Return what to do where wheels have damping, of a model that may be without their angles."""
-    nv, rates = len(part.M), slopes(part)[-len(part.M) :, -len(part.M) :]
+    nv, rates = len(part.M), rate_matrix(part)[-len(part.M) :, -len(part.M) :]
     least = _ROUNDING * (np.abs(part.M) @ np.abs(rates)).diagonal()
     dragged = -(part.M @ rates).diagonal() > least
     names = [part.state_names[i - nv].removeprefix("qdot_m.") for i in np.flatnonzero(dragged)]
@@ -322,12 +322,12 @@ def rigid_forces(body: LinearModel) -> Noisy:
     return system.S.after(motions.T)
 
 
-def without(lin: LinearModel, left: Indices) -> LinearModel:
+def without(lin: LinearModel, removed: Indices) -> LinearModel:
     """Return a model without coordinates (k,) and their rates, exact whatever these do (9.4)."""
-    kept = np.setdiff1d(np.arange(len(lin.M)), left)
+    kept = np.setdiff1d(np.arange(len(lin.M)), removed)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
-    rest = floating_inertia(lin.M, kept, left)
-    return selected(_balanced(lin), names, rest, partial(without, left=left))
+    rest = floating_inertia(lin.M, kept, removed)
+    return selected(_balanced(lin), names, rest, partial(without, removed=removed))
 
 
 def _balanced(lin: LinearModel) -> LinearModel:
@@ -342,21 +342,21 @@ def _balanced(lin: LinearModel) -> LinearModel:
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
     """Return the model of some states, of the inertia M, and of the outputs that see no others."""
-    S = picked(names, lin.state_names)
-    seen, values = seen_through(lin, S), part_of(lin, S, S.T, M)
+    S = selection(names, lin.state_names)
+    seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
     values |= {"C": seen @ values["C"], "D": seen @ lin.D, "y0": seen @ lin.y0}
     for key in ("output_names", "output_units"):
         values[key] = tuple(getattr(lin, key)[i] for i in seen.argmax(axis=1))
     return certified(LinearModel(**values), lin, make)
 
 
-def picked(names: Sequence[str], of: Sequence[str]) -> Array:
-    """Return S (k, n) that picks names from others."""
+def selection(names: Sequence[str], of: Sequence[str]) -> Array:
+    """Return the matrix S (k, n) that selects some of n names."""
     return np.eye(len(of))[[of.index(name) for name in names]]
 
 
-def seen_through(lin: LinearModel, S: Array) -> Array:
-    """Return O (k, ny) that picks the outputs which see none but the states S x."""
+def outputs_of(lin: LinearModel, S: Array) -> Array:
+    """Return the matrix (k, ny) that selects the outputs of the states S x alone."""
     others = np.abs(lin.C - lin.C @ S.T @ S).max(axis=1, initial=0.0)
     return np.eye(len(lin.C))[others <= 1e-12 * np.abs(lin.C).max(axis=1, initial=0.0)]
 

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from fflin.analysis.controllability import controllability, observability
+from fflin.analysis.controllability import controllability
 from fflin.analysis.mechanics import conserved
 from fflin.analysis.names import grouped, with_rates
+from fflin.analysis.observability import observability
 from fflin.analysis.ranks import Margin, Values, judged
 from fflin.analysis.reduction import damped_wheels
 from fflin.base.errors import (

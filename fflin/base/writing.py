@@ -7,6 +7,8 @@
 - A command never overwrites a file that it reads.
 """
 
+import csv
+import io
 import os
 import stat
 from collections.abc import Iterable, Iterator, Mapping
@@ -102,6 +104,13 @@ def _same_file(path: str | Path, other: Path) -> bool:
         return os.path.samefile(path, other)
     except (OSError, ValueError):  # one of them does not exist
         return False
+
+
+def csv_table(rows: Iterable[Iterable[Any]]) -> bytes:
+    """Return the content of a CSV file."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
 
 
 def write_whole(contents: Mapping[Path, bytes]) -> None:

@@ -18,7 +18,7 @@ from fflin.batch.rows import Points
 from fflin.batch.run import ChunkResult
 from fflin.dynamics.chart import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.inertia import Inertia
-from fflin.dynamics.rnea import Rates
+from fflin.dynamics.rnea import AccelerationDerivatives
 from fflin.kernel.compiled import checked_engine
 from fflin.kernel.tree import LANES
 from fflin.linear.linearization import LARGEST, Linearizer, Prepared
@@ -26,7 +26,7 @@ from fflin.linear.state_equations import assemble, drift
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.kernel.accelerations import Mask
+    from fflin.kernel.derivatives import Mask
 
 RowNumbers: TypeAlias = NDArray[np.integer[Any]]
 
@@ -80,11 +80,6 @@ class ChunkJob:
         count = len(points.q)
         if out is None:
             out = {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
-        if self.only_inertia and not self.linearizer.robot.n and count > 1:
-            # Without joints M is the same everywhere.
-            one = self.run(Points(points.q[:1], None, None), start)
-            out["B_lower"][:] = one.arrays["B_lower"]
-            return ChunkResult(dict(out), one.notes)
         left = self.compiled.write(points, out) if self.compiled else np.arange(count)
         if not len(left):
             return ChunkResult(dict(out), [])
@@ -158,27 +153,26 @@ class BatchEquations:
         """Write A, B, f0 and x0 about any points, and return where they are sound."""
         ready, (q, v, u), A, B = self._prepared, points, out["A"], out["B_lower"]
         state, actuation, count = ready.map, ready.actuation, len(q)
-        v = np.zeros((count, state.robot.nv)) if v is None else v
-        u = np.zeros((count, len(actuation.names))) if u is None else u
         own = ready.own_reference
         chart: Chart = Standing(count) if own else state.charts(q)
+        v = np.zeros((count, state.robot.nv)) if v is None else v
+        no_inputs: Array = np.zeros((count, len(actuation.names)))
+        u = no_inputs if u is None else actuation.in_base_axes(chart, u)
         r_b: Array = np.zeros((count, 3)) if own else state.positions(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
-        u = actuation.in_base_axes(chart, u)
         nv = nu.shape[1]
         A[:, :nv] = ready.rest["A"][:nv]
         c, judged = self._kernel.write(q, nu, q_m, u, A, B)
-        rates = Rates(c, A[:, nv:], B, state.gravity(q))
+        rates = AccelerationDerivatives(c, A[:, nv:], B, state.gravity(q))
         f0 = assemble(state, actuation, chart, nu, u, rates, A, moving=ready.moving)
         out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
         out["f0"][:] = 0.0 if ready.moving else f0
         if ready.moving:
             out["_drift"][:] = drift(state, f0, rates.gravity)
-        # NaN compares false.
+        # NaN compares false. The upper half of A is finite where q0 and f0 are sound.
         good = self._kernel.sound(q, judged) & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
-        for array in (A, B, f0):
-            flat = array.reshape(count, -1)
-            good &= np.vecdot(flat, flat) < LARGEST
+        for rows in (A.reshape(count, -1)[:, A[0].size // 2 :], B.reshape(count, -1), f0):
+            good &= np.vecdot(rows, rows) < LARGEST
         return good
 
 

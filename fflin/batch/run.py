@@ -6,7 +6,6 @@ worker dies. This module is independent of the meaning of the rows and of the jo
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 import warnings
 from collections import Counter, deque
@@ -21,6 +20,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
+from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -61,7 +61,7 @@ class ChunkResult(NamedTuple):
 
 
 class Job(Protocol):
-    """Computation on rows; it is pickled, and sent to every worker once."""
+    """Computation on rows; it is pickled, and each worker unpickles it once."""
 
     @property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
@@ -194,20 +194,18 @@ class Dispatch:
     """Waiting and running chunks, the number of attempts for each, and the workers."""
 
     def __init__(self, job: Job, rows: Rows, spans: list[Span], workers: Executor) -> None:
-        content = pickle.dumps(job)
-        self._parcel = Parcel(hashlib.sha256(content).hexdigest(), content)
+        self._job = pickle.dumps(job)
         self._rows, self._workers, self._ahead = rows, workers, _QUEUED * _count(workers)
         self._waiting = spans[::-1]
-        self._running: dict[Future[ChunkResult | None], Span] = {}
+        self._running: dict[Future[ChunkResult], Span] = {}
         self._attempts: Counter[Span] = Counter()
         self._broken: BaseException | None = None
-        self._known = False
 
     def __iter__(self) -> Iterator[Done]:
         try:
             while self._waiting or self._running:
                 while self._waiting and len(self._running) < self._ahead and not self._broken:
-                    self._submit(self._waiting.pop(), None if self._known else self._parcel.content)
+                    self._submit(self._waiting.pop())
                 if self._running:
                     yield from self._finished()
                 if self._broken:
@@ -216,11 +214,11 @@ class Dispatch:
             for future in self._running:
                 future.cancel()
 
-    def _submit(self, span: Span, content: bytes | None) -> None:
+    def _submit(self, span: Span) -> None:
         """Begin a chunk, or put it back where the executor is dead."""
-        arguments = self._parcel._replace(content=content), self._rows(*span), span.start
+        rows = self._rows(*span)
         try:
-            future = self._workers.submit(work, *arguments)
+            future = self._workers.submit(work, self._job, rows, span.start)
         except Exception as error:  # broken, shut down, or of its own
             self._waiting.append(span)
             self._broken = error
@@ -245,14 +243,9 @@ class Dispatch:
                 # Executors have errors of their own, such as of a scheduler that lost a worker.
                 yield from self._lost(span, f"{type(error).__name__}: {error}")
             else:
-                if chunk is None:
-                    self._attempts[span] -= 1
-                    self._submit(span, self._parcel.content)
-                else:
-                    self._known = True
-                    yield Done(span, chunk, "")
+                yield Done(span, chunk, "")
 
-    def _wait(self) -> set[Future[ChunkResult | None]]:
+    def _wait(self) -> set[Future[ChunkResult]]:
         pool = self._workers if isinstance(self._workers, ProcessPoolExecutor) else None
         hung = False
         while not (
@@ -294,29 +287,16 @@ class Dispatch:
             yield Done(span, None, reason)
 
 
-class Parcel(NamedTuple):
-    """A job as it is sent: under a key, and its content only where a worker may not have it."""
-
-    key: str
-    content: bytes | None
+def work(job: bytes, rows: Any, start: int) -> ChunkResult:
+    """Process a chunk in a worker, by a pickled job."""
+    return _unpickled(job).run(rows, start)
 
 
-# The jobs that this worker has received; the oldest is dropped first.
-_JOBS: dict[str, Job] = {}
-_KEPT = 4
-
-
-def work(parcel: Parcel, rows: Any, start: int) -> ChunkResult | None:
-    """Do a chunk in a worker, or return None where the worker does not have the job."""
-    job = _JOBS.get(parcel.key)
-    if job is None:
-        if parcel.content is None:
-            return None
-        job = pickle.loads(parcel.content)
-        while len(_JOBS) >= _KEPT:
-            _JOBS.pop(next(iter(_JOBS)), None)
-        _JOBS[parcel.key] = job
-    return job.run(rows, start)
+@lru_cache(maxsize=4)
+def _unpickled(job: bytes) -> Job:
+    """Return a job, unpickled once in each worker: it compiles or prepares at its first chunk."""
+    result: Job = pickle.loads(job)
+    return result
 
 
 def _count(executor: Executor) -> int:

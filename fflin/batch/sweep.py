@@ -92,7 +92,7 @@ def sweep(
         Compiled by default if numba is installed and the outputs are the state.
     executor : concurrent.futures.Executor, optional
         Executor whose workers process the chunks: processes, dask (``Client.get_executor()``) or
-        mpi4py.futures. The robot is sent to each worker once. The executor is not shut down.
+        mpi4py.futures. The executor is not shut down.
     workers : int, optional
         Number of worker processes to start, at most one per core. A process that dies is replaced.
         With workers, call `sweep` under ``if __name__ == "__main__":``.
@@ -151,8 +151,8 @@ def sweep(
     shares = (_SHARES, 1) if parallel else (4 * threads, threads)
     store = _store(task, path, chunk or _chunk_size(task, *shares))
     with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
-        if others is None and not (job.compiled and robot.n):
-            threads = 1  # without joints there is but one M
+        if others is None and not job.compiled:
+            threads = 1
         failed = run_chunks(
             job, task.points, store, executor=others, threads=threads, progress=progress
         )

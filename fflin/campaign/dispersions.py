@@ -150,7 +150,7 @@ class Dispersions:
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
                 f"{kind} is dispersed, which needs a sampled policy, but this policy is "
-                "continuous; give sample=, a multiple of dt (--dt on the command line)"
+                "continuous; give sample=, a multiple of dt (--sample on the command line)"
             )
         label = dict(zip(names, names, strict=True))
         try:

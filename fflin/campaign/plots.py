@@ -27,6 +27,11 @@ _BANDS = (
     (0.05, "90 % of runs", 0.22),
     (0.25, "50 % of runs", 0.38),
 )
+_PERCENTILES = (
+    (0.5, "median", "-"),
+    (0.95, "95th percentile", "-."),
+    (0.99, "99th percentile", ":"),
+)
 _INK, _GOAL = COLORS[0], "#555555"
 _WORST = (COLORS[1], COLORS[3], COLORS[4], COLORS[2], COLORS[7])
 _DECADES, _BARS, _BINS = 6, 10, 48
@@ -253,10 +258,10 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
     for name, (said, color) in names.items():
         kept: Any = edges
         axes.hist(of[name].clip(*edges[[0, -1]]), kept, color=color, alpha=0.55, label=said)
-        for p, style in ((0.5, "-"), (0.95, "-."), (0.99, ":")):
+        for p, mark, style in _PERCENTILES:
             at = campaign.quantile(name, p).value
             if math.isfinite(at):
-                axes.axvline(at, color=color, lw=1.2, ls=style, label=f"{100 * p:g}th percentile")
+                axes.axvline(at, color=color, lw=1.2, ls=style, label=mark)
     _goals(axes.axvline, campaign, *names)
     axes.set(xlabel=f"{kind} error [{KINDS[kind]}]", ylabel="runs", xlim=edges[[0, -1]])
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fflin.analysis.names import rate_of
-from fflin.analysis.reduction import picked, regulated_part, wheel_inputs
+from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double
@@ -282,7 +282,7 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     kept = getattr(gain, "regulated", ())
     part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
     if part.state_names == kept:  # the others, which are left to themselves, do not settle
-        K, lin = K @ picked(kept, lin.state_names).T, part
+        K, lin = K @ selection(kept, lin.state_names).T, part
     loop = Loop(robot, lin, K)
     require_fit(lin, robot, loop.state)
     if not len(lin.x0):

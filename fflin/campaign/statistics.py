@@ -138,7 +138,7 @@ def marks_of(
     attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
     law, marks = no_law(state, plan.initial), empty(kernel_statistics.RUN_STATISTICS)
     law.path.point.q[3:7] = quaternion_product(conjugate(state.origin_quaternion), attitude)
-    way, speed = path or (np.zeros(0), np.zeros(0))
+    q_ref, nu_ref = path or (np.zeros(0), np.zeros(0))
     return marks._replace(
         robot=marks.robot._replace(
             index=np.array([joint.idx_q for joint in robot.joints], dtype=np.intp),
@@ -147,12 +147,12 @@ def marks_of(
         ),
         law=law._replace(near=first[state.groups.q_m]),
         path=law.path,
-        home=first,
-        way=way,
-        speed=speed,
+        x_ref=first,
+        q_ref=q_ref,
+        nu_ref=nu_ref,
         kind=kinds_of(state),
         settled=SETTLED,
-        there=np.full(kinds, THERE),
+        tolerance=np.full(kinds, THERE),
         steps=steps,
         at=marks.at._replace(q=np.zeros(robot.nq), nu=np.zeros(state.nx // 2)),
         sizes=np.zeros(kinds),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import math
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.tables import counted
+from fflin.base.tables import counted, signals
 from fflin.commands.arguments import (
     OUTPUT,
     PAGE,
@@ -27,8 +29,15 @@ from fflin.commands.arguments import (
     group_of,
     number,
 )
-from fflin.commands.points import linear_model, load_robot, once, placed
-from fflin.commands.results import Report, figure_of
+from fflin.commands.points import (
+    attitude,
+    linear_model,
+    load_robot,
+    once,
+    placed,
+    point_of,
+)
+from fflin.commands.results import Report, figure_of, plain
 
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
@@ -60,6 +69,18 @@ def add_commands(commands: Commands) -> None:
     add_figure(modes, "frequencies, damping and shapes")
     pages = group_of(modes, OUTPUT)
     add(pages, "--html", "write a page that plays the mode shapes", PAGE)
+    held = command(
+        commands,
+        "equilibrium",
+        _equilibrium,
+        "show the inputs that hold a point, the deflection of springs, and the stability",
+        example="fflin equilibrium servicer_7dof --stiffness panel_left=100 --gravity 0 0 -0.01",
+        common="joint rpy velocity relative-equilibrium orbit stiffness gravity passive inputs "
+        "frame output-file",
+    )
+    add_point(held)
+    what = "q, u, the deflections and the poles"
+    add_output_file(group_of(held, OUTPUT), what, RECORD, "Equilibrium")
     _add_sensitivity(commands)
     _add_uncertain(commands)
 
@@ -130,8 +151,9 @@ def _range(text: str) -> tuple[str, Any]:
 
 
 def _analyze(arguments: argparse.Namespace) -> Report:
-    from fflin.analysis.controllability import controllability, observability
+    from fflin.analysis.controllability import controllability
     from fflin.analysis.modes import modes
+    from fflin.analysis.observability import observability
 
     _, lin = linear_model(arguments)
     moved, shown, found = controllability(lin), observability(lin), modes(lin)
@@ -174,6 +196,46 @@ def _modes(arguments: argparse.Namespace) -> Report:
 
     files = {arguments.plot: figure_of("plot_modes", found), arguments.html: page}
     return Report(robot.name, result, "\n\n".join(parts), files)
+
+
+def _equilibrium(arguments: argparse.Namespace) -> Report:
+    from fflin.analysis.modes import modes
+    from fflin.base.record import write_record
+    from fflin.linear.equilibrium import equilibrium
+    from fflin.linear.linearization import linearize
+
+    if arguments.effort:
+        raise InputError("--effort sets the inputs, which this command computes; remove --effort")
+    robot, q, v, reference = point_of(arguments)
+    if arguments.relative_equilibrium:
+        q, reference = attitude(robot, q, arguments.relative_equilibrium, arguments.frame)
+    axes = {"frame": arguments.frame, "reference": reference}
+    held = equilibrium(robot, q, v=v, **axes)
+    lin = linearize(robot, held.q, v, held.u, **axes)
+    found = modes(lin)
+    poles = found.poles
+    growth = float(poles.real.max(initial=-math.inf))
+    decays = not found.zero_eigenvalues and all(mode.margin < -1.0 for mode in found.modes)
+    stability = "unstable" if found.unstable else "stable" if decays else "marginally stable"
+    lines = [
+        f"{robot.name}: {stability}: largest real part of the poles {growth:.3g} 1/s, "
+        f"{counted(found.zero_eigenvalues, 'eigenvalue')} at zero",
+        signals("x0", lin.x0, lin.state_names, lin.state_units) if lin.x0.any() else "x0: all zero",
+        str(held),
+    ]
+    result = {
+        **plain(held),
+        "state_names": lin.state_names,
+        "state_units": lin.state_units,
+        "x0": lin.x0,
+        "stability": stability,
+        "largest_real_part": growth,
+        "zero_eigenvalues": found.zero_eigenvalues,
+        "poles": poles,
+    }
+    entries = {"kind": "Equilibrium", **vars(held), "poles": poles}
+    write = partial(write_record, record=entries, sealed=True)
+    return Report(robot.name, result, "\n".join(lines), {arguments.output_file: write})
 
 
 def _momentum(lin: LinearModel) -> str:

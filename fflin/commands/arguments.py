@@ -7,10 +7,13 @@ import copy
 import math
 import re
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
+
+from fflin.base.errors import FflinWarning
 
 if TYPE_CHECKING:
     from fflin.commands.results import Report
@@ -158,7 +161,8 @@ class _Help(argparse.Action):
 def short_help(command: argparse.ArgumentParser) -> str:
     """Return the help of a command with the first sentence about each common option."""
     arguments = [each for each in command._actions if not each.option_strings]
-    options = {each.dest: each for each in command._actions if each.option_strings}
+    every = [each for each in command._actions if each.option_strings]
+    options = {each.dest: each for each in reversed(every)}  # a former name comes second
     del options["help"]
     common = [name.replace("-", "_") for name in command.get_default("common")] or list(options)
     formatter = argparse.HelpFormatter(command.prog, max_help_position=30)
@@ -178,7 +182,7 @@ def short_help(command: argparse.ArgumentParser) -> str:
         formatter.end_section()
     formatter.add_text(command.epilog)
     if options:
-        formatter.add_text(f"all {len(options)} options in full: {command.prog} --help all")
+        formatter.add_text(f"all {len(every) - 1} options in full: {command.prog} --help all")
     return formatter.format_help()
 
 
@@ -216,6 +220,21 @@ def add(
         file = "FILE" if isinstance(type, OutputFile) else None
         more["metavar"] = metavar or _METAVARS.get(type, file)
     group.add_argument(name, help=help, type=type, **more)
+
+
+class _FormerName(argparse.Action):
+    """Option under its former name, which warns of the new one."""
+
+    def __call__(self, _: Any, given: argparse.Namespace, value: Any, option: Any = None) -> None:
+        new = f"--{self.dest.replace('_', '-')}"
+        warnings.warn(f"{option} is now {new}; write {new} {value}", FflinWarning, stacklevel=2)
+        setattr(given, self.dest, value)
+
+
+def add_former_name(group: Container, name: str, new: str) -> None:
+    """Add the former name of an option for a time in seconds."""
+    text = f"former name of --{new}"
+    group.add_argument(name, dest=new, type=number, metavar="H", action=_FormerName, help=text)
 
 
 def switch(group: Container, name: str, help: str) -> None:
@@ -290,6 +309,71 @@ def add_pose(group: Container) -> None:
         assignment,
         repeatable=True,
     )
+
+
+def add_target(group: Container) -> None:
+    """Add the options for the configuration and velocity of the target."""
+    add(
+        group,
+        "--target-joint",
+        "target position of a joint [rad|m]; by default [target] of robot.toml, then its [point], "
+        "then the neutral position",
+        assignment,
+        repeatable=True,
+    )
+    rpy = "target attitude of the base: roll, pitch, yaw [deg] about fixed axes"
+    add(group, "--target-rpy", rpy, number, ("R", "P", "Y"))
+    add(group, "--target-position", "target position of the base [m]", number, ("X", "Y", "Z"))
+    add(
+        group,
+        "--target-velocity",
+        "target velocity, such as the speed of a wheel. In a simulation it is also the initial "
+        "velocity unless --velocity is given",
+        assignment,
+        repeatable=True,
+    )
+
+
+def add_limits(group: Container) -> None:
+    """Add --limits and --limit."""
+    add(
+        group,
+        "--limits",
+        "keep the inputs within the limits of the robot (urdf, default), or of --limit alone "
+        "(none). The limits are the efforts of the URDF, max and min of the inputs, and the speeds "
+        "of the wheels",
+        choices=("urdf", "none"),
+        default="urdf",
+    )
+    add(
+        group,
+        "--limit",
+        "largest magnitude of an input, or of all inputs of a group such as tau_m or a pattern. "
+        "This value takes precedence over --limits",
+        assignment,
+        repeatable=True,
+    )
+
+
+def add_step(group: Container) -> None:
+    """Add --dt, and --step as it was called."""
+    add(group, "--dt", "integration step [s]; chosen automatically by default", number, "H")
+    add(group, "--step", "former name of --dt", number, "H")
+
+
+def settle_step(arguments: argparse.Namespace) -> None:
+    """Set --dt and --sample from their former names, --step and --dt, with a warning."""
+    said = ""
+    if arguments.step is not None:
+        said = "--step is now --dt, the integration step"
+        if arguments.dt is not None:
+            said += ", and --dt is now --sample, the sample time of the controller"
+            arguments.sample = arguments.dt
+        arguments.dt = arguments.step
+    elif arguments.dt is not None and arguments.sample is None:
+        said = "--dt is the integration step; the sample time of the controller is --sample"
+    if said:
+        warnings.warn(said, FflinWarning, stacklevel=2)
 
 
 def add_inputs_there(group: Container) -> None:

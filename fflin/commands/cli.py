@@ -25,11 +25,11 @@ TASKS = {
     "inspect robots": {"robots": "models", "info": "models", "init": "models", "view": "visual"},
     "make and check a linear model": {"linearize": "models", "check": "models"},
     "analyse a model": {
-        **{"analyze": "analysis", "modes": "analysis", "validity": "regions"},
-        **{"sensitivity": "analysis", "uncertain": "analysis", "funnel": "regions"},
+        **dict.fromkeys(("analyze", "modes", "equilibrium", "sensitivity"), "analysis"),
+        **{"uncertain": "analysis", "validity": "regions", "funnel": "regions"},
     },
     "design and simulate": {
-        **{"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
+        **{"lqr": "regulator", "tvlqr": "tracking", "plan": "planning", "simulate": "simulation"},
         "export": "export",
     },
     "many models or simulations": {"sweep": "sweeps", "montecarlo": "montecarlo"},

@@ -14,13 +14,18 @@ from fflin.commands.arguments import (
     add,
     add_frame,
     add_inputs_there,
+    add_limits,
     add_pose,
     add_robot,
+    add_step,
     add_system,
+    add_target,
     assignment,
+    count_of,
     group_of,
     input_file,
     number,
+    settle_step,
     switch,
     yes_or_no,
 )
@@ -28,6 +33,7 @@ from fflin.commands.points import (
     attitude,
     configuration_of,
     held_at,
+    limits_of_options,
     once,
     refuse_pose,
     velocity_of,
@@ -41,7 +47,7 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
 
-_WEIGHTS = ("weights", "q", "r", "bryson", "dt")
+_WEIGHTS = ("weights", "q", "r", "bryson", "sample")
 _POSE = ("target_rpy", "target_position")
 _TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
 
@@ -64,7 +70,7 @@ def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> 
 def refuse_law(arguments: argparse.Namespace) -> None:
     """Refuse the options of a regulator together with --free."""
     _refuse(arguments, ("limit", "delay"), "--free has no input to limit or delay")
-    names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "reduce", "allocate", "gain", "controller")
+    names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "reduce", "allocate", "gain", "controller", "mpc")
     _refuse(
         arguments,
         names,
@@ -85,28 +91,10 @@ def add_loop(command: argparse.ArgumentParser) -> None:
         assignment,
         repeatable=True,
     )
-    add(
-        goal,
-        "--target-joint",
-        "target position of a joint [rad|m]; by default [target] of robot.toml, then its [point], "
-        "then the neutral position",
-        assignment,
-        repeatable=True,
-    )
-    rpy = "target attitude of the base: roll, pitch, yaw [deg] about fixed axes"
-    add(goal, "--target-rpy", rpy, number, ("R", "P", "Y"))
-    add(goal, "--target-position", "target position of the base [m]", number, ("X", "Y", "Z"))
-    add(
-        goal,
-        "--target-velocity",
-        "target velocity, such as the speed of a wheel. It is also the initial velocity unless "
-        "--velocity is given",
-        assignment,
-        repeatable=True,
-    )
+    add_target(goal)
     add_inputs_there(goal)
     add_trajectory(command)
-    add_weights(command)
+    add_weights(command, integrated=True)
     _add_controllers(group_of(command, CONTROLLER))
     run = group_of(command, SIMULATION)
     add(
@@ -117,7 +105,7 @@ def add_loop(command: argparse.ArgumentParser) -> None:
         number,
         "T",
     )
-    add(run, "--step", "integration step [s]; chosen automatically by default", number, "H")
+    add_step(run)
     methods = "integrator: cf4 (default), rkmk4 or semi_implicit_euler"
     add(run, "--method", methods, metavar="METHOD", default="cf4")
     add_system(command)
@@ -158,37 +146,28 @@ def _add_controllers(group: Container) -> None:
         "thrusters, which cannot pull. This is the default if the thrusters can push in every "
         "direction. With --no-allocate, negative thrust is set to zero",
     )
+    switch(
+        group,
+        "--mpc",
+        "use model predictive control with the limits of the robot; it needs --sample",
+    )
+    add(group, "--horizon", "number of samples in the horizon of --mpc", count_of, default=20)
     switch(group, "--free", "simulate without a regulator and without inputs")
-    add(
-        group,
-        "--limits",
-        "saturate the inputs at the limits of the robot (urdf, default), or at --limit alone "
-        "(none). The limits are the efforts of the URDF, max and min of the inputs, and the speeds "
-        "of the wheels",
-        choices=("urdf", "none"),
-        default="urdf",
-    )
-    add(
-        group,
-        "--limit",
-        "largest magnitude of an input, or of all inputs of a group such as tau_m or a pattern. "
-        "This value takes precedence over --limits",
-        assignment,
-        repeatable=True,
-    )
+    add_limits(group)
     delay = "time [s] from a sample until its command acts"
     add(group, "--delay", delay, number, "T", default=0.0)
 
 
 def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
     """Return the loop of the options of `add_loop`."""
+    from fflin.control.policies import StateFeedback
     from fflin.simulation.times import SHORTEST, time_to_settle
 
-    given = once("--limit", arguments.limit)
+    settle_step(arguments)
     options: dict[str, Any] = {
-        "dt": arguments.step,
+        "dt": arguments.dt,
         "method": arguments.method,
-        "limits": [arguments.limits, given] if arguments.limits == "urdf" else given or None,
+        "limits": limits_of_options(arguments),
         "delay": arguments.delay,
         "duration": arguments.duration,
     }
@@ -208,8 +187,9 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
     options["q0"], options["v0"] = q, v = start_of(robot, arguments, feedback.lin.reference)
     require_held(robot, feedback, q)
     if arguments.duration is None:
-        options["duration"] = time_to_settle(robot, feedback, q, v)
-    alone = policy is feedback and not arguments.controller
+        linear = StateFeedback(feedback.lin, feedback.gain.K) if arguments.mpc else feedback
+        options["duration"] = time_to_settle(robot, linear, q, v)
+    alone = policy is feedback and not (arguments.controller or arguments.mpc)
     return Loop(policy, options, *([feedback, lin] if alone else []))
 
 
@@ -240,6 +220,10 @@ def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, 
     from fflin.control.policies import Allocation, StateFeedback, thrusters_give_every_wrench
 
     gain: Any = None
+    if arguments.mpc:
+        names = ("allocate", "gain", "controller", "reduce")
+        _refuse(arguments, names, "--mpc computes the inputs itself")
+        arguments.allocate = False
     allocate = (
         thrusters_give_every_wrench(robot) if arguments.allocate is None else arguments.allocate
     )
@@ -262,12 +246,30 @@ def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, 
         _refuse(arguments, (*_WEIGHTS, "gain", "reduce"), "--controller replaces the regulator")
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback: Any = LinearController(arguments.controller, lin, sign=sign)
+    elif arguments.mpc:
+        feedback = _mpc(lin, arguments)
     else:
         gain = gain or gain_of(lin, arguments)
         feedback = StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
     if allocate:
         return Allocation(feedback, design), feedback, None
     return feedback, feedback, None if arguments.reduce else lin
+
+
+def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Any:
+    """Return the predictive controller of the weights and limits."""
+    from fflin.control.default_weights import rule_weights
+    from fflin.control.mpc import mpc
+
+    if arguments.sample is None:
+        raise InputError("--mpc needs the sample time of the controller; add --sample H")
+    options: dict[str, Any] = {"weights": arguments.weights}
+    given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
+    if any(given.values()):
+        Q, R, _, _ = rule_weights(lin.discretize(arguments.sample), arguments.weights, given)
+        options = {"Q": Q, "R": R}
+    limits = limits_of_options(arguments)
+    return mpc(lin, horizon=arguments.horizon, dt=arguments.sample, limits=limits, **options)
 
 
 def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
@@ -279,7 +281,7 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
 
     _refuse(
         arguments,
-        ("free", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS),
+        ("free", "mpc", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS),
         "the trajectory defines the target",
     )
     poses = ("joint", "rpy", "position", "velocity")
@@ -340,7 +342,7 @@ def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> Linea
     if gain.x0[:6].any():
         _refuse(arguments, _POSE, "--gain contains the pose of the base")
     else:
-        q[:7] = _target_of(robot, arguments)[0][:7]
+        q[:7] = target_of(robot, arguments)[0][:7]
     if number := arguments.relative_equilibrium:
         q, reference = attitude(robot, q, number, gain.frame)
     return linearize(robot, q, v, gain.u0, frame=gain.frame, reference=reference)
@@ -386,13 +388,13 @@ def _without_thrusters(robot: Robot) -> Robot:
 def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
     from fflin.linear.linearization import linearize
 
-    q, v = _target_of(robot, arguments)
+    q, v = target_of(robot, arguments)
     q, u, reference = held_at(robot, q, v, arguments)
     lin = linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
     return regulated_part(lin, arguments)
 
 
-def _target_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:
+def target_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:
     """Return q (nq,) and v (nv,) of the target, which is the point of the robot by default."""
     from fflin.robot.fields import combined
 

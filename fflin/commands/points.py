@@ -65,6 +65,12 @@ def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
     return load_inputs(name)
 
 
+def limits_of_options(arguments: argparse.Namespace) -> Any:
+    """Return the limits of --limits and --limit."""
+    given = once("--limit", arguments.limit)
+    return ["urdf", given] if arguments.limits == "urdf" else given or None
+
+
 def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return the pairs of a repeatable option; refuse a name that is given twice."""
     values = dict(pairs)
@@ -126,17 +132,22 @@ def placed(
 
 def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     """Return the robot and its linear model about the given point."""
-    import pinocchio as pin
-
     from fflin.linear.linearization import linearize
+
+    robot, q, v, reference = point_of(arguments)
+    q, u, reference = held_at(robot, q, v, arguments, reference)
+    return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
+
+
+def point_of(arguments: argparse.Namespace) -> tuple[Robot, Array, Array | None, pin.SE3 | None]:
+    """Return the robot, q (nq,), v (nv,) and the reference of the given point."""
+    import pinocchio as pin
 
     robot = load_robot(arguments)
     q = configuration_of(robot, arguments, robot.point)
     v = velocity_of(robot, arguments, robot.point, "velocity")
     refuse_pose(arguments)
-    reference = pin.SE3.Identity() if arguments.reference == "world" else None
-    q, u, reference = held_at(robot, q, v, arguments, reference)
-    return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
+    return robot, q, v, pin.SE3.Identity() if arguments.reference == "world" else None
 
 
 def refuse_pose(arguments: argparse.Namespace, prefix: str = "") -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 from fflin.base.errors import InputError
 from fflin.commands.arguments import (
@@ -18,9 +17,11 @@ from fflin.commands.arguments import (
     add,
     add_figure,
     add_frame,
+    add_limits,
     add_output_file,
     add_point,
     add_robot,
+    add_step,
     add_system,
     assignment,
     command,
@@ -28,10 +29,11 @@ from fflin.commands.arguments import (
     group_of,
     input_file,
     number,
+    settle_step,
     whole,
 )
 from fflin.commands.loops import along
-from fflin.commands.points import linear_model, load_robot, once
+from fflin.commands.points import limits_of_options, linear_model, load_robot, once
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.results import Report, figure_of
 from fflin.commands.tracking import add_trajectory
@@ -40,7 +42,7 @@ _ERRORS = "attitude [deg], position [m], joints, turning (omega_b), moving (v_b)
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
 
 # Options of other commands, which `along` refuses.
-_NONE = "free gain controller target_joint target_rpy target_position target_velocity effort"
+_NONE = "free mpc gain controller target_joint target_rpy target_position target_velocity effort"
 _NONE += " equilibrium"
 _NONE += " joint rpy position velocity"
 
@@ -58,7 +60,7 @@ def _add_validity(commands: Commands) -> None:
         _validity,
         "measure how far the robot can be displaced until the linear model or its regulator fails",
         example="fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
-        common="joint inputs weights q r bryson dt reduce attitude offset spread samples seed "
+        common="joint inputs weights q r bryson sample reduce attitude offset spread samples seed "
         "jobs limits frames plot",
     )
     add_point(validity)
@@ -97,13 +99,13 @@ def _add_funnel(commands: Commands) -> None:
         example="fflin funnel arm.toml --trajectory plan.csv --schedule gains.npz "
         "--goal attitude=1",
         common="trajectory schedule goal within weights q r knots samples seed threads "
-        "step limits limit frame inputs output-file plot html",
+        "dt limits limit frame inputs output-file plot html",
     )
     add_robot(funnel)
     add_system(funnel)
     add_frame(group_of(funnel, TRAJECTORY))
     add_trajectory(funnel)
-    add_weights(funnel)
+    add_weights(funnel, integrated=True)
     runs, shown = group_of(funnel, "runs"), group_of(funnel, OUTPUT)
     add(
         group_of(funnel, CONTROLLER),
@@ -116,26 +118,13 @@ def _add_funnel(commands: Commands) -> None:
     add(runs, "--goal", goal, assignment, repeatable=True)
     within = "largest error allowed at any time of a run; names as in --goal"
     add(runs, "--within", within, assignment, repeatable=True)
-    add(
-        runs,
-        "--limits",
-        "saturate the inputs at the limits of the robot (urdf, default), or never (none)",
-        choices=("urdf", "none"),
-        default="urdf",
-    )
-    add(
-        runs,
-        "--limit",
-        "largest magnitude of an input, group or pattern; it takes precedence over --limits",
-        assignment,
-        repeatable=True,
-    )
+    add_limits(runs)
     add(runs, "--knots", "number of knots to test", count_of, default=10)
     add(runs, "--samples", "number of runs from each knot", count_of, default=100)
     add(runs, "--seed", "random seed of the runs", whole, "S", default=0)
     add(runs, "--confidence", "confidence level of the intervals", number, "P", default=0.95)
     add(runs, "--threads", "number of threads; by default one for each core", count_of)
-    add(runs, "--step", "integration step [s]; chosen automatically by default", number, "H")
+    add_step(runs)
     add(shown, "--html", "write a page that plays the motion with the funnel as a tube", PAGE)
     add_figure(funnel, "the funnel")
     add_output_file(shown, "the funnel", RECORD, "Funnel")
@@ -153,7 +142,7 @@ def _validity(arguments: argparse.Namespace) -> Report:
     robot, lin = linear_model(arguments)
     lin = regulated_part(lin, arguments)
     gain = gain_of(lin, arguments)
-    judged = lin.discretize(arguments.dt) if arguments.dt else lin
+    judged = lin.discretize(arguments.sample) if arguments.sample else lin
     bar, cut = Progress(), arguments.limits == "urdf"
     try:
         with OwnWorkers(arguments.jobs) if arguments.jobs > 1 else nullcontext() as executor:
@@ -186,11 +175,9 @@ def _funnel(arguments: argparse.Namespace) -> Report:
     if arguments.trajectory is None and arguments.schedule is None:
         raise InputError("neither --trajectory nor --schedule is given; give one of them, or both")
     robot = load_robot(arguments)
+    settle_step(arguments)
     policy, _ = along(robot, arguments)
-    given = once("--limit", arguments.limit)
-    urdf = "urdf" if arguments.limits == "urdf" else None
-    limits: Any = [urdf, given] if urdf and given else given or urdf
-    options: dict[str, Any] = {"limits": limits, "dt": arguments.step}
+    options = {"limits": limits_of_options(arguments), "dt": arguments.dt}
     kept = {key: getattr(arguments, key) for key in _RUNS} | options
     kept["within"], bar = once("--within", arguments.within), Progress()
     try:

@@ -15,6 +15,7 @@ from fflin.commands.arguments import (
     Commands,
     add,
     add_figure,
+    add_former_name,
     add_output_file,
     add_point,
     assignment,
@@ -40,7 +41,7 @@ def add_commands(commands: Commands) -> None:
         _lqr,
         "design a linear quadratic regulator; show gain, poles, residual and margins",
         example="fflin lqr canadarm2 -o gain.npz",
-        common="joint velocity equilibrium inputs frame weights q r bryson dt reduce "
+        common="joint velocity equilibrium inputs frame weights q r bryson sample reduce "
         "wheel-speeds output-file plot",
     )
     add_point(lqr)
@@ -49,8 +50,11 @@ def add_commands(commands: Commands) -> None:
     add_figure(lqr, "the poles, and the loop of each input with its margins,")
 
 
-def add_weights(command: argparse.ArgumentParser) -> None:
-    """Add the options of the cost and the regulated states: --q, --r, --bryson, --dt and others."""
+def add_weights(command: argparse.ArgumentParser, *, integrated: bool = False) -> None:
+    """Add the options of the cost, the sample time and the regulated states.
+
+    If a loop is `integrated`, --dt is its integration step; otherwise it is the former --sample.
+    """
     group = group_of(command, CONTROLLER)
     add(
         group,
@@ -86,11 +90,14 @@ def add_weights(command: argparse.ArgumentParser) -> None:
     )
     add(
         group,
-        "--dt",
-        "design for inputs held for H [s]; the continuous-time cost is still minimised",
+        "--sample",
+        "sample time of the controller [s]: inputs are held for H; the continuous-time cost is "
+        "still minimised",
         number,
         "H",
     )
+    if not integrated:
+        add_former_name(group, "--dt", "sample")
     switch(
         group,
         "--reduce",
@@ -128,8 +135,8 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
         given = arguments.equilibrium or arguments.relative_equilibrium or lin.v.any()
         more = ", --relative-equilibrium" if lin.frame in ("lvlh", "hill") else ""
         raise EquilibriumError(str(error) if given else f"{error} (--equilibrium{more})") from None
-    if arguments.dt is not None:
-        lin = lin.discretize(arguments.dt)
+    if arguments.sample is not None:
+        lin = lin.discretize(arguments.sample)
     try:
         given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
         speeds = arguments.wheel_speeds

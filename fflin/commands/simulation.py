@@ -42,7 +42,7 @@ def add_commands(commands: Commands) -> None:
         "simulate the robot with a regulator to a target or along a trajectory",
         example="fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html "
         "--plot loop.png",
-        common="joint rpy velocity target-joint target-rpy trajectory weights q r gain schedule "
+        common="joint rpy target-joint target-rpy trajectory weights q r sample mpc gain schedule "
         "free limits duration inputs output-file plot html",
     )
     add_loop(simulate)
@@ -78,7 +78,7 @@ def _simulate(arguments: argparse.Namespace) -> Report:
     try:
         motion = simulated(robot, arguments)
     except InputError as error:
-        hint = " (--dt)" if "time between samples" in str(error) else ""
+        hint = " (--sample)" if "time between samples" in str(error) else ""
         raise InputError(f"{error}{hint}") from None
     return Report(
         robot.name,

@@ -43,9 +43,9 @@ def add_commands(commands: Commands) -> None:
         "tvlqr",
         _tvlqr,
         "design the time-varying regulator along a trajectory",
-        example="fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --dt 0.1 "
+        example="fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 "
         "-o gains.npz",
-        common="trajectory hold strict weights q r bryson dt qf inputs frame output-file",
+        common="trajectory hold strict weights q r bryson sample qf inputs frame output-file",
     )
     add_robot(tvlqr)
     add_system(tvlqr)
@@ -145,10 +145,10 @@ def schedule_of(
     from fflin.control.default_weights import pace_along, rule_weights
     from fflin.control.tvlqr import steady_end, tvlqr
 
-    options: dict[str, Any] = {"sample": arguments.dt, "weights": arguments.weights}
+    options: dict[str, Any] = {"sample": arguments.sample, "weights": arguments.weights}
     given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
     if any(given.values()):
-        pace = pace_along(float(along.t[-1] - along.t[0]), arguments.dt or 0.0)
+        pace = pace_along(float(along.t[-1] - along.t[0]), arguments.sample or 0.0)
         Q, R, _, rule = rule_weights(steady_end(along), arguments.weights, given, pace=pace)
         options |= {"Q": Q, "R": R, "weights": None, "rule": rule}
     return tvlqr(along, Qf=Qf, **options)

@@ -8,13 +8,19 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from scipy.linalg import eigh
 
-from fflin.analysis.mechanics import second_order, slopes
+from fflin.analysis.mechanics import rate_matrix, second_order
 from fflin.analysis.ranks import Noisy, null_space
-from fflin.analysis.reduction import ignorable_wheels, picked, regulated_part, rigid_forces, without
+from fflin.analysis.reduction import (
+    ignorable_wheels,
+    regulated_part,
+    rigid_forces,
+    selection,
+    without,
+)
 from fflin.base.errors import FflinWarning, InputError, listed, unknown
 from fflin.base.names import input_keys
 from fflin.base.validation import Array
-from fflin.control.riccati import rates_of, solve
+from fflin.control.optimal.riccati import rates_of, solve
 from fflin.control.saturation import warn_beyond
 from fflin.control.weights import GivenWeight, sampled_cost, weights_of
 from fflin.linear.model import LinearModel
@@ -88,7 +94,7 @@ def default_weights(
 ) -> Weights:
     """Return weights with which a displaced robot comes back within the URDF's limits (10.7)."""
     m = len(lin.M)
-    N = slopes(lin)[:m, m:]
+    N = rate_matrix(lin)[:m, m:]
     if N.shape != lin.M.shape or not np.linalg.cond(N) < 1e8:
         raise InputError(
             f"the states of the model of '{lin.robot}' are not coordinates and their rates, which "
@@ -159,7 +165,7 @@ def _of_inertia(
         *_limits("effort", _efforts(lin), use, 2.0),
     ]
     limit, achieved = min(limits), ""
-    rate = slopes(lin)
+    rate = rate_matrix(lin)
     loaded = rate[m:].any() or rate[:m, :m].any()
     if loaded:
         grows = _growth(lin)
@@ -192,7 +198,7 @@ def _on_velocities(
     lin: LinearModel, S: Array, cost: Array, least: Array, damped: bool
 ) -> Callable[[float], Array]:
     """Return the weight (m, m) on velocities of (10.8), for a bandwidth."""
-    m, X = len(lin.M), slopes(lin)
+    m, X = len(lin.M), rate_matrix(lin)
     size = np.sqrt(least)
     values, directions = np.linalg.eigh((S / cost) @ S.T / np.outer(size, size))
     root = size[:, None] * directions * np.sqrt(values.clip(_LEAST_REACH))
@@ -502,11 +508,11 @@ def _of_regulated(
     Q, R, rule, bandwidth, (of_positions, of_inputs) = found
     if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
         rule += f"; at or beyond the URDF limit at the point itself: {listed(beyond)}"
-    S = picked(body.state_names, lin.state_names)
+    S = selection(body.state_names, lin.state_names)
     Q = S.T @ Q @ S
     terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
     if speeds := [name for name in part.state_names if name not in body.state_names]:
-        S, slow = picked(speeds, lin.state_names), _SPEEDS * bandwidth
+        S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
         # Inputs R^-1/2 Z n that turn no body change the speeds at X n.
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
         X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)

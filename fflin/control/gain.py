@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.analysis.reduction import picked
+from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError, listed
 from fflin.base.names import group_of, input_keys
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array
 from fflin.control.margins import Margins, input_margins
-from fflin.control.riccati import rates_of
+from fflin.control.optimal.riccati import rates_of
 from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
-    from fflin.control.riccati import Solution
+    from fflin.control.optimal.riccati import Solution
     from fflin.linear.exchange import ToolGain
 
 # A larger gain, of more than three joints, is shown by the norms of its blocks.
@@ -187,7 +187,7 @@ class Gain(Design):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed at first access."""
-        S = picked(self.regulated or self.state_names, self.state_names)
+        S = selection(self.regulated or self.state_names, self.state_names)
         return input_margins(S @ self.A @ S.T, S @ self.B, self.K @ S.T, self.R, self.dt)
 
 
@@ -210,7 +210,7 @@ def make_gain(
     weights: str = "as given",
 ) -> Gain:
     """Return a gain of a solution and weights of a part of a model, with the rest not fed back."""
-    S = picked(part.state_names, lin.state_names)
+    S = selection(part.state_names, lin.state_names)
     poles, margin = solution.ordered(lin.dt)
     return Gain(
         **{key: getattr(lin, key) for key in _FROM_MODEL},
@@ -283,7 +283,7 @@ def _unregulated(gain: Gain) -> str:
     if speeds := [name for name in left if name.startswith("qdot_m.")]:
         B = gain.B / np.linalg.norm(gain.B, axis=1, keepdims=True).clip(1e-300)
         held, both = (
-            np.linalg.matrix_rank(picked(names, gain.state_names) @ B)
+            np.linalg.matrix_rank(selection(names, gain.state_names) @ B)
             for names in (gain.regulated, (*gain.regulated, *speeds))
         )
         tied = "tied to the body's rate by the conserved momentum"

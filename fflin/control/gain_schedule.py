@@ -14,7 +14,7 @@ from fflin.base.errors import InputError
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import folded
 from fflin.base.validation import Array, number
-from fflin.control.differential_riccati import Coefficients, imbalance
+from fflin.control.optimal.differential_riccati import Coefficients, imbalance
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.analysis.reduction import picked, regulated_part, seen_through
+from fflin.analysis.reduction import outputs_of, regulated_part, selection
 from fflin.analysis.stabilizability import require_detectable, require_disturbed
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
@@ -16,7 +16,7 @@ from fflin.base.record import Design
 from fflin.base.validation import Array, dimension
 from fflin.control.gain import Gain, titled
 from fflin.control.lqr import require_fixed_point
-from fflin.control.riccati import solve
+from fflin.control.optimal.riccati import solve
 from fflin.control.weights import Weight, columns, weight
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel, state_space
@@ -236,8 +236,8 @@ def kalman(
     noise, through = disturbance(lin, W, G)
     V = weight("V", V, lin.output_names, definite=True)
     whole, noises, lin = lin, V, regulated_part(lin, wheel_speeds)
-    S = picked(lin.state_names, whole.state_names)
-    seen = seen_through(whole, S)
+    S = selection(lin.state_names, whole.state_names)
+    seen = outputs_of(whole, S)
     W, V = S @ through @ noise @ through.T @ S.T, seen @ V @ seen.T
     W = 0.5 * W + 0.5 * W.T
     require_detectable(lin)
@@ -316,7 +316,7 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
             f"the gain feeds back {listed(unseen)}, which the estimator does not estimate; give "
             "the same wheel_speeds to both"
         )
-    S = picked(names, e.state_names)
+    S = selection(names, e.state_names)
     return Compensator(
         A=S @ (e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K)) @ S.T,
         B=S @ e.L,

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.analysis.mechanics import slopes
-from fflin.analysis.reduction import picked, regulated_part
+from fflin.analysis.mechanics import rate_matrix
+from fflin.analysis.reduction import regulated_part, selection
 from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
 from fflin.control.default_weights import rule_weights
 from fflin.control.gain import Gain, make_gain
-from fflin.control.riccati import Riccati, Solution, half_size, solve
+from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve
 from fflin.control.weights import Weight, cost_weights, weight
 from fflin.linear.model import LinearModel
 
@@ -137,7 +137,7 @@ def lqr(
     Q, R, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:
-        S = picked(part.state_names, lin.state_names)
+        S = selection(part.state_names, lin.state_names)
         Q, cross = S @ Q @ S.T, None if cross is None else S @ cross
     solution = _solve(part, Q, R, cross)
     return make_gain(lin, part, solution, Q, R, cross, rule)
@@ -340,7 +340,7 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
             raise np.linalg.LinAlgError("the weights are too badly scaled")
     except np.linalg.LinAlgError as error:
         # The closed form is for double integrators alone.
-        forces = slopes(lin)[len(lin.M) - len(lin.A) :].any()
+        forces = rate_matrix(lin)[len(lin.M) - len(lin.A) :].any()
         raise StabilizabilityError(
             f"no stabilising solution of the Riccati equation was found: {error}; scale the "
             f"weights, for example with bryson{'' if forces else ', or use acceleration_lqr'}"

@@ -14,10 +14,10 @@ from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, number, whole
-from fflin.control.differential_riccati import bounded_by, samples_back
 from fflin.control.gain import Gain
 from fflin.control.horizon import Horizon, Matrices, Receding, Stage
 from fflin.control.lqr import lqr
+from fflin.control.optimal.differential_riccati import bounded_by, samples_back
 from fflin.control.policies import Feedback, Policy, StateFeedback
 from fflin.control.saturation import input_limits
 from fflin.control.tracking import TrajectoryFeedback

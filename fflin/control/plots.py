@@ -11,7 +11,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing, letters_of, logarithmic
-from fflin.base.validation import Array, number, refuse_masked
+from fflin.base.validation import Array, instance, number, refuse_masked
 from fflin.control.gain import Gain
 from fflin.control.margins import Loop, input_loops
 from fflin.linear.model import LinearModel
@@ -81,8 +81,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     >>> lin = fflin.linearize(fflin.load("planar_detumble"))
     >>> figure = fflin.plot_loops(fflin.lqr(lin), "loops.png")
     """
-    if not isinstance(gain, Gain):
-        raise InputError(f"gain is a {type(gain).__name__}, expected a Gain, as from fflin.lqr")
+    instance("gain", gain, Gain, "a Gain, as from fflin.lqr")
     tall = max(8.5, 1.5 + 0.12 * len(gain.K))
     with drawing(path, 11.0, tall) as figure:
         w, response, loops = input_loops(gain)

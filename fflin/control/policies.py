@@ -208,8 +208,8 @@ class AllocatedPolicy:
             columns[:, held] = columns[:, held] @ given.chart(q).R.T
         M = asked.project(pin.crba(asked.robot.model, self._design_data, q).T)
         factor = np.linalg.cholesky(M)
-        A, b = np.linalg.solve(factor, columns), np.linalg.solve(factor, force)
-        return nearest(A, b, self._least, self._most)
+        scaled = np.linalg.solve(factor, np.column_stack((columns, force)))
+        return nearest(scaled[:, :-1], scaled[:, -1], self._least, self._most)
 
 
 class Clock:
@@ -278,8 +278,8 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
     # The entries of a list are read faster than the entries of an array.
     problem = least_squares(least.tolist(), most.tolist(), size)._replace(
         columns=np.concatenate((A.T.ravel(), b)),
-        R=numbers * len(least),
         state=[0] * len(least),
+        order=[0] * len(least),
         **{name: numbers.copy() for name in ("x", "s", "low", "high")},
     )
     solve(problem, size, 0)

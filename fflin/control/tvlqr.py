@@ -14,12 +14,12 @@ from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import DetectabilityError, EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, number
-from fflin.control import differential_riccati as riccati
 from fflin.control.default_weights import pace_along, rule_weights
 from fflin.control.gain import Gain
 from fflin.control.gain_schedule import FilterSchedule, GainSchedule, Interpolant
 from fflin.control.kalman import disturbance, kalman
 from fflin.control.lqr import lqr
+from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, sampled_cost, weight
 from fflin.dynamics.inertia import rotor_names
 from fflin.linear.equilibrium import equilibrium

@@ -14,7 +14,7 @@ from fflin.dynamics.orbital import Tide, field_of
 from fflin.dynamics.state import StateMap
 
 
-class Rates(NamedTuple):
+class AccelerationDerivatives(NamedTuple):
     """Accelerations of the base origin and the joints, in base axes, and their derivatives.
 
     At one point, or with leading axes at many.
@@ -79,7 +79,7 @@ class Accelerations:
 
     def rates(
         self, q: Array, v: Array, nu: Array, q_m: Array, u: Array, slopes: Array, by_u: Array
-    ) -> Rates:
+    ) -> AccelerationDerivatives:
         """Return the rates at q, v and u in base axes, v being `nu` and q_m in state order.
 
         Their slopes and by_u are the C-contiguous arrays of their shapes that are given.
@@ -131,7 +131,7 @@ class Accelerations:
         np.dot(-inverse, self._force_slopes, out=slopes)
         if not actuation.default:
             np.dot(inverse, columns, out=by_u)
-        return Rates(c, slopes, by_u, tide.fall if tide else state.gravity(q))
+        return AccelerationDerivatives(c, slopes, by_u, tide.fall if tide else state.gravity(q))
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
         """Return the torques of stored momentum; the wrenches include the inputs'."""

@@ -307,7 +307,7 @@ def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: Any) -> Stat
     if not policy.schedule.dt:
         raise InputError(
             "the gains are continuous in time, expected gains at samples; design them with "
-            "tvlqr(..., sample=dt) (fflin tvlqr --dt)"
+            "tvlqr(..., sample=dt) (fflin tvlqr --sample)"
         )
     dt, state = policy.schedule.dt, policy.state_map(robot)
     world = StateMap(robot, frame="local")

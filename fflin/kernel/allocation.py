@@ -25,8 +25,10 @@ from fflin.kernel.lanes import (
     inlined,
     load,
     poke,
+    remove_components,
     root,
     row_product,
+    row_products,
     store,
     width,
     write_scaled,
@@ -40,15 +42,16 @@ _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 
 
 class LeastSquares(
-    namedtuple("LeastSquares", "least most columns given A Q R b wanted x s low high state")
+    namedtuple("LeastSquares", "least most columns given A Q R b y wanted x s low high state order")
 ):
     """The x (k,) within `least` and `most` (k,) that makes the sum of columns nearest to a force.
 
     `columns` has the k columns of an input's unit force, one after the other, and then the force.
     What follows is work space: the `given` columns of a lane; `A`, the same divided by their norm;
-    their orthogonal factors `Q` and `R` with the rows of `LEAST` below; the remainder `b`; the
-    force `wanted` of length 1; the solution `s` without bounds; the scaled bounds `low` and
-    `high`; and the `state` of each input.
+    the orthogonal factors `Q` and `R` of the columns of free inputs, with the rows of `LEAST`
+    below, in the `order` in which the inputs became free; the remainder `b`, and `y` for its
+    components; the force `wanted` of length 1; the solution `s` without bounds; the scaled bounds
+    `low` and `high`; and the `state` of each input.
     """
 
 
@@ -60,7 +63,7 @@ class Allocation(namedtuple("Allocation", "asking giving point work problem")):
     """
 
 
-LEAST_SQUARES = Struct(LeastSquares, columns=LANED, state=INDICES)
+LEAST_SQUARES = Struct(LeastSquares, columns=LANED, state=INDICES, order=INDICES)
 ALLOCATION = Struct(
     Allocation,
     asking=MECHANICS,
@@ -83,12 +86,14 @@ def least_squares(least, most, size):
         Q=np.zeros(count * (size + count)),
         R=np.zeros(count * count),
         b=np.zeros(size + count),
+        y=np.zeros(count),
         wanted=np.zeros(size),
         x=np.zeros(count),
         s=np.zeros(count),
         low=np.zeros(count),
         high=np.zeros(count),
         state=np.zeros(count, dtype=np.intp),
+        order=np.zeros(count, dtype=np.intp),
     )
 
 
@@ -167,54 +172,64 @@ def solve(problem, size, lane):
     force = root(row_product(given, last, given, last, size))
     nothing = not (unit > 0.0 and force > 0.0)
     scale = 1.0 if nothing else unit / force
+    free = 0
     for j in range(count):
         low[j], high[j] = least[j] * scale, max(most[j] * scale, least[j] * scale + 1e-15)
         x[j] = min(max(0.0, low[j]), high[j])
-        problem.state[j] = _LOW if least[j] == 0.0 else _FREE
+        problem.state[j] = _LOW
+        if least[j] != 0.0:
+            problem.state[j] = _FREE
+            problem.order[free] = j
+            free += 1
     if not nothing:
         write_scaled(given, 0, 1.0 / unit, A)
         write_scaled(given[last:], 0, 1.0 / force, wanted)
-        changed = _solve_scaled(problem, size, 0)
+        free, kept = _solve_scaled(problem, size, free, 0)
         # The rounding of what cannot be given would drown the rows of LEAST: it is removed.
         wanted[:] = 0.0
         for j in range(count):
-            add_row(wanted, 0, x[j], A, j * size, size)
-        _solve_scaled(problem, size, changed)
+            if x[j] != 0.0:
+                add_row(wanted, 0, x[j], A, j * size, size)
+        _solve_scaled(problem, size, free, kept)
     for j in range(count):
         x[j] = min(max(x[j] / scale, least[j]), most[j]) + 0.0 * force
 
 
 @called
-def _solve_scaled(problem, size, changed):
+def _solve_scaled(problem, size, free, kept):
     """Write the solution of what is wanted into x, starting from x and the state of its entries.
 
-    Columns of the factor before the input `changed` are there. Return the same for the next call.
+    The first `free` inputs in `order` are free, and the factor has the columns of the first `kept`.
+    Return both for the next call.
     """
-    x, s, low, high, state = problem.x, problem.s, problem.low, problem.high, problem.state
-    count, newest = len(x), -1
+    x, s, low, high = problem.x, problem.s, problem.low, problem.high
+    state, order, count, newest = problem.state, problem.order, len(problem.x), -1
     for _ in range(20 * count):
-        _fit(problem, size, changed)
-        changed, hit, step = count, -1, 1.0
-        for j in range(count):
-            if state[j] == _FREE and not low[j] <= s[j] <= high[j]:
+        _fit(problem, size, free, kept)
+        kept, hit, step = free, -1, 1.0
+        for at in range(free):
+            j = order[at]
+            if not low[j] <= s[j] <= high[j]:
                 bound = low[j] if s[j] < low[j] else high[j]
-                way = (bound - x[j]) / (s[j] - x[j])
-                if hit < 0 or way < step:
-                    hit, step = j, way
+                reached = (bound - x[j]) / (s[j] - x[j])
+                if hit < 0 or reached < step:
+                    hit, step = at, reached
         if hit >= 0:
-            for j in range(count):
-                if state[j] == _FREE:
-                    x[j] += step * (s[j] - x[j])
-            x[hit] = low[hit] if s[hit] < low[hit] else high[hit]
-            state[hit] = _LOW if s[hit] < low[hit] else _HIGH
-            changed = hit
-            if hit != newest or step > 0.0:
+            for at in range(free):
+                x[order[at]] += step * (s[order[at]] - x[order[at]])
+            j = order[hit]
+            x[j] = low[j] if s[j] < low[j] else high[j]
+            state[j] = _LOW if s[j] < low[j] else _HIGH
+            free, kept = free - 1, hit
+            for at in range(hit, free):
+                order[at] = order[at + 1]
+            if j != newest or step > 0.0:
                 newest = -1
                 continue
-            # It goes the wrong way by rounding alone: another is tried.
-            state[hit] += _TRIED
-            _fit(problem, size, changed)
-            changed = count
+            # It leaves its bound the wrong way because of rounding alone: try another.
+            state[j] += _TRIED
+            _fit(problem, size, free, kept)
+            kept = free
         for j in range(count):
             if state[j] == _FREE:
                 x[j] = s[j]
@@ -224,33 +239,28 @@ def _solve_scaled(problem, size, changed):
         if newest < 0:
             break
         state[newest] = _FREE
-        changed = min(changed, newest)
-    return changed
+        order[free] = newest
+        free += 1
+    return free, kept
 
 
 @called
-def _fit(problem, size, changed):
+def _fit(problem, size, free, kept):
     """Write the least squares of the free inputs into s, and the remaining force into b.
 
-    By modified Gram and Schmidt, the force being the last column: as exact as Householder's. The
-    factor's columns before the first `changed` input are still there.
+    By an orthogonal factor, to which the columns of inputs from `kept` on are added in their order.
     """
-    s, Q, R, b, state = problem.s, problem.Q, problem.R, problem.b, problem.state
+    s, Q, R, b, order, y = problem.s, problem.Q, problem.R, problem.b, problem.order, problem.y
     count = len(s)
-    rows = size + count
     _subtract_bound(problem, size)
-    for j in range(count):
-        if state[j] == _FREE:
-            if j >= changed:
-                _orthogonalise(problem, size, j)
-            s[j] = row_product(Q, j * rows, b, 0, rows)
-            add_row(b, 0, -s[j], Q, j * rows, rows)
-    for j in range(count - 1, -1, -1):
-        if state[j] == _FREE:
-            for i in range(j + 1, count):
-                if state[i] == _FREE:
-                    s[j] -= R[j * count + i] * s[i]
-            s[j] /= R[j * count + j]
+    for at in range(kept, free):
+        _orthogonalise(problem, size, at)
+    remove_components(Q, size + count, free, b, y, 0)
+    for at in range(free - 1, -1, -1):
+        value = y[at] / R[at * count + at]
+        s[order[at]] = value
+        if at > 0:
+            add_row(y, 0, -value, R, at * count, at)
 
 
 @inlined
@@ -266,32 +276,28 @@ def _subtract_bound(problem, size):
 
 
 @inlined
-def _orthogonalise(problem, size, j):
-    """Write the part of a column that is orthogonal to the free columns before it, of length 1."""
-    Q, R, state, count = problem.Q, problem.R, problem.state, len(problem.least)
+def _orthogonalise(problem, size, at):
+    """Write the part of a free input's column that is orthogonal to those before, of length 1."""
+    Q, R, count, j = problem.Q, problem.R, len(problem.least), problem.order[at]
     rows = size + count
-    first = j * rows
-    column = Q[first : first + rows]
+    column = Q[at * rows : (at + 1) * rows]
     column[:] = 0.0
     write_scaled(problem.A[j * size :], 0, 1.0, column[:size])
     column[size + j] = LEAST
-    for i in range(j):
-        if state[i] == _FREE:
-            share = row_product(Q, i * rows, column, 0, rows)
-            add_row(column, 0, -share, Q, i * rows, rows)
-            R[i * count + j] = share
+    remove_components(Q, rows, at, column, R, at * count)
     length = root(row_product(column, 0, column, 0, rows))
     write_scaled(column, 0, 1.0 / length, column)
-    R[j * count + j] = length
+    R[at * count + at] = length
 
 
 @called
 def _steepest(problem, size):
     """Return the untried input at a bound that best leaves it; -1 where none does."""
-    best, found, A, b, state = 0.0, -1, problem.A, problem.b, problem.state
+    best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
+    row_products(problem.A, size, b, slopes)
     for j in range(len(state)):
         if state[j] == _LOW or state[j] == _HIGH:
-            slope = LEAST * b[size + j] + row_product(A, j * size, b, 0, size)
+            slope = LEAST * b[size + j] + slopes[j]
             if state[j] == _HIGH:
                 slope = -slope
             if slope > best:

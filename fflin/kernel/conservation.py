@@ -13,11 +13,12 @@ from collections import namedtuple
 from fflin.kernel import vectors as vec
 from fflin.kernel.arguments import LANED, Struct
 from fflin.kernel.displacements import axes_of
+from fflin.kernel.inertia import spatial_inertia_times
 from fflin.kernel.lanes import inlined, load, store
-from fflin.kernel.rnea import spatial_inertia_times, stored_momentum
+from fflin.kernel.rnea import stored_momentum
 
-# Where these begin in the sums: impulse and way so far, and of the step.
-IMPULSE, WAY, STEP_IMPULSE, STEP_WAY = 0, 6, 9, 15
+# Where these begin in the sums: impulse and shift of the centre of mass, so far and of the step.
+IMPULSE, SHIFT, STEP_IMPULSE, STEP_SHIFT = 0, 6, 9, 15
 SUMS = 18
 
 
@@ -25,8 +26,8 @@ class MomentumReference(namedtuple("MomentumReference", "start weight per_mass s
     """What is kept; each array of doubles may have a second axis of eight lanes.
 
     `start` (12,): momentum, centre of mass, and the point that both are seen from; weight (3,); and
-    `sums` (18,): impulse (6,) and way besides that of the initial velocity (3,), so far and of the
-    step.
+    `sums` (18,): the impulse (6,), and the shift (3,) of the centre of mass beyond the one of its
+    initial velocity, so far and of the step.
     """
 
 
@@ -54,16 +55,18 @@ def add_wrench(work, robot, reference, point, weight, moment):
     force = vec.plus(force, falls)
     vec.add3(reference.sums, STEP_IMPULSE, vec.times(force, weight))
     vec.add3(reference.sums, STEP_IMPULSE + 3, vec.times(torque, weight))
-    vec.add3(reference.sums, STEP_WAY, vec.times(force, moment))
+    vec.add3(reference.sums, STEP_SHIFT, vec.times(force, moment))
 
 
 @inlined
 def end_step(reference, h):
     """Go on by a step of h [s]."""
     per_mass = load(reference.per_mass, 0)
-    way = vec.times(vec.get3(reference.sums, IMPULSE), h)
+    shift = vec.times(vec.get3(reference.sums, IMPULSE), h)
     vec.add3(
-        reference.sums, WAY, vec.times(vec.plus(way, vec.get3(reference.sums, STEP_WAY)), per_mass)
+        reference.sums,
+        SHIFT,
+        vec.times(vec.plus(shift, vec.get3(reference.sums, STEP_SHIFT)), per_mass),
     )
     vec.add6(reference.sums, IMPULSE, vec.get6(reference.sums, STEP_IMPULSE))
 
@@ -73,8 +76,8 @@ def kept_at(reference, t):
     """Return the momentum, linear and angular, and where the centre of mass is."""
     momentum = vec.plus6(vec.get6(reference.start, 0), vec.get6(reference.sums, IMPULSE))
     flown = vec.times(vec.get3(reference.start, 0), t * load(reference.per_mass, 0))
-    way = vec.plus(vec.get3(reference.start, 6), vec.get3(reference.sums, WAY))
-    return momentum, vec.plus(way, flown)
+    shift = vec.plus(vec.get3(reference.start, 6), vec.get3(reference.sums, SHIFT))
+    return momentum, vec.plus(shift, flown)
 
 
 @inlined

@@ -1,6 +1,7 @@
 """Attitudes, and displacements of a configuration along its tangent.
 
-A displacement has the order of the state: the base's turn and way in base axes, then the joints.
+A displacement has the order of the state: the base's rotation and translation in base axes, then
+the joints.
 """
 
 from __future__ import annotations

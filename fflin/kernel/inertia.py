@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from fflin.kernel import vectors as vec
-from fflin.kernel.lanes import floor, inlined, load, splat, store, transpose
+from fflin.kernel.lanes import floor, inlined, load, splat, store
 from fflin.kernel.tree import INERTIA, LANES, PLACE
 
 
@@ -101,22 +101,14 @@ def _carry(work, at, above, place):
 
 
 @inlined
-def inertia_times(work, at, w):
-    """Return I w of the inertia at `at`."""
+def spatial_inertia_times(work, at, motion):
+    """Return inertia times a motion vector, moment and force."""
+    m, h = load(work, at), vec.get3(work, at + 1)
     xx, xy, xz = vec.get3(work, at + 4)
     yy, yz, zz = vec.get3(work, at + 7)
-    return vec.dot((xx, xy, xz), w), vec.dot((xy, yy, yz), w), vec.dot((xz, yz, zz), w)
-
-
-@inlined
-def _momentum(work, at, axis, turns, slides):
-    """Return the momentum (angular, linear) about its joint of an inertia that the joint moves."""
-    m = load(work, at)
-    lever = vec.cross(vec.get3(work, at + 1), axis)
-    return (
-        vec.plus(vec.times(inertia_times(work, at, axis), turns), vec.times(lever, slides)),
-        vec.minus(vec.times(vec.times(axis, m), slides), vec.times(lever, turns)),
-    )
+    w, v = motion
+    turning = vec.dot((xx, xy, xz), w), vec.dot((xy, yy, yz), w), vec.dot((xz, yz, zz), w)
+    return vec.plus(turning, vec.cross(h, v)), vec.plus(vec.times(v, m), vec.cross(w, h))
 
 
 @inlined
@@ -158,7 +150,8 @@ def inwards(work, tree):
         at = inertias + body * INERTIA
         place = places + body * PLACE
         z = vec.get3(work, place + 6)
-        moment, force = _momentum(work, at, z, tree.turns[body], tree.slides[body])
+        axis = vec.times(z, tree.turns[body]), vec.times(z, tree.slides[body])
+        moment, force = spatial_inertia_times(work, at, axis)
         _carry(work, at, inertias + tree.parent[body] * INERTIA, place)
         above = body
         while above > 0:
@@ -180,28 +173,10 @@ def inwards(work, tree):
     hx, hy, hz = vec.get3(work, inertias + 1)
     xx, xy, xz = vec.get3(work, inertias + 4)
     yy, yz, zz = vec.get3(work, inertias + 7)
-    own = (xx, xy, yy, xz, yz, zz)
-    for index in range(6):
-        store(work, packed + index, own[index])
-    linear = (
-        zero,
-        hz,
-        zero - hy,
-        m,
-        zero - hz,
-        zero,
-        hx,
-        zero,
-        m,
-        hy,
-        zero - hx,
-        zero,
-        zero,
-        zero,
-        m,
-    )
-    for index in range(15):
-        store(work, packed + (6 + index), linear[index])
+    vec.put6(work, packed, ((xx, xy, yy), (xz, yz, zz)))
+    vec.put6(work, packed + 6, ((zero, hz, -hy), (m, -hz, zero)))
+    vec.put3(work, packed + 12, (hx, zero, m))
+    vec.put6(work, packed + 15, ((hy, -hx, zero), (zero, zero, m)))
     for index in range(len(tree.row)):
         at = packed + (tree.row[index] + tree.depth[index])
         vec.add(work, at, tree.armature[index])
@@ -300,11 +275,6 @@ def pack(rows, first, lanes):
 @inlined
 def unpack(work, start, entries, out, first, offset):
     """Write entries that stand lane beside lane to the rows of eight points, from a column on."""
-    stride = out.shape[1]
-    whole = entries - entries % LANES
-    to = first * stride + offset
-    for entry in range(0, whole, LANES):
-        transpose(work, start + entry, out, to + entry, stride)
-    for entry in range(whole, entries):
+    for entry in range(entries):
         for lane in range(LANES):
             out[first + lane, offset + entry] = work[start + entry, lane]

@@ -263,50 +263,11 @@ def angle(typing: Any, sine: Any, cosine: Any) -> Any:
     return _together(sine, cosine)(sine, cosine), generate
 
 
-@intrinsic
-def transpose(typing: Any, source: Any, index: Any, target: Any, start: Any, stride: Any) -> Any:
-    """Write eight vectors that stand one after the other lane by lane.
-
-    Lane k goes to the eight doubles of `target` from ``start + k stride`` on.
-    """
-
-    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        values, first, out, begin, step = arguments
-        rows = []
-        for row in range(LANES):
-            at = builder.add(first, ir.Constant(first.type, row))
-            rows.append(builder.load(_place(context, builder, source, values, at)))
-            rows[-1].align = _BYTES
-        # Swap blocks of 1, 2 and 4 lanes between rows that lie as far apart.
-        for size in (1, 2, 4):
-            low = [lane if not lane & size else lane - size + LANES for lane in range(LANES)]
-            high = [lane + size if not lane & size else lane + LANES for lane in range(LANES)]
-            masks = [
-                ir.Constant(ir.VectorType(_INT32, LANES), [_INT32(i) for i in picks])
-                for picks in (low, high)
-            ]
-            for row in range(LANES):
-                if not row & size:
-                    pair = rows[row], rows[row + size]
-                    rows[row], rows[row + size] = (
-                        builder.shuffle_vector(*pair, mask) for mask in masks
-                    )
-        for row, value in enumerate(rows):
-            at = builder.add(begin, builder.mul(step, ir.Constant(step.type, row)))
-            place = _flat_place(context, builder, target, out, at)
-            _write(builder, value, builder.bitcast(place, _VECTOR.as_pointer()))
-        return context.get_dummy_value()
-
-    index_type = numba.types.intp
-    signature = numba.types.void(source, index_type, target, index_type, index_type)
-    return signature, generate
-
-
 # By the function of `kernel.lanes` that each one stands for.
 OPERATIONS = {
     getattr(uncompiled, operation): globals()[operation]
     for operation in (
         *("load", "store", "splat", "floor", "whole", "root", "peek", "poke"),
-        *("chosen", "below", "angle", "transpose"),
+        *("chosen", "below", "angle"),
     )
 }

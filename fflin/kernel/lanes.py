@@ -76,11 +76,6 @@ def below(value: Any, bound: Any) -> Any:
     return value < bound
 
 
-def transpose(source: Any, index: int, target: Any, start: int, stride: int) -> None:
-    """Write eight entries in eight lanes, lane k to ``target`` from ``start + k stride`` on."""
-    raise NotImplementedError("eight lanes need compiled code")
-
-
 @inlined
 def width(array: Any) -> Any:
     """Return how many lanes an array has; none where it is empty."""
@@ -95,6 +90,22 @@ def row_product(a: Any, first: int, b: Any, second: int, count: int) -> Any:
 def add_row(a: Any, first: int, share: float, b: Any, second: int, count: int) -> None:
     """Add `share` times `count` entries of an array of numbers to entries of another."""
     a[first : first + count] += share * b[second : second + count]
+
+
+def row_products(a: Any, size: int, b: Any, out: Any) -> None:
+    """Write the scalar product of each `size` entries of an array with the first of another."""
+    np.dot(a.reshape(len(out), size), b[:size], out)
+
+
+def remove_components(Q: Any, size: int, count: int, x: Any, found: Any, first: int) -> None:
+    """Make x orthogonal to the first `count` rows of Q, and write its components along them."""
+    basis = Q[: count * size].reshape(count, size)
+    components = basis.dot(x)
+    x -= components.dot(basis)
+    # Once more: the first time leaves a share of what it removes to rounding.
+    rest = basis.dot(x)
+    x -= rest.dot(basis)
+    np.add(components, rest, found[first : first + count])
 
 
 def write_scaled(source: Any, lane: int, share: float, target: Any) -> None:
@@ -117,9 +128,30 @@ def _add_row(a: Any, first: int, share: float, b: Any, second: int, count: int) 
 
 
 @called
+def _row_products(a: Any, size: int, b: Any, out: Any) -> None:
+    for index in range(len(out)):
+        out[index] = _row_product(a, index * size, b, 0, size)
+
+
+@called
+def _remove_components(Q: Any, size: int, count: int, x: Any, found: Any, first: int) -> None:
+    # One after the other: as exact as Householder's factor, if x is its last column.
+    for index in range(count):
+        share = _row_product(Q, index * size, x, 0, size)
+        _add_row(x, 0, -share, Q, index * size, size)
+        found[first + index] = share
+
+
+@called
 def _write_scaled(source: Any, lane: int, share: float, target: Any) -> None:
     for index in range(len(target)):
         target[index] = share * peek(source, index, lane)
 
 
-LOOPS |= {row_product: _row_product, add_row: _add_row, write_scaled: _write_scaled}
+LOOPS |= {
+    row_product: _row_product,
+    row_products: _row_products,
+    add_row: _add_row,
+    remove_components: _remove_components,
+    write_scaled: _write_scaled,
+}

@@ -30,14 +30,15 @@ from fflin.kernel.policies import LAW, NOTHING, command
 from fflin.kernel.vectors import copy, put3, put6
 
 
-class Method(namedtuple("Method", "h origin way speed nodes weights moments tangent")):
+class Method(namedtuple("Method", "h origin shift speed nodes weights moments tangent")):
     """Steps of h [s], s stages each, by what its displacements and velocities are made of.
 
     Row by row: shares of v and the stages' accelerations in the displacement after each stage, and
-    the second one after the last (`way`), and in the velocity there (`speed`). A way begins at the
-    step's first place, or at its second stage's where `origin` says 1. `nodes` [s] are the stages'
-    times, `weights` and `moments` their shares in sums along, with h and h^2. With `tangent` a way
-    is a share of the rate in the tangent at the first place, the last the sum of all by `weights`.
+    the second one after the last (`shift`), and in the velocity there (`speed`). A displacement
+    begins at the configuration of the first stage, or of the second stage if `origin` is 1. `nodes`
+    [s] are the stages' times, `weights` and `moments` their shares in sums along, with h and h^2.
+    With `tangent` it is a share of the rate in the tangent at the first configuration, and the last
+    is the sum of all by `weights`.
     """
 
 
@@ -126,8 +127,8 @@ def _act(work, channel, law, robot, point, step, stage, t):
 
 
 @called
-def _turn_way(method, stages, nu, stage, last):
-    """Write the way of a method in the tangent, from that of the last stage."""
+def _turn_shift(method, stages, nu, stage, last):
+    """Write the displacement in the tangent after a stage, from the one of the stage before."""
     along, total = stages.along, stages.total
     for index in range(len(along)):
         if stage == 0:
@@ -137,7 +138,7 @@ def _turn_way(method, stages, nu, stage, last):
     for index in range(len(along)):
         rate = load(along, index)
         store(total, index, load(total, index) + method.weights[stage] * rate)
-        store(along, index, load(total, index) if last else load(method.way, stage) * rate)
+        store(along, index, load(total, index) if last else load(method.shift, stage) * rate)
 
 
 @inlined
@@ -148,14 +149,14 @@ def _move(robot, method, stages, point, stage):
         copy(point.q, 0, stages.second, 0, len(point.q))
     last = stage == len(method.origin) - 1
     if method.tangent:
-        _turn_way(method, stages, point.nu, stage, last)
+        _turn_shift(method, stages, point.nu, stage, last)
     else:
-        _combine(method.way, stage, rates, along)
+        _combine(method.shift, stage, rates, along)
     _combine(method.speed, stage, rates, point.nu)
     begin = stages.first if method.origin[stage] == 0 else stages.second
     displace(robot.tree, begin, along, point.q)
     if last and not method.tangent:
-        _combine(method.way, stage + 1, rates, along)
+        _combine(method.shift, stage + 1, rates, along)
         displace(robot.tree, point.q, along, point.q)
 
 

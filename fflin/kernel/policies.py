@@ -35,18 +35,18 @@ _NEAR = 1e-9  # a time this near to a knot, relative to the interval, is the kno
 
 class Path(
     namedtuple(
-        "Path", "t q u way speed hold ahead ends held over last starts K order along e point"
+        "Path", "t q u shift speed hold ahead ends held over last starts K order along e point"
     )
 ):
     """A trajectory and its gains, piece by piece.
 
     At the knots t (N,) [s] q and u, row by row, and once more, with nu and K, where the run `ends`
     later, which is when t > `over` [s].
-    Between them `way` is the cubic (4, 6 + n) in the share of the interval of the displacement from
-    its knot, and `speed` that of nu; u is linear or on `hold`, taken `ahead` [s] of the time, and
-    the three inputs from each of `held` on stand in the world's axes. K has `order` coefficients in
-    the time since each of `starts`, and stays after `last` [s]. `along` (6 + n,), the error e (nx,)
-    and the `point` that is followed are work space.
+    Between knots, `shift` is a cubic (4, 6 + n) in the elapsed fraction of the interval. It gives
+    the displacement from the knot, and `speed` is the same of nu; u is linear or on `hold`, taken
+    `ahead` [s] of the time, and the three inputs from each of `held` on are in world axes. K has
+    `order` coefficients in the time since each of `starts`, and stays after `last` [s]. `along`
+    (6 + n,), the error e (nx,) and the `point` that is followed are work space.
     """
 
 
@@ -113,7 +113,7 @@ def _follow(robot, path, t):
     if after:
         copy(path.speed, 4 * (last + 1) * len(point.nu), point.nu, 0, len(point.nu))
     else:
-        _cubic(path.way, k, s, path.along)
+        _cubic(path.shift, k, s, path.along)
         _cubic(path.speed, k, s, point.nu)
         displace(robot.tree, point.q, path.along, point.q)
     for index in range(len(path.held)):
@@ -206,8 +206,7 @@ class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
     """
 
 
-_PLACES = dict.fromkeys(("joint", "first", "stride"), INDICES)
-GRID = Struct(Grid, at=LANED, **_PLACES)
+GRID = Struct(Grid, at=LANED, **dict.fromkeys(("joint", "first", "stride"), INDICES))
 GYROS = Struct(Gyros, body=INDICES)
 FILTER = Struct(Filter, z=LANED, rates=LANED)
 LAW = Struct(

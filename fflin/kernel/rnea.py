@@ -10,7 +10,7 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5.
 from __future__ import annotations
 
 from fflin.kernel import vectors as vec
-from fflin.kernel.inertia import inertia_times
+from fflin.kernel.inertia import spatial_inertia_times
 from fflin.kernel.lanes import inlined, load, splat, store
 from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
 
@@ -37,15 +37,6 @@ def motion_cross(velocity, along):
     """Return the rate of a motion vector `along` that is carried by a velocity."""
     w, v = velocity
     return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
-
-
-@inlined
-def spatial_inertia_times(work, at, motion):
-    """Return inertia times a motion vector, moment and force."""
-    m, h = load(work, at), vec.get3(work, at + 1)
-    w, v = motion
-    moment = vec.plus(inertia_times(work, at, w), vec.cross(h, v))
-    return moment, vec.plus(vec.times(v, m), vec.cross(w, h))
 
 
 @inlined

@@ -1,4 +1,4 @@
-"""What is kept of eight runs while they go on, row by row of the compiled loop."""
+"""Statistics of eight parallel runs, updated with each row of the compiled loop."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ from fflin.kernel.vectors import copy, dot
 class RunStatistics(
     namedtuple(
         "RunStatistics",
-        "robot law path home way speed kind settled there steps at "
+        "robot law path x_ref q_ref nu_ref kind settled tolerance steps at "
         "sizes largest_x largest_u largest outside errors inputs",
     )
 ):
-    """What is compared, and the marks so far.
+    """Reference of the errors of eight runs, and their statistics so far.
 
-    States are read as the `law` says and errors as the `path` does: from the state `home` (nx,),
-    which the path's point has the attitude of, or from the rows q and nu of a `way` and its
-    `speed`. `kind` (nx,) is 0 for a state without a kind of its own and
-    -1 for one that has no error either. `settled` is the share of the largest, and `there` (kinds,)
-    the sizes, below which an error has settled; at `steps` (times,) errors and inputs are kept.
-    `at` is work space. All from there on are in lanes.
+    The `law` reads states. Errors are from the state `x_ref` (nx,), whose attitude the point of
+    `path` has, or from the rows `q_ref` and `nu_ref` of a moving reference. `kind` (nx,) is 0 for a
+    state without a kind, and -1 for a state whose error is not kept. An error has settled if it is
+    below the fraction `settled` of its largest value, or below `tolerance` (kinds,). At `steps`
+    (times,) errors and inputs are kept. `at` is work space. The fields after it are in lanes.
     """
 
 
@@ -52,29 +51,29 @@ def _size(value):
 
 
 @inlined
-def _grow(marks, index, value):
-    """Write the larger of a mark and a number."""
-    store(marks, index, chosen(load(marks, index), value, value, load(marks, index)))
+def _grow(stats, index, value):
+    """Write the larger of an entry and a number."""
+    store(stats, index, chosen(load(stats, index), value, value, load(stats, index)))
 
 
 @inlined
-def _compare(marks, step):
+def _compare(stats, step):
     """Write the errors at a step, and the size of each kind."""
-    at, there, sizes, e = marks.at, marks.path.point, marks.sizes, marks.path.e
-    if len(marks.way) > 0:
-        copy(marks.way, step * len(there.q), there.q, 0, len(there.q))
-        copy(marks.speed, step * len(there.nu), there.nu, 0, len(there.nu))
-        error(marks.robot, marks.path, at)
+    at, there, sizes, e = stats.at, stats.path.point, stats.sizes, stats.path.e
+    if len(stats.q_ref) > 0:
+        copy(stats.q_ref, step * len(there.q), there.q, 0, len(there.q))
+        copy(stats.nu_ref, step * len(there.nu), there.nu, 0, len(there.nu))
+        error(stats.robot, stats.path, at)
     else:
-        read_state(marks.robot, marks.law, at, 0)
+        read_state(stats.robot, stats.law, at, 0)
         for index in range(len(e)):
-            store(e, index, load(marks.law.x, index) - load(marks.home, index))
+            store(e, index, load(stats.law.x, index) - load(stats.x_ref, index))
     for kind in range(len(sizes)):
         store(sizes, kind, 0.0)
     for index in range(len(e)):
-        value, kind = _size(load(e, index)), marks.kind[index]
+        value, kind = _size(load(e, index)), stats.kind[index]
         if kind >= 0:
-            _grow(marks.largest_x, index, value)
+            _grow(stats.largest_x, index, value)
         if kind > 0:
             _grow(sizes, kind, value)
     (x, y, z), w = attitude(there.q)
@@ -84,38 +83,37 @@ def _compare(marks, step):
 
 
 @listed
-def note(marks, rows, first, count):
-    """Do as `take`, of marks that are opened."""
-    at, sizes, kept = marks.at, marks.sizes, 0
-    width, inputs = len(at.q) + len(at.nu), len(marks.largest_u)
-    while kept < len(marks.steps) and marks.steps[kept] < first:
+def note(stats, rows, first, count):
+    """Do the work of `take`, on opened arguments."""
+    at, sizes, kept = stats.at, stats.sizes, 0
+    width, inputs = len(at.q) + len(at.nu), len(stats.largest_u)
+    while kept < len(stats.steps) and stats.steps[kept] < first:
         kept += 1
     for row in range(count):
         step, begin = first + row, row * (width + inputs + 9)
         copy(rows, begin, at.q, 0, len(at.q))
         copy(rows, begin + len(at.q), at.nu, 0, len(at.nu))
-        _compare(marks, step)
+        _compare(stats, step)
         for kind in range(len(sizes)):
             value = load(sizes, kind)
-            _grow(marks.largest, kind, value)
-            # Where an error has its largest so far it is outside; so what was outside last stays
-            # it when a larger one comes.
-            bound = marks.settled * load(marks.largest, kind)
-            bound = chosen(bound, marks.there[kind], marks.there[kind], bound)
-            store(marks.outside, kind, chosen(bound, value, float(step), load(marks.outside, kind)))
+            _grow(stats.largest, kind, value)
+            # A new maximum is never within the bound, so it resets the settling time.
+            bound = stats.settled * load(stats.largest, kind)
+            bound = chosen(bound, stats.tolerance[kind], stats.tolerance[kind], bound)
+            store(stats.outside, kind, chosen(bound, value, float(step), load(stats.outside, kind)))
         for index in range(inputs):
-            _grow(marks.largest_u, index, _size(load(rows, begin + width + index)))
-        if kept < len(marks.steps) and marks.steps[kept] == step:
-            copy(sizes, 0, marks.errors, kept * len(sizes), len(sizes))
-            copy(rows, begin + width, marks.inputs, kept * inputs, inputs)
+            _grow(stats.largest_u, index, _size(load(rows, begin + width + index)))
+        if kept < len(stats.steps) and stats.steps[kept] == step:
+            copy(sizes, 0, stats.errors, kept * len(sizes), len(sizes))
+            copy(rows, begin + width, stats.inputs, kept * inputs, inputs)
             kept += 1
     if count > 0:
-        read_state(marks.robot, marks.law, at, 0)
+        read_state(stats.robot, stats.law, at, 0)
 
 
 @compiled
 def take(words, rows, first, count):
-    """Take so many rows as `loop.advance` writes, the first of which is of a step, into account.
+    """Update the statistics with `count` rows of `loop.advance`, the first one of step `first`.
 
     `words` are of `RunStatistics`.
     """

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +19,11 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.model import Certificate, LinearModel
 from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Index: TypeAlias = slice | NDArray[np.intp]
 
 # Terms that cancel exactly still leave their rounding, 1e-16 of their size. Counted with this
 # share they allow for it, and hide nothing larger.
@@ -63,7 +69,7 @@ def aba_route(
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
-    there = own.slopes(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
+    there = own.jacobians(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
     # The tangent of what moves on turns with it.
     A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
     A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
@@ -117,7 +123,7 @@ def compare(
     ]
 
 
-def _blocks(matrix: Array, rows: dict[str, Any], columns: dict[str, Any]) -> Array:
+def _blocks(matrix: Array, rows: Mapping[str, Index], columns: Mapping[str, Index]) -> Array:
     """Return the largest entry of each block, none being negative; zero of an empty one."""
     largest = np.array([matrix[each].max(axis=0, initial=0.0) for each in rows.values()])
     found = [largest[:, each].max(axis=1, initial=0.0) for each in columns.values()]
@@ -140,9 +146,9 @@ def _cancelling_terms(
     speed, rate, momentum = speeds(state, v)
     # What the momentum of wheels does to a turning link, in the units of the rows.
     spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
-    still = speed.copy()
-    still[LINEAR] *= _ROUNDING_SHARE
-    resting = still / mobility
+    slowed = speed.copy()
+    slowed[LINEAR] *= _ROUNDING_SHARE
+    resting = slowed / mobility
     accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
     forces = np.abs(lin.u0) * input_mobility
     size = _largest(accelerations) + _largest(forces) + rate * (_largest(resting) + spin)

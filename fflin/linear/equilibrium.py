@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -19,8 +19,11 @@ from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from fflin.linear.model import LinearModel
 
+    Mask: TypeAlias = NDArray[np.bool_]
 
 # Round-off of M a and of the accelerations themselves, relative to the terms that they sum.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
@@ -164,29 +167,29 @@ def equilibrium(
     actuation, pushes = Actuation(state), forces_of(robot)
     free = {f"tau_m.{name}" for name, k in robot.stiffness.items() if k} - set(actuation.names)
     soft = np.array([name in free for name in pushes])
-    fine = (held := _Held(linearizer, given, v)).fine
+    tolerance = (balance := _Balance(linearizer, given, v)).tolerance
     for _ in range(20):  # Newton's method: a few do
-        loose = soft & (np.abs(held.residual) > fine)
+        loose = soft & (np.abs(balance.residual) > tolerance)
         if not loose.any():
             break
-        step = state.spread(held.settling(linearizer, soft))
-        at = pin.integrate(robot.model, held.lin.q, step)
+        step = state.spread(balance.newton_step(linearizer, soft))
+        at = pin.integrate(robot.model, balance.lin.q, step)
         at[:7] = given[:7]
-        held = _Held(linearizer, at, v)
-        fine = np.maximum(fine, held.fine)
-    left = np.where(soft & ~loose, 0.0, held.left)
-    if float(np.linalg.norm(left)) > held.allowed:
-        raise _unbalanced(robot, held.residual, np.abs(left), pushes)
-    at, u = held.lin.q, held.u
+        balance = _Balance(linearizer, at, v)
+        tolerance = np.maximum(tolerance, balance.tolerance)
+    left = np.where(soft & ~loose, 0.0, balance.left)
+    if float(np.linalg.norm(left)) > balance.allowed:
+        raise _unbalanced(robot, balance.residual, np.abs(left), pushes)
+    at, u = balance.lin.q, balance.u
     if reference is not None or robot.orbit:
         chart = state.chart(at)
         for columns in actuation.held:
             u[columns] = chart.R @ u[columns]
     names = actuation.names, actuation.units, tuple(pushes), tuple(pushes.values())
-    return Equilibrium(at, u, state.joints_apart(given, at), held.residual, *names)
+    return Equilibrium(at, u, state.joints_apart(given, at), balance.residual, *names)
 
 
-class _Held:
+class _Balance:
     """Minimum-norm inputs at a point, in base axes, and the residual forces."""
 
     def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
@@ -206,9 +209,9 @@ class _Held:
         self.u, self.left = least_norm(mobility[:, None] * columns, target, one_sided)
         self.allowed = TOLERANCE * float(np.linalg.norm(target))
         self.allowed += float(np.linalg.norm(mobility * rounding))
-        self.residual, self.fine = self.left / mobility, rounding + terms
+        self.residual, self.tolerance = self.left / mobility, rounding + terms
 
-    def settling(self, linearizer: Linearizer, soft: Any) -> Array:
+    def newton_step(self, linearizer: Linearizer, soft: Mask) -> Array:
         """Return Newton's step (6 + n,) of the joints whose rows of the forces are `soft`."""
         robot, lin = linearizer.robot, linearizer(self.lin.q, self.lin.v, self.u)
         hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
@@ -285,7 +288,7 @@ _EPS = float(np.finfo(float).eps)
 TOLERANCE = 1e-9
 
 
-def least_norm(C: Array, d: Array, one_sided: Any) -> tuple[Array, Array]:
+def least_norm(C: Array, d: Array, one_sided: Mask) -> tuple[Array, Array]:
     """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``."""
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
@@ -314,7 +317,7 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
     return u
 
 
-def _least_distance(C: Array, start: Array, one_sided: Any) -> Array:
+def _least_distance(C: Array, start: Array, one_sided: Mask) -> Array:
     """Return the least u = start + Z z with u[one_sided] >= 0, where C Z = 0."""
     from scipy.linalg import null_space
     from scipy.optimize import nnls

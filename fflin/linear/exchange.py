@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.record import Design
@@ -16,7 +17,7 @@ from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel, StateSpace
 from fflin.linear.sampling import held_exponential
-from fflin.linear.tool_coordinates import Slopes, ToolCoordinates, tool_coordinates
+from fflin.linear.tool_coordinates import Jacobians, ToolCoordinates, tool_coordinates
 from fflin.robot.robot import Robot
 
 _ROUNDING = 1e-12  # of the largest entry, by which another route to a matrix may miss a zero
@@ -123,8 +124,8 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     sampled, whole, step = lin.dt, lin.generator, _step(tool, dt)
     if whole is None or (step and sampled):
         raise InputError("the model is sampled; transform its continuous-time model instead")
-    lin, (kind, own, to, rates) = whole, _bridge(robot, whole, tool)
-    A, B = carried(own, to, lin.A, lin.B)
+    lin, (kind, own, to, rates) = whole, _jacobians_at(robot, whole, tool)
+    A, B = transformed(own, to, lin.A, lin.B)
     (q, v), states = kind.vectors(lin.q, lin.v), kind.states()
     rate: Array = to.P @ rates
     x0 = np.concatenate((np.zeros(len(v)) if kind.tangent else q, v))
@@ -135,7 +136,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
         fields = {"C": (lin.C @ own.P + D @ (to.H - own.H)) @ to.left, "D": D @ to.V, "y0": lin.y0}
         outputs = dict(zip(lin.output_names, lin.output_units, strict=True))
     if step:
-        A, B, rate = _stepped(A, B, rate, step)
+        A, B, rate = _euler_step(A, B, rate, step)
     f0: Array = rate * (not lin.moving)
     if sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
@@ -180,7 +181,7 @@ def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
     """Return the gain of a model in a tool's coordinates; its closed-loop poles are the same."""
     model, whole = lin.to(tool), lin.generator
     assert whole is not None and lin._robot is not None
-    _, own, to, _ = _bridge(lin._robot, whole, tool)
+    _, own, to, _ = _jacobians_at(lin._robot, whole, tool)
     # An input that is held in one of the two axes turns in the other (15.4).
     turned = np.linalg.solve(to.V, (to.H - own.H) @ to.left)
     return ToolGain(model.T_u @ K @ model.T_left + turned, model, verified=lin.verified)
@@ -242,30 +243,32 @@ def from_tool(
     True
     """
     q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
-    place: Any = {"frame": frame, "reference": reference, "moving": moving}
-    lin, step = linearize(robot, q, v, **place), _step(tool, dt)
+    options: Any = {"frame": frame, "reference": reference, "moving": moving}
+    lin, step = linearize(robot, q, v, **options), _step(tool, dt)
     if u is not None:
         u = vector("u", u, len(lin.u0), "the robot's inputs, as the tool has them")
-        _, own, to, _ = _bridge(robot, lin, tool)
-        lin = linearize(robot, q, v, np.linalg.solve(own.V, to.V @ u), **place)
+        _, own, to, _ = _jacobians_at(robot, lin, tool)
+        lin = linearize(robot, q, v, np.linalg.solve(own.V, to.V @ u), **options)
     if A is None and B is None:
         return lin
-    _, own, to, rates = _bridge(robot, lin, tool)
-    ours = carried(own, to, lin.A, lin.B)
-    ours = _stepped(*ours, to.P @ rates, step)[:2] if step else ours
-    changes = [_change(*each) for each in zip("AB", (A, B), ours, strict=True)]
+    _, own, to, rates = _jacobians_at(robot, lin, tool)
+    ours = transformed(own, to, lin.A, lin.B)
+    ours = _euler_step(*ours, to.P @ rates, step)[:2] if step else ours
+    changes = [_difference(*each) for each in zip("AB", (A, B), ours, strict=True)]
     if step:  # the rows of positions follow from those of rates
         nv = len(ours[0]) // 2
         changes = [np.vstack((0.0 * each[:nv], each[nv:] / step)) for each in changes]
     own, to = (each._replace(rate=0.0 * each.rate, extra=0.0 * each.extra) for each in (own, to))
     A, B = (
         np.where((old == 0.0) & (np.abs(new) < _ROUNDING * np.abs(old).max()), 0.0, old + new)
-        for old, new in zip((lin.A, lin.B), carried(to, own, *changes), strict=True)
+        for old, new in zip((lin.A, lin.B), transformed(to, own, *changes), strict=True)
     )
     return replace(lin, A=A, B=B)
 
 
-def _bridge(robot: Robot, lin: LinearModel, tool: str) -> tuple[Any, Slopes, Slopes, Array]:
+def _jacobians_at(
+    robot: Robot, lin: LinearModel, tool: str
+) -> tuple[ToolCoordinates, Jacobians, Jacobians, Array]:
     """Return a tool's coordinates, the derivatives of the model's and the tool's, and dy/dt."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
@@ -275,19 +278,19 @@ def _bridge(robot: Robot, lin: LinearModel, tool: str) -> tuple[Any, Slopes, Slo
     nu, rates = state.velocities(lin.v), lin.drift
     point = lin.q, nu, own.actuation.in_base_axes(state.chart(lin.q), lin.u0)
     if rates is None:  # f0 is P times the rate of y
-        rates = own.slopes(*point, 0.0 * nu).left @ lin.f0
+        rates = own.jacobians(*point, 0.0 * nu).left @ lin.f0
     rates = rates[len(nu) :]
-    return kind, own.slopes(*point, rates), kind.slopes(*point, rates), np.append(nu, rates)
+    return kind, own.jacobians(*point, rates), kind.jacobians(*point, rates), np.append(nu, rates)
 
 
-def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Array]:
+def transformed(source: Jacobians, to: Jacobians, A: Array, B: Array) -> tuple[Array, Array]:
     """Return A and B in other coordinates (15.3), (15.4)."""
     B = source.left @ B @ np.linalg.inv(source.V)
     A = source.left @ (A @ source.P - source.rate) + B @ (to.H - source.H)
     return (to.P @ A + to.rate) @ to.left + to.extra, to.P @ B @ to.V
 
 
-def _step(tool: str, dt: Any) -> float:
+def _step(tool: str, dt: float | None) -> float:
     """Return the time step, 0 if none is given."""
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
@@ -297,7 +300,7 @@ def _step(tool: str, dt: Any) -> float:
     return h
 
 
-def _stepped(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
+def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
     """Return A, B and f0 of a step of semi-implicit Euler (15.6); of the base linear, angular."""
     v, a = np.split(rate, 2)
     nv, moved = len(v), h * (v + h * a)
@@ -309,7 +312,7 @@ def _stepped(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, A
     return A, B, np.concatenate((moved, h * a))
 
 
-def _change(name: str, given: Any, expected: Array) -> Array:
+def _difference(name: str, given: ArrayLike | None, expected: Array) -> Array:
     """Return by how much a matrix of the caller is more than expected."""
     array = expected if given is None else as_double(name, given)
     if array.shape != expected.shape or not np.isfinite(array).all():

@@ -15,7 +15,7 @@ import numpy as np
 
 from fflin.base import record
 from fflin.base.record import Record, figure, figures, text, texts
-from fflin.base.writing import check_ending, read_file, write_whole
+from fflin.base.writing import check_ending, csv_table, read_file, write_whole
 
 # Of what the rows and columns of each matrix are, and the entries of each vector.
 _MATRICES = {
@@ -68,7 +68,7 @@ def write_model(path: Path, entries: Record, *, sealed: bool) -> None:
         record.write_record(path, entries, sealed=sealed)
         return
     record.require_finite(entries)
-    contents = {key: _csv_text(rows) for key, rows in _tables(entries).items()}
+    contents = {key: csv_table(rows) for key, rows in _tables(entries).items()}
     if sealed:
         contents["info"] += f"{record.SEAL},{record.content_digest(contents)}\n".encode()
     write_whole({_csv_path(path, key): content for key, content in contents.items()})
@@ -219,9 +219,3 @@ def foreign_table(path: Path) -> Path | None:
 
 def _csv_path(path: Path, key: str) -> Path:
     return path.with_name(f"{path.stem}.{key}.csv")
-
-
-def _csv_text(rows: list[list[Any]]) -> bytes:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()

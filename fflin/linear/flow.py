@@ -21,7 +21,7 @@ _ACCURACY, _MOST_STEPS = 1e-8, 128
 
 # Round-off of positions, and of accelerations that are sums of terms that may cancel.
 _EPS = float(np.finfo(float).eps)
-_OF_PLACES, _OF_SUMS = 16.0 * _EPS, 1e3 * _EPS
+_POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
 # A time this near to a knot, relative to the interval, is the knot's.
 _NEAR = 1e-9
@@ -41,10 +41,10 @@ class Flow:
 
     @cached_property
     def residual(self) -> Array:
-        """Error of each interval's end at the next knot (N - 1,), see `missed`."""
-        return self.missed(range(len(self._t) - 1))
+        """Error of each interval's end at the next knot (N - 1,), see `interval_errors`."""
+        return self.interval_errors(range(len(self._t) - 1))
 
-    def missed(self, intervals: Iterable[int]) -> Array:
+    def interval_errors(self, intervals: Iterable[int]) -> Array:
         """Return the relative errors of the ends of some intervals at the next knots."""
         # An observer who flies along with the base's median velocity takes the rates (Galilei), and
         # each rotor counts for itself: neither an orbit nor a fast wheel hides anything.
@@ -54,8 +54,10 @@ class Flow:
         usual = np.median(velocities, axis=0)
         flown = np.outer(t - t[0], usual)
         farthest = float(np.abs(q[:, 7:]).max(initial=1.0))
-        digits = np.full(v.shape[1], _OF_PLACES * farthest)
-        digits[:3] = _OF_PLACES * max(float(np.abs(x).max()) for x in (q[:, :3], flown, velocities))
+        digits = np.full(v.shape[1], _POSITION_ROUNDING * farthest)
+        digits[:3] = _POSITION_ROUNDING * max(
+            float(np.abs(x).max()) for x in (q[:, :3], flown, velocities)
+        )
         q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= usual @ rotations
         knots = list(zip(q, v, u, strict=True))
@@ -70,7 +72,7 @@ class Flow:
 
         def size(of_q: Array, of_v: Array, h: float) -> float:
             miss = np.maximum(np.abs(of_q) - digits, 0.0) / (speed * h)
-            jump = np.maximum(np.abs(of_v) - digits - _OF_SUMS * sums * h, 0.0) / (push * h)
+            jump = np.maximum(np.abs(of_v) - digits - _SUM_ROUNDING * sums * h, 0.0) / (push * h)
             return float(np.maximum(miss, jump).max())
 
         found, steps = [], 1
@@ -107,14 +109,14 @@ class Flow:
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v and u (base axes) at a time, from cubics with the robot's own rates."""
-        k, s = placed(self._t, t)
+        k, s = interval_of(self._t, t)
         powers, (turns, speeds) = np.array((1.0, s, s * s, s**3)), self.cubics
         q: Array = pin.integrate(self._model, self._q[k], powers.dot(turns[k]))
         return q, powers.dot(speeds[k]), self._in_base_axes(q, self._input(k, s))
 
     def points(self, times: Array) -> tuple[Array, Array, Array]:
         """Return q, v and u (k, ..) at times (k,), as `at` does at one time."""
-        placements = [placed(self._t, t) for t in times.tolist()]
+        placements = [interval_of(self._t, t) for t in times.tolist()]
         k, s = np.array([k for k, _ in placements]), np.array([s for _, s in placements])
         powers, (turns, speeds) = s[:, None] ** np.arange(4), self.cubics
         steps = np.einsum("ij,ijk->ik", powers, turns[k])
@@ -126,11 +128,11 @@ class Flow:
 
     def input(self, t: float) -> Array:
         """Return the inputs (nu,) just after a time, in the frame's axes."""
-        return self._input(*placed(self._t, t))
+        return self._input(*interval_of(self._t, t))
 
-    def _input(self, k: int, share: float) -> Array:
+    def _input(self, k: int, fraction: float) -> Array:
         u: Array = self._u[k]
-        return u if self._held else u + share * (self._u[k + 1] - u)
+        return u if self._held else u + fraction * (self._u[k + 1] - u)
 
     def _in_base_axes(self, q: Array, u: Array) -> Array:
         return self._aba.actuation.rows_in_base_axes(q[None], u[None])[0]
@@ -147,17 +149,17 @@ class Flow:
         end = begin[1:]
         if self._held:
             end = np.array([self.rate(*each) for each in zip(q[1:], v[1:], self._u, strict=False)])
-        way = np.array([pin.difference(self._model, *pair) for pair in pairwise(q)])
+        apart = np.array([pin.difference(self._model, *pair) for pair in pairwise(q)])
         wheels = [joint.idx_v for joint in self._aba.state.robot.joints if joint.unbounded]
         # The knots have a fast wheel's angle only within a turn; its speed says how many turns.
-        turns = (0.5 * h * (v[1:] + v[:-1]) - way)[:, wheels] / (2.0 * np.pi)
-        way[:, wheels] += 2.0 * np.pi * np.round(turns)
+        turns = (0.5 * h * (v[1:] + v[:-1]) - apart)[:, wheels] / (2.0 * np.pi)
+        apart[:, wheels] += 2.0 * np.pi * np.round(turns)
         slopes = [
             pin.dDifference(self._model, *pair, pin.ArgumentPosition.ARG1) @ speed
             for pair, speed in zip(pairwise(q), v[1:], strict=True)
         ]
         return (
-            cubic(np.zeros_like(way), way, h * v[:-1], h * slopes),
+            cubic(np.zeros_like(apart), apart, h * v[:-1], h * slopes),
             cubic(v[:-1], v[1:], h * begin[:-1], h * end),
         )
 
@@ -169,17 +171,19 @@ def _largest(rows: list[Array]) -> Array:
     return largest
 
 
-def placed(t: Array, time: float) -> tuple[int, float]:
+def interval_of(t: Array, time: float) -> tuple[int, float]:
     """Return which interval of times a time is in, and the share of it that is over."""
     last = len(t) - 2
     k = max(0, min(int(t.searchsorted(time, "right")) - 1, last))
-    share = float((time - t[k]) / (t[k + 1] - t[k]))
-    if share > 1.0 - _NEAR and k < last:
+    fraction = float((time - t[k]) / (t[k + 1] - t[k]))
+    if fraction > 1.0 - _NEAR and k < last:
         return k + 1, 0.0
-    return k, 0.0 if share < _NEAR else min(share, 1.0)
+    return k, 0.0 if fraction < _NEAR else min(fraction, 1.0)
 
 
 def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
     """Return the coefficients (N - 1, 4, ..) of cubics over [0, 1] from values and derivatives."""
-    way = last - first
-    return np.stack((first, rate, 3 * way - 2 * rate - end_rate, rate + end_rate - 2 * way), axis=1)
+    apart = last - first
+    return np.stack(
+        (first, rate, 3 * apart - 2 * rate - end_rate, rate + end_rate - 2 * apart), axis=1
+    )

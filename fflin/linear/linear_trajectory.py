@@ -16,7 +16,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.linear.flow import placed
+from fflin.linear.flow import interval_of
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.linear.sampling import GAUSS, HEAVY, LIGHT, held_exponential
@@ -111,16 +111,16 @@ class LinearTrajectory(Trajectory):
     def matrices(self, t: float) -> tuple[Array, Array]:
         """Return A (nx, nx) and B (nx, nu) about the point at time t [s], also between knots."""
         t = self._within(t)
-        k, share = placed(self.t, t)
-        if self.dt or share in (0.0, 1.0):
-            k += int(share) if not self.dt else 0
+        k, fraction = interval_of(self.t, t)
+        if self.dt or fraction in (0.0, 1.0):
+            k += int(fraction) if not self.dt else 0
             return self.A[k], self.B[k]
         lin = self._linearizer(*self.flow.at(t))
         return lin.A, lin.B
 
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
         """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), as `matrices` does at one."""
-        placements = [placed(self.t, t) for t in times.tolist()]
+        placements = [interval_of(self.t, t) for t in times.tolist()]
         knot = np.array([k + (share == 1.0) for k, share in placements])
         inside = np.array([0.0 < share < 1.0 for _, share in placements])
         A, B = self.A[knot], self.B[knot]
@@ -131,10 +131,10 @@ class LinearTrajectory(Trajectory):
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
         """Evaluate arrays at one time: interpolated between knots, or held since the last knot."""
-        k, share = placed(self.t, self._within(t))
-        if self.dt or not share:
+        k, fraction = interval_of(self.t, self._within(t))
+        if self.dt or not fraction:
             return tuple(each[k] for each in arrays)
-        return tuple(each[k] + share * (each[k + 1] - each[k]) for each in arrays)
+        return tuple(each[k] + fraction * (each[k + 1] - each[k]) for each in arrays)
 
     def check(self) -> Check:
         """Check every knot by `fflin.check`, and return the largest value of each error."""
@@ -245,9 +245,7 @@ def along(motion: Trajectory) -> LinearTrajectory:
     linearizer = Linearizer(motion.robot, moving=True)
     found: dict[str, Any] = motion._given | linearizer.along(motion.q, motion.v, motion.u_base)
     names = ("state_names", "input_names", "output_names")
-    made = LinearTrajectory(**found, **{key: linearizer.prepared.common[key] for key in names})
-    object.__setattr__(made, "flow", motion.flow)  # what it has found of the same motion
-    return made
+    return LinearTrajectory(**found, **{key: linearizer.prepared.common[key] for key in names})
 
 
 # Steps are halved until the transition of a sample is this accurate.

@@ -20,7 +20,7 @@ from fflin.dynamics.chart import Chart, Standing
 from fflin.dynamics.inertia import rotor_names
 from fflin.dynamics.names import refuse_orbit, unknown_frame
 from fflin.dynamics.orbital import mean_motion
-from fflin.dynamics.rnea import Accelerations, Rates
+from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.compiled import checked_engine, numba_is_there
 from fflin.linear.certificate import certify, inertia_matrix
@@ -37,7 +37,7 @@ LARGEST = 1e200
 
 if TYPE_CHECKING:
     from fflin.dynamics.outputs import Sensing
-    from fflin.kernel.accelerations import RowOfOne, RowRates
+    from fflin.kernel.derivatives import CompiledAccelerations, RowAccelerations
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,15 +63,15 @@ class Prepared:
         other = {} if self.own_reference else {"_reference": self.reference}
         return {**self.common, **self.rest, "_computed": asked, **other}
 
-    def kernel(self) -> RowRates:
+    def kernel(self) -> RowAccelerations:
         """Return the compiled accelerations; `InputError` if the robot has none."""
-        from fflin.kernel.accelerations import RowRates
+        from fflin.kernel.derivatives import RowAccelerations
         from fflin.kernel.tree import batch_tree
 
         tree, reason = batch_tree(self.robot), self.not_compilable
         if tree is None or reason:
             raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
-        return RowRates(self.map, self.actuation, tree)
+        return RowAccelerations(self.map, self.actuation, tree)
 
     @property
     def not_compilable(self) -> str:
@@ -278,11 +278,11 @@ class Linearizer:
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
-        self._source: Accelerations | RowOfOne = self._accelerations
+        self._source: Accelerations | CompiledAccelerations = self._accelerations
         if engine == "compiled":
-            from fflin.kernel.accelerations import RowOfOne
+            from fflin.kernel.derivatives import CompiledAccelerations
 
-            self._source = RowOfOne(ready.kernel(), self._accelerations)
+            self._source = CompiledAccelerations(ready.kernel(), self._accelerations)
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         given = np.concatenate((robot.gravity, *robot.springs))
@@ -389,7 +389,7 @@ class Linearizer:
                         sensing, actuation, self._data, _STANDING, rates, x0[k], point
                     )
                     C[k], D[k], y[k] = seen["C"], seen["D"], seen["y0"]
-        all_rates = Rates(c, A[:, lower], B[:, lower], gravity)
+        all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity)
         f0 = assemble(state, actuation, chart, nu, u, all_rates, A, moving=ready.moving)
         for arrays in zip(A, B, C, D, f0, y, strict=True):
             _require_finite(*arrays)

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 from copy import copy
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
@@ -35,8 +35,8 @@ class Nonlinear:
         self.state = state
         self.aba = aba or Aba(state)
         observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
-        flies = np.linalg.norm(observer) > _FAST and state.robot.orbit is None
-        self._observer = observer if flies else np.zeros(3)
+        moves = np.linalg.norm(observer) > _FAST and state.robot.orbit is None
+        self._observer = observer if moves else np.zeros(3)
 
     def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return (q, v, a) in Pinocchio's order."""
@@ -48,14 +48,14 @@ class Nonlinear:
         chart, q, v = self.state.points(x)
         u = self.aba.actuation.in_base_axes(chart, u)
         observer = self._observer @ rotation_matrices(q[:, 3:7])
-        seen = v.copy()
-        seen[:, PIN_LINEAR] -= observer
-        rows = zip(q, seen, u, strict=True)
+        relative = v.copy()
+        relative[:, PIN_LINEAR] -= observer
+        rows = zip(q, relative, u, strict=True)
         a = np.array([self.aba.acceleration(*each).copy() for each in rows])
         a[:, PIN_LINEAR] -= times(skew(v[:, PIN_ANGULAR]), observer)
         return chart, q, v, a
 
-    def passing(self, x: Array, q: Array, v: Array, a: Array, t: Array) -> Array:
+    def after_motion(self, x: Array, q: Array, v: Array, a: Array, t: Array) -> Array:
         """Return the states (N, nx) a time t (N, 1) after rows of q, v and a, near the state x."""
         model = self.state.robot.model
         after = np.array([pin.integrate(model, *each) for each in zip(q, t * v, strict=True)])
@@ -77,9 +77,9 @@ class Nonlinear:
             # Of the velocity's reference-axis components.
             rate[:, LINEAR] += times(skew(angular), linear)
         turning = chart.q0 * angular + times(skew(chart.q_b), angular)
-        flying, rates = times(chart.R, linear), state.velocities(v)[:, 6:]
+        position_rate, rates = times(chart.R, linear), state.velocities(v)[:, 6:]
         rate = state.to_frame(chart, rate[..., None])[..., 0]
-        return np.concatenate((0.5 * turning, flying, rates, rate), axis=1)
+        return np.concatenate((0.5 * turning, position_rate, rates, rate), axis=1)
 
 
 class ErrorDynamics(Nonlinear):
@@ -91,11 +91,11 @@ class ErrorDynamics(Nonlinear):
         self._q[:3] = 0.0
         self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
 
-    def passing(self, x: Array, q: Array, v: Array, a: Array, t: Array) -> Array:
+    def after_motion(self, x: Array, q: Array, v: Array, a: Array, t: Array) -> Array:
         """Return the errors when reference and robot have both moved on for a time t."""
         at, still = np.tile(self._q, (len(t), 1)), np.zeros_like(a)
-        ahead = super().passing(x, at, np.tile(self._v, (len(t), 1)), still, t)
-        errors = moving_errors("local", super().passing(x, q, v, a, t), ahead)
+        ahead = super().after_motion(x, at, np.tile(self._v, (len(t), 1)), still, t)
+        errors = moving_errors("local", super().after_motion(x, q, v, a, t), ahead)
         errors[:, -len(self._a) :] -= t * self._a
         return errors
 
@@ -106,12 +106,18 @@ class ErrorDynamics(Nonlinear):
         # edot = (e0 (w - w*) + e x (w + w*)) / 2 and rdot = R_e v - v* - w* x r.
         turning = chart.q0 * (angular - at_angular)
         turning += times(skew(chart.q_b), angular + at_angular)
-        flying = times(chart.R, linear) - at_linear - x[:, state.groups.r_b] @ skew(at_angular).T
+        position_rate = (
+            times(chart.R, linear) - at_linear - x[:, state.groups.r_b] @ skew(at_angular).T
+        )
         rates = state.velocities(v - self._v)[:, 6:]
-        return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a), axis=1)
+        return np.concatenate(
+            (0.5 * turning, position_rate, rates, state.velocities(a) - self._a), axis=1
+        )
 
 
-def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None) -> Array:
+def outputs(
+    robot: Robot, lin: LinearModel, q: Array, v: Array | None = None, u: Array | None = None
+) -> Array:
     """Return the outputs y of a robot in the coordinates of a linear model.
 
     - Attitudes are in the model's chart, with q0 >= 0.
@@ -167,15 +173,17 @@ def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None
     return Measuring(state, lin.q)(x, at, moving, a)
 
 
-def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, bends: Any) -> Array:
+def jacobian(
+    f: Callable[[Array], Array], point: Array, steps: Array, is_curved: NDArray[np.bool_]
+) -> Array:
     """Return the Jacobian of f, a function of rows, by central differences of the given steps."""
-    curved, straight = np.diag(steps)[bends], np.diag(steps)[~bends]
-    ways = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
-    first, last = np.split(f(np.concatenate((point + ways, point - ways))), 2)
+    curved, straight = np.diag(steps)[is_curved], np.diag(steps)[~is_curved]
+    offsets = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
+    first, last = np.split(f(np.concatenate((point + offsets, point - offsets))), 2)
     *near, rest = np.split(first - last, [len(curved) * k for k in (1, 2, 3)])
     slopes: Array = np.empty((rest.shape[1], len(point)))
-    slopes[:, bends] = np.tensordot(_WEIGHTS, near, axes=1).T
-    slopes[:, ~bends] = 0.5 * rest.T
+    slopes[:, is_curved] = np.tensordot(_WEIGHTS, near, axes=1).T
+    slopes[:, ~is_curved] = 0.5 * rest.T
     return slopes / steps
 
 
@@ -207,9 +215,9 @@ def flow_error(model: Nonlinear, lin: LinearModel) -> float:
     expected = model._rates(x, chart, q, v, a)
     # Differences at t = -3 h ... 3 h.
     h = 1e-2 * chart.q0 / (1.0 + np.abs(v[:, 3:]).max(axis=1, keepdims=True))
-    ways = np.concatenate([k * h for k in (1, 2, 3, -1, -2, -3)])
+    offsets = np.concatenate([k * h for k in (1, 2, 3, -1, -2, -3)])
     q, v_there, a = (np.tile(each, (6, 1)) for each in (q, v, a))
-    after = model.passing(x[0], q, v_there, a, ways)
+    after = model.after_motion(x[0], q, v_there, a, offsets)
     ahead, behind = after.reshape(2, 3, *x.shape)
     rates = np.tensordot(_WEIGHTS, ahead - behind, axes=1) / h
     floor, size = 1.0 + np.abs(v).max(axis=1), np.abs(expected).max(axis=1)

@@ -16,7 +16,7 @@ from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart, times
 from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.outputs import Sensing
-from fflin.dynamics.rnea import Rates
+from fflin.dynamics.rnea import AccelerationDerivatives
 from fflin.dynamics.state import StateMap
 
 
@@ -34,7 +34,7 @@ def assemble(
     chart: Chart,
     nu: Array,
     u: Array,
-    rates: Rates,
+    rates: AccelerationDerivatives,
     A: Array,
     *,
     moving: bool,
@@ -71,7 +71,8 @@ def assemble(
     # Accelerations, still in base axes.
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
-        chart.turn_columns(state.in_reference, lower[..., nv:])
+        # The columns of the base's linear velocity are zeros.
+        chart.turn_columns((ANGULAR,) if omega_in_reference else (), rates.by_nu)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
         actuation.turn_columns(chart, rates.by_u)
     if state.falls:
@@ -95,13 +96,18 @@ def assemble(
 
 
 def _over_rotations(
-    state: StateMap, actuation: Actuation, chart: Chart, u: Array, rates: Rates, W: Array
+    state: StateMap,
+    actuation: Actuation,
+    chart: Chart,
+    u: Array,
+    rates: AccelerationDerivatives,
+    W: Array,
 ) -> Array:
     """Return the derivatives Theta (.., 6 + n, 3) of `rates` over base rotations (4.4)."""
     omega_in_reference, v_in_reference = state.axes
     # Derivatives of the accelerations alone are zero here without an orbit.
     theta, c = rates.by_turn, rates.c
-    for columns in actuation.held:
+    for columns in actuation.held if u.any() else ():
         theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
     if omega_in_reference:
         theta = theta + product(rates.by_nu[..., ANGULAR], W)
@@ -130,7 +136,7 @@ def output_equations(
     actuation: Actuation,
     data: pin.Data,
     chart: Chart,
-    rates: Rates,
+    rates: AccelerationDerivatives,
     x0: Array,
     point: Sequence[Array],
 ) -> dict[str, Array]:

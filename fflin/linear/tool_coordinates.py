@@ -28,7 +28,8 @@ _UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # of the others rad and rad/s
 class Convention(NamedTuple):
     """Convention of a tool for a free flyer."""
 
-    attitude: str  # in x: "wxyz", "q_b", "euler", or a tangent: "turn", or "pose" with the position
+    # In x: "wxyz", "q_b", "euler", or a tangent vector: "tangent", or "pose" with the position.
+    attitude: str
     stored: str  # in q
     angular_first: bool
     axes: tuple[bool, bool]  # whether (omega, v), and (torque, force), stand in the world's axes
@@ -38,15 +39,15 @@ class Convention(NamedTuple):
 
 TOOLS = {
     "drake": Convention("wxyz", "wxyz", True, IN_REFERENCE_AXES["world"]),
-    "mujoco": Convention("turn", "wxyz", False, IN_REFERENCE_AXES["hybrid"]),
+    "mujoco": Convention("tangent", "wxyz", False, IN_REFERENCE_AXES["hybrid"]),
     "pinocchio": Convention("pose", "xyzw", False, IN_REFERENCE_AXES["local"]),
-    "spart": Convention("turn", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True),
+    "spart": Convention("tangent", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True),
     "euler": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"]),
     "euler_rates": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"], rates=True),
 }
 
 
-class Slopes(NamedTuple):
+class Jacobians(NamedTuple):
     """Derivatives of coordinates x' and inputs u' at a point, over y (15.1) and u in base axes."""
 
     P: Array  # of x' over y (15.2)
@@ -64,7 +65,7 @@ class ToolCoordinates:
         robot, own = state.robot, not tool
         kind = TOOLS[tool] if tool else Convention("q_b", "xyzw", True, state.axes)
         self.state, self.convention, self._moving = state, kind, moving
-        self.tangent = kind.attitude in ("turn", "pose")
+        self.tangent = kind.attitude in ("tangent", "pose")
         self._roll = 0 if kind.angular_first else 3  # from angular, linear to the tool's order
         self._world = np.repeat(kind.axes, 3)[:, None]
         self._base = _centre(robot) if kind.at_centre else pin.SE3.Identity()
@@ -74,7 +75,7 @@ class ToolCoordinates:
         followers = [] if own else [follower.joint for follower in robot.followers]
         self.joints = sorted((*robot.joints, *followers), key=lambda joint: joint.idx_v)
         if kind.stored in ("wxyz", "matrix") and robot.file_joints:
-            self.joints.sort(key=lambda joint: _way(robot, joint.name))
+            self.joints.sort(key=lambda joint: _joint_path(robot, joint.name))
         self._idx_v = [joint.idx_v for joint in self.joints]
         # Of Pinocchio's v, for a unit of the tool's; only Pinocchio itself scales modal amplitudes.
         scales = np.array([1.0 if kind.stored == "xyzw" and tool else j.scale for j in self.joints])
@@ -91,16 +92,16 @@ class ToolCoordinates:
         if not own:
             self._inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
             motors = acting.groups.get("tau_m", at[:0])
-            places = [f"tau_m.{joint.name}" for joint in self.joints]
-            self._inputs[motors] = sorted(motors, key=lambda i: places.index(acting.names[i]))
+            names = [f"tau_m.{joint.name}" for joint in self.joints]
+            self._inputs[motors] = sorted(motors, key=lambda i: names.index(acting.names[i]))
         self.inputs = {acting.names[i]: acting.units[i] for i in self._inputs}
 
     def states(self) -> dict[str, str]:
         """Return {name: unit} of x'."""
         kind, found = self.convention, dict[str, str]()
-        turn = _NAMES.get(kind.attitude, ["theta.x", "theta.y", "theta.z"])
-        omega = [f"{x}_rate" for x in turn] if kind.rates else [f"omega.{x}" for x in "xyz"]
-        pose, twist = [*turn, "p.x", "p.y", "p.z"], [*omega, "v.x", "v.y", "v.z"]
+        attitude = _NAMES.get(kind.attitude, ["theta.x", "theta.y", "theta.z"])
+        omega = [f"{x}_rate" for x in attitude] if kind.rates else [f"omega.{x}" for x in "xyz"]
+        pose, twist = [*attitude, "p.x", "p.y", "p.z"], [*omega, "v.x", "v.y", "v.z"]
         for names, joint_name, angle in ((pose, "q_m", "rad"), (twist, "qdot_m", "rad/s")):
             base = np.roll(names, self._roll).tolist()
             found |= {name: _UNITS.get(name.partition(".")[0], angle) for name in base}
@@ -115,7 +116,9 @@ class ToolCoordinates:
         at = pin.SE3(self.state.rotation(q), self.state.positions(q)) * self._base
         attitude = np.roll(attitude, 1) if stored == "wxyz" else R.T.ravel()  # column by column
         pose = np.concatenate((_angles(R) if stored == "euler" else attitude, at.translation))
-        twist = self._turn(R, rates=self.convention.rates) @ self._X @ self.state.velocities(v)[:6]
+        twist = (
+            self._rotated(R, rates=self.convention.rates) @ self._X @ self.state.velocities(v)[:6]
+        )
         joints = [joint.value(q) for joint in self.joints]
         parts = (pose, joints), (twist, v[self._idx_v] / self._scales)
         q, v = (np.concatenate((np.roll(base, self._roll), rest)) for base, rest in parts)
@@ -135,7 +138,7 @@ class ToolCoordinates:
         at[:7] = pin.SE3ToXYZQUAT(state.origin.actInv(base))
         for joint, value in zip(self.joints, q[k:].tolist(), strict=True):
             joint.place(at, value)
-        nu = np.linalg.solve(self._turn(R, rates=self.convention.rates) @ self._X, twist)
+        nu = np.linalg.solve(self._rotated(R, rates=self.convention.rates) @ self._X, twist)
         speed = state.spread(np.concatenate((nu, np.zeros(robot.n))))
         speed[self._idx_v] = v[6:] * self._scales
         return robot.checked_configuration(at), robot.checked_velocity(speed)
@@ -163,29 +166,29 @@ class ToolCoordinates:
             quaternion = np.array((0.0, 0.0, 0.0, 1.0)) if self._moving else quaternion
         return quaternion, turning.rotation_matrix(quaternion)
 
-    def _turn(self, R: Array, *, rates: bool = False) -> Array:
+    def _rotated(self, R: Array, *, rates: bool = False) -> Array:
         """Return the matrix (6, 6) that takes a twist or wrench in base axes to the tool's."""
-        turn = np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
+        rotation = np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
         if rates:
-            turn[ANGULAR, ANGULAR] = _of_angles(_angles(R))[0]
-        return turn
+            rotation[ANGULAR, ANGULAR] = _of_angles(_angles(R))[0]
+        return rotation
 
     def _held(self, parts: Array) -> Array:
         """Return the derivatives (6, 3) over a rotation of world-fixed vectors, base axes (4.4)."""
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
-    def slopes(self, q: Array, nu: Array, u: Array, rates: Array) -> Slopes:
+    def jacobians(self, q: Array, nu: Array, u: Array, rates: Array) -> Jacobians:
         """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) in base axes."""
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
-        still, R_now = self._attitude(q)
+        here, R_now = self._attitude(q)
         # A step along the motion; errors and tangents go along with a reference that moves.
         twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
-        went = (not self._moving) * _STEP * twist.real
-        turns = 0.5 * turning.product_matrix(still) @ np.append(twist.real[ANGULAR], 0.0)
-        quaternion = still + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
+        moved = (not self._moving) * _STEP * twist.real
+        turns = 0.5 * turning.product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
+        quaternion = here + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
         R, w, vec = turning.rotation_matrix(quaternion), quaternion[3], quaternion[:3]
-        by_turn = -self._turn(R) @ self._held(twist)
-        attitude: Any = np.eye(3) + 0.5 * skew(went[ANGULAR])
+        by_turn = -self._rotated(R) @ self._held(twist)
+        attitude: Any = np.eye(3) + 0.5 * skew(moved[ANGULAR])
         if kind.attitude == "euler":
             attitude, bends = _of_angles(_angles(R), twist[ANGULAR])
             by_turn[ANGULAR] = kind.rates * bends @ attitude
@@ -197,8 +200,8 @@ class ToolCoordinates:
         base = np.zeros((k + 6, 12), dtype=complex)  # over (theta, p), (omega, v)
         base[: k - 3, :3], base[k - 3 : k, 3:6] = attitude, R
         if kind.attitude == "pose":
-            base[k - 3 : k, :6] = np.hstack((0.5 * skew(went[LINEAR]), attitude))
-        base[k:, :3], base[k:, 6:] = by_turn, self._turn(R, rates=kind.rates)
+            base[k - 3 : k, :6] = np.hstack((0.5 * skew(moved[LINEAR]), attitude))
+        base[k:, :3], base[k:, 6:] = by_turn, self._rotated(R, rates=kind.rates)
         base[:k], base[k:] = (np.roll(rows, self._roll, axis=0) for rows in (base[:k], base[k:]))
         first = k + nv - 6
         P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
@@ -208,15 +211,17 @@ class ToolCoordinates:
         P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
         extra = np.zeros((len(P), len(P)))
         if k == 7:
-            extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(still, 1))
+            extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(here, 1))
         # By blocks, so that zeros stay zeros.
         poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
         below = -twists @ P.real[first:, : 6 + n] @ poses
         left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
-        pick, H = self._wrench, np.zeros((len(u), 12 + 2 * n))
-        V = np.eye(len(u)) + pick.T @ (X.T @ self._turn(R_now).T - np.eye(6)) @ pick
-        H[:, :3] = pick.T @ X.T @ self._held(np.linalg.solve(X.T, pick @ u)) @ X[ANGULAR, ANGULAR]
-        return Slopes(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
+        wrench, H = self._wrench, np.zeros((len(u), 12 + 2 * n))
+        V = np.eye(len(u)) + wrench.T @ (X.T @ self._rotated(R_now).T - np.eye(6)) @ wrench
+        H[:, :3] = (
+            wrench.T @ X.T @ self._held(np.linalg.solve(X.T, wrench @ u)) @ X[ANGULAR, ANGULAR]
+        )
+        return Jacobians(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
@@ -237,14 +242,14 @@ def _centre(robot: Robot) -> pin.SE3:
     return pin.SE3(np.eye(3), np.array(robot.model.inertias[ROOT].lever))
 
 
-def _way(robot: Robot, name: str) -> list[int]:
+def _joint_path(robot: Robot, name: str) -> list[int]:
     """Return the file indices of the joints from the root to a joint; unknown ones come last."""
-    frames, way, order = robot.model.frames, list[int](), robot.file_joints
+    frames, path, order = robot.model.frames, list[int](), robot.file_joints
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
     while at:
         name, at = frames[at].name, frames[at].parentFrame
-        way.insert(0, order.index(name) if name in order else len(order))
-    return way
+        path.insert(0, order.index(name) if name in order else len(order))
+    return path
 
 
 def _left(P: Array) -> Array:

@@ -344,6 +344,6 @@ def plot_motion(
     >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
     >>> figure = fflin.plot_motion(motion, "motion.png", show=["q_b", "*.joint_1"])
     """
-    from fflin.simulation.motion_plot import draw_motion
+    from fflin.simulation.plots import draw_motion
 
     return draw_motion(require_motion(motion), path, show)

@@ -34,7 +34,7 @@ _MEMORY = 2**22  # [bytes] of rows that are there at a time
 def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.Arguments:
     """Return what `kernel.loop.advance` reads of a plan whose policy and method it knows."""
     h, state, method = plan.times.dt, plant.state, plan.method
-    size, (way, speed) = 6 + state.robot.n, method.shares(h)
+    size, (shift, speed) = 6 + state.robot.n, method.shares(h)
     start = MomentumReference(conserved, method, h, plan.q, plan.v)
     stop = stop_conditions(plan)
     mechanics = mechanics_of(plant, tree)
@@ -43,7 +43,7 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.A
         method=loop.Method(
             h=h,
             origin=method.origins,
-            way=way.ravel(),
+            shift=shift.ravel(),
             speed=speed.ravel(),
             nodes=np.minimum(np.array(method.nodes) * h, plan.last_node * h),
             weights=np.array(method.weights) * h,
@@ -279,7 +279,7 @@ def _path(path: policies.Path, plan: Plan, policy: Any, asking: Plant) -> polici
     if type(policy) is not TrajectoryFeedback:
         return path
     motion, schedule = policy.trajectory, policy.schedule
-    way, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
+    shift, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
     q, u = list(motion.q), list(motion.u)
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
     held = _places([each.start for each in motion.flow.held])
@@ -300,7 +300,7 @@ def _path(path: policies.Path, plan: Plan, policy: Any, asking: Plant) -> polici
         t=np.array(motion.t),
         q=np.concatenate(q),
         u=np.concatenate(u),
-        way=way,
+        shift=shift,
         speed=speed,
         hold=motion.hold == "previous",
         ahead=policy.ahead,

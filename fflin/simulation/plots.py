@@ -1,4 +1,4 @@
-"""Figures of motions, with matplotlib."""
+"""The figure of a motion: states, inputs, errors and drifts, with matplotlib."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing
+from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array
+from fflin.dynamics.state import moving_errors
+from fflin.simulation.curves import Curve, curves, resting_from
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,10 +23,9 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 _OF_JOINTS = ("q_m", "qdot_m")
-_SMOOTH = ("wheel speeds", "wheel momenta")
 _MOST_IN_A_PANEL = 6
-_NEAR = 1.0 / 3.0  # share of a limit that a curve comes to where it is drawn
 _PALE: dict[str, Any] = {"lw": 3.6, "alpha": 0.3}  # of a reference, below what follows it
+_DASHED: dict[str, Any] = {"ls": "--", "lw": 1.0}  # of a prediction, on top
 _GROUPS = {
     "q_b": "attitude q_b",
     "r_b": "position r_b",
@@ -31,202 +34,184 @@ _GROUPS = {
     "v_b": "velocity v_b",
     "qdot_m": "joint rates qdot_m",
 }
+_WHEELS = {"speed": "wheel speeds", "wheel": "wheel torques", "momentum": "wheel momenta"}
 
 
-class Signals(NamedTuple):
-    """Histories (N, k) with names GROUP.NAME, limits (2,), linear prediction and reference."""
-
-    values: Array
-    names: Sequence[str]
-    units: Sequence[str]
-    limits: Mapping[str, Array]
-    linear: Array | None = None
-    reference: Array | None = None
-
-    def only(self, indices: Sequence[int]) -> Signals:
-        """Return some of the columns."""
-        names, units = ([of[i] for i in indices] for of in (self.names, self.units))
-        beside = (None if x is None else x[:, indices] for x in (self.linear, self.reference))
-        return Signals(self.values[:, indices], names, units, self.limits, *beside)
-
-    def times(self, factors: Array, unit: str, limits: Mapping[str, Array]) -> Signals:
-        """Return them times (k,), in that unit and with limits of it."""
-        beside = (None if x is None else factors * x for x in (self.linear, self.reference))
-        return Signals(factors * self.values, self.names, [unit] * len(factors), limits, *beside)
-
-    def unit(self, indices: Sequence[int]) -> str:
-        """Return the units of some columns in brackets."""
-        shown = sorted({self.units[i] for i in indices} - {"1"})
-        return f"[{', '.join(shown)}]" if shown else ""
-
-
-class _Panel(NamedTuple):
-    """Columns of signals under a title, all of one unit."""
-
-    signals: Signals
-    indices: list[int]
-
-
-def draw(
-    t: Array,
-    states: Signals,
-    inputs: Signals,
-    wheels: Mapping[str, float],
-    apart: tuple[str, Signals] | None,
-    drifts: Mapping[str, Array],
-    *,
-    title: str,
-    marks: Sequence[float] = (),
-    path: str | Path | None = None,
-) -> Figure:
-    """Draw states, what they are `apart` from, inputs, `wheels` {name: inertia} and drifts."""
-    groups: dict[str, list[int]] = {}
-    for index, name in enumerate(states.names):
-        group, _, entry = name.partition(".")
-        if group not in _OF_JOINTS or entry not in wheels:
-            groups.setdefault(group, []).append(index)
-    panels = _panels(states, inputs, wheels)
-    across = 3 if len(groups) > 4 else 4
+def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None) -> Figure:
+    """Draw a motion, see `plot_motion`."""
+    states, panels = _selected(motion, show)
+    what, errors = _errors(motion)
+    across = 3 if len(states) > 4 else 4
+    heights = [3.0, 1.2][: 1 + bool(errors)] * math.ceil(len(states) / across) or [0.01]
     # With the drift, in as few rows of up to four as there can be.
     rows = math.ceil((len(panels) + 1) / 4)
-    both = apart is not None
-    heights = [3.0, 1.2][: 1 + both] * math.ceil(len(groups) / across) or [0.01]
     with drawing(path, 11.0, 0.3 + 3.0 * rows + 0.9 * sum(heights)) as figure:
         above, below = figure.add_gridspec(2, 1, height_ratios=[sum(heights), 3.0 * rows])
         spaces = {"hspace": 0.06, "wspace": 0.06}
         grid = above.subgridspec(len(heights), across, height_ratios=heights, **spaces)
         spots = below.subgridspec(rows, math.ceil((len(panels) + 1) / rows), **spaces)
-        places = (spots[k] for k in range(len(panels) + 1))
-        lines: dict[str, Line2D] = {}
-        for place, (group, indices) in enumerate(groups.items()):
+        joints: dict[str, Line2D] = {}
+        for place, (group, found) in enumerate(states.items()):
             row, column = divmod(place, across)
-            axes = figure.add_subplot(grid[row * (1 + both), column])
-            _histories(axes, t, states, group, indices, keyed=place == 0)
-            if apart is not None:
-                below_it = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
-                _apart(below_it, t, *apart, indices)
+            axes = figure.add_subplot(grid[row * (1 + bool(errors)), column])
+            _draw(axes, motion.t, found, _GROUPS[group])
+            if place == 0 and motion.tracked:
+                axes.plot([], [], color="#888888", **_PALE, label="reference")
+            joints |= _named(axes) if group in _OF_JOINTS else {}
+            if group not in _OF_JOINTS:
+                axes.legend(handlelength=1.2)
+            if errors:
+                strip = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
+                _draw(strip, motion.t, [errors[curve.key] for curve in found], lw=1.0)
+                strip.set_ylabel(f"{what}\n{strip.get_ylabel()}".strip())
+                strip.ticklabel_format(axis="y", scilimits=(-2, 3))
                 axes.tick_params(labelbottom=False)
-            else:
-                axes.set_xlabel("t [s]")
-            if group in _OF_JOINTS:
-                lines |= _named(axes)
-        for what, panel in panels.items():
-            axes = figure.add_subplot(next(places))
-            _inputs(axes, t, panel, what, {name: x.get_color() for name, x in lines.items()})
-            if what.startswith("joint"):
-                lines |= {name: x for name, x in _named(axes).items() if name == "limit"}
-            elif len(panel.indices) > _MOST_IN_A_PANEL:
-                _below(figure, _named(axes), what, "right" if groups.get("q_m") else "center")
-        if groups.get("q_m"):
-            # Joints are many, have long names, and are the same in three panels.
-            limit = {"limit": lines.pop("limit")} if "limit" in lines else {}
-            _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
+                axes.set_xlabel("")
+        _draw_panels(figure, spots, motion.t, panels, joints if "q_m" in states else None)
+        rest = None if motion.phases else resting_from(motion)
+        marks = [*motion.starts[1:].tolist(), *([] if rest is None else [rest])]
         for axes, mark in product(figure.axes, marks):
             axes.axvline(mark, lw=0.8, ls=":", color="#555555", label="_rest")
-        _drifts(figure.add_subplot(next(places)), t, drifts)
+        _drifts(figure.add_subplot(spots[len(panels)]), motion)
         for axes in figure.axes:
             axes.margins(x=0.0)
-        figure.suptitle(title, fontsize=11)
+        figure.suptitle(_title(motion, rest), fontsize=11)
     return figure
 
 
-def _panels(states: Signals, inputs: Signals, wheels: Mapping[str, float]) -> dict[str, _Panel]:
-    """Return what acts and how wheels turn, by title."""
-    found: dict[str, _Panel] = {}
-    for i, (name, unit) in enumerate(zip(inputs.names, inputs.units, strict=True)):
-        title = "torques" if unit == "N m" else "forces"
-        if name in wheels:
-            title = "wheel torques"
-        elif name.startswith("tau_m."):
-            # Nearly always all turn, or all slide.
-            title = "joint inputs tau_m" if unit == "N m" else "joint forces tau_m"
-        found.setdefault(title, _Panel(inputs, [])).indices.append(i)
-    speeds = [i for i, x in enumerate(states.names) if x in {f"qdot_m.{name}" for name in wheels}]
-    if speeds:
-        torques = {x: found.pop(x) for x in ("wheel torques",) if x in found}
-        found |= {"wheel speeds": _Panel(states, speeds)} | torques
-        J = np.array([wheels[_short(states.names[i])] for i in speeds])
-        if J.all():
-            names = [states.names[i] for i in speeds]
-            limits = {x: J[k] * states.limits[x] for k, x in enumerate(names) if x in states.limits}
-            momenta = states.only(speeds).times(J, "N m s", limits)
-            found["wheel momenta"] = _Panel(momenta, list(range(len(J))))
-    return found
+def _selected(motion: Any, show: Any) -> tuple[dict[str, list[Curve]], dict[str, list[Curve]]]:
+    """Return the states to show by group, and inputs, speeds and momenta of wheels by title."""
+    names = (*motion.state_names, *input_keys(motion))
+    show = [show] if isinstance(show, str) else show
+    if not (show is None or isinstance(show, Sequence)):
+        raise InputError(f"show is {show!r}, expected a list of names, groups or patterns")
+    keys = names if show is None else [names[i] for i in chosen("state or input", show, names)]
+    wheels = dict.fromkeys(motion.wheels, 0.0)
+    wheels |= dict(zip(motion.wheels, motion.wheel_inertias.tolist(), strict=False))
+    states: dict[str, list[Curve]] = {}
+    panels: dict[str, list[Curve]] = {}
+    for curve in curves(motion, wheels):
+        if curve.key in keys and curve.group in _GROUPS:
+            # With a reference, the prediction is drawn among the errors.
+            linear = None if motion.tracked else curve.linear
+            states.setdefault(curve.group, []).append(curve._replace(linear=linear))
+        elif curve.key in keys:
+            panels.setdefault(_panel_of(curve, wheels), []).append(curve)
+    for title in _WHEELS.values():  # come last
+        panels |= {title: panels.pop(title)} if title in panels else {}
+    return states, panels
 
 
-def _histories(
-    axes: Axes, t: Array, states: Signals, group: str, indices: list[int], *, keyed: bool
+def _draw_panels(
+    figure: Figure,
+    spots: Any,
+    t: Array,
+    panels: Mapping[str, list[Curve]],
+    joints: dict[str, Line2D] | None,
 ) -> None:
-    for color, i in zip(cycle(len(indices)), indices, strict=True):
-        gaps = indices if group == "q_b" else []
-        _curve(axes, t, states, i, gaps, color=color, label=_short(states.names[i]))
-    _limits(axes, states, indices)
-    axes.set(title=_GROUPS[group], ylabel=states.unit(indices))
-    if keyed and states.reference is not None:
-        axes.plot([], [], color="#888888", **_PALE, label="reference")
-    if group not in _OF_JOINTS:
-        axes.legend(handlelength=1.2)
+    """Draw inputs and wheels; below, name the joints and the curves of panels with many."""
+    lines = joints or {}
+    colors = {name: line.get_color() for name, line in lines.items()}
+    for place, (title, found) in enumerate(panels.items()):
+        axes = figure.add_subplot(spots[place])
+        steps = "default" if found[0].group in ("speed", "momentum") else "steps-post"
+        _draw(axes, t, found, title, colors, drawstyle=steps)
+        if title.startswith("joint"):
+            lines |= {name: x for name, x in _named(axes).items() if name == "limit"}
+        elif len(found) > _MOST_IN_A_PANEL:
+            _below(figure, _named(axes), title, "center" if joints is None else "right")
+        else:
+            axes.legend(ncols=2 if len(found) > 3 else 1, handlelength=1.6)
+    if joints is not None:
+        # Joints are many, have long names, and are the same in three panels.
+        limit = {"limit": lines.pop("limit")} if "limit" in lines else {}
+        _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
 
 
-def _curve(
-    axes: Axes, t: Array, of: Signals, i: int, gaps: Sequence[int] = (), **look: Any
+def _title(motion: Any, rest: float | None) -> str:
+    parts = [f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"]
+    if motion.linear is not None:
+        parts.append("solid: nonlinear, dashed: linear")
+    for name, start in zip(motion.phases[1:], motion.starts[1:], strict=True):
+        parts.append(f"{name} at {start:g} s")
+    if rest is not None:
+        parts.append(f"reference at rest from {rest:.4g} s")
+    return "; ".join(parts) + (f"\n{motion.stopped}" if motion.stopped else "")
+
+
+def _panel_of(curve: Curve, wheels: Mapping[str, float]) -> str:
+    """Return the title of the panel of an input, or of speeds and momenta of wheels."""
+    if curve.group in ("speed", "momentum") or curve.short in wheels:
+        return _WHEELS[curve.group]
+    if curve.group == "tau_m":  # nearly always all turn, or all slide
+        return "joint inputs tau_m" if curve.unit == "N m" else "joint forces tau_m"
+    return "torques" if curve.unit == "N m" else "forces"
+
+
+def _errors(motion: Any) -> tuple[str, dict[str, Curve]]:
+    """Return the errors from a reference, of attitude in degrees, or from the linear model."""
+    names, units, linear = motion.state_names, motion.state_units, motion.linear
+    rows, what = [], "error"
+    if motion.tracked:
+        units = ("deg",) * 3 + units[3:]
+        for x in (motion.x,) if linear is None else (motion.x, linear):
+            e = moving_errors(motion.frame, x, motion.target)
+            sines = np.minimum(1.0, np.linalg.norm(e[:, :3], axis=1, keepdims=True))
+            e[:, :3] *= np.degrees(2.0 / np.sinc(np.arcsin(sines) / np.pi))
+            rows.append(e.T)
+    elif linear is not None:
+        what, rows = "difference", [(motion.x - linear).T]
+    none = np.zeros(0)
+    of = zip(names, units, *rows, strict=True) if rows else ()
+    return what, {name: Curve(name, "", name, unit, x, none, *y) for name, unit, x, *y in of}
+
+
+def _draw(
+    axes: Axes,
+    t: Array,
+    found: Sequence[Curve],
+    title: str = "",
+    colors: Mapping[str, Any] | None = None,
+    **look: Any,
 ) -> None:
-    """Draw a column over its pale reference, and the linear prediction dashed on top."""
-    dashed = {"ls": "--", "lw": 1.0}
-    for x, own in ((of.reference, _PALE), (of.values, look), (of.linear, dashed)):
-        if x is not None:
-            times, shown = _broken(t, x, gaps) if gaps else (t, x)
-            axes.plot(times, shown[:, i], **{"color": look["color"]} | own)
-    if of.reference is not None:
-        band = of.reference[:, i], of.values[:, i]
-        # Across a half turn of the base one of them may have changed its sign already.
-        near = None if not gaps else (of.reference[:, gaps] * of.values[:, gaps]).sum(axis=1) >= 0.0
-        axes.fill_between(t, *band, where=near, color=look["color"], alpha=0.25, lw=0.0)
-
-
-def _broken(t: Array, x: Array, indices: Sequence[int]) -> tuple[Array, Array]:
-    """Return times and states with a gap where the attitude goes through a turn of 180 degrees."""
-    q_b = x[:, indices]
-    # The vector part of a unit quaternion whose sign has changed.
-    jumps = 1 + np.flatnonzero((q_b[1:] * q_b[:-1]).sum(axis=1) < -0.5)
-    return np.insert(t, jumps, t[jumps]), np.insert(x, jumps, np.nan, axis=0)
-
-
-def _apart(axes: Axes, t: Array, title: str, signals: Signals, indices: list[int]) -> None:
-    for color, i in zip(cycle(len(indices)), indices, strict=True):
-        _curve(axes, t, signals, i, color=color, lw=1.0)
-    axes.set(xlabel="t [s]", ylabel=f"{title}\n{signals.unit(indices)}".strip())
-    axes.ticklabel_format(axis="y", scilimits=(-2, 3))
-
-
-def _inputs(axes: Axes, t: Array, panel: _Panel, title: str, colors: Mapping[str, Any]) -> None:
-    """Draw a panel, in which joints have their colours."""
-    signals, indices = panel
-    for color, i in zip(cycle(len(indices)), indices, strict=True):
-        short = _short(signals.names[i])
-        _curve(
-            *(axes, t, signals, i),
-            color=colors.get(short, color),
-            drawstyle="default" if title in _SMOOTH else "steps-post",
-            label=short if title.startswith("wheel") else signals.names[i],
-        )
-    _limits(axes, signals, indices)
-    axes.set(title=title, xlabel="t [s]", ylabel=signals.unit(indices))
-    if not title.startswith("joint") and len(indices) <= _MOST_IN_A_PANEL:
-        axes.legend(ncols=2 if len(indices) > 3 else 1, handlelength=1.6)
-
-
-def _limits(axes: Axes, signals: Signals, indices: Sequence[int]) -> None:
-    """Draw the limits that a curve comes near."""
-    levels = {
-        level
-        for i in indices
-        for level in signals.limits.get(signals.names[i], np.zeros(0)).tolist()
-        if level and math.isfinite(level) and (signals.values[:, i] / level).max() >= _NEAR
-    }
-    for level in sorted(levels):
-        label = "limit" if level == max(levels) else "_limit"
+    """Draw curves over their pale references, predictions dashed on top, and limits."""
+    near = None
+    if found[0].group == "q_b":
+        found, near = _with_gaps(found)
+    full = title and found[0].group not in _GROUPS and title not in _WHEELS.values()
+    for own, curve in zip(cycle(len(found)), found, strict=True):
+        color = (colors or {}).get(curve.short, own)
+        label = curve.name if full else curve.short
+        if curve.reference is not None:
+            axes.plot(t, curve.reference, color=color, **_PALE)
+        axes.plot(t, curve.values, color=color, label=label, **look)
+        if curve.linear is not None:
+            axes.plot(t, curve.linear, color=color, **_DASHED)
+        if curve.reference is not None:
+            band = curve.reference, curve.values
+            axes.fill_between(t, *band, where=near, color=color, alpha=0.25, lw=0.0)
+    levels = sorted({level for curve in found for level in curve.near})
+    for level in levels:
+        label = "limit" if level == levels[-1] else "_limit"
         axes.axhline(level, ls="--", lw=0.9, color="#555555", label=label)
+    units = ", ".join(sorted({curve.unit for curve in found} - {"1"}))
+    axes.set(title=title, xlabel="t [s]", ylabel=units and f"[{units}]")
+
+
+def _with_gaps(found: Sequence[Curve]) -> tuple[list[Curve], Array | None]:
+    """Return attitudes with gaps at 180 degrees, and where a band joins them to the reference.
+
+    At 180 degrees the vector part of a unit quaternion changes its sign.
+    """
+    fields = ("values", "linear", "reference")
+    given = [name for name in fields if getattr(found[0], name) is not None]
+    rows = {name: np.array([getattr(each, name) for each in found]) for name in given}
+    near = (rows["values"] * rows["reference"]).sum(axis=0) >= 0.0 if "reference" in rows else None
+    for each in rows.values():
+        jumps = (each[:, 1:] * each[:, :-1]).sum(axis=0) < -0.5
+        each[:, 1:][:, jumps] = np.nan
+    broken = [{name: rows[name][i] for name in given} for i in range(len(found))]
+    return [each._replace(**row) for each, row in zip(found, broken, strict=True)], near
 
 
 def _named(axes: Axes) -> dict[str, Line2D]:
@@ -243,15 +228,12 @@ def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -
     figure.legend(handles=named, loc=place, ncols=columns, handlelength=1.6, title=title)
 
 
-def _drifts(axes: Axes, t: Array, drifts: Mapping[str, Array]) -> None:
+def _drifts(axes: Axes, motion: Any) -> None:
     # Zero has no place on a logarithmic axis: nothing is below the rounding of one.
+    drifts = {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift}
     shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}
     for color, (label, drift) in zip(COLORS, shown.items(), strict=False):
-        axes.semilogy(t, drift, color=color, label=label)
+        axes.semilogy(motion.t, drift, color=color, label=label)
     axes.set(title=f"relative {next(iter(shown))} drift", xlabel="t [s]")
     axes.set_ylim(1e-17, max(1e-13, *(10.0 * float(drift.max()) for drift in shown.values())))
     axes.legend(handlelength=1.2)
-
-
-def _short(name: str) -> str:
-    return name.partition(".")[2] or name

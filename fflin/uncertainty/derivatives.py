@@ -22,7 +22,7 @@ from fflin.dynamics.chart import Standing
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.names import LINEAR, PIN_ANGULAR
 from fflin.dynamics.orbital import Tide, field_of
-from fflin.dynamics.rnea import Accelerations, Rates
+from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import StateMap
 from fflin.linear.certificate import aba_route
 from fflin.linear.linearization import Prepared, own_reference, prepare
@@ -72,7 +72,7 @@ class ModelSlopes:
         self.bodies = BodySlopes(ready, self._rates, lin.q, lin.v, inverse)
 
     @cached_property
-    def _of_bodies(self) -> Rates:
+    def _of_bodies(self) -> AccelerationDerivatives:
         return self.bodies.all()
 
     def over(self, parameters: Sequence[Parameter]) -> tuple[Array, ...]:
@@ -82,7 +82,9 @@ class ModelSlopes:
         ready, state, nu = self._ready, self._ready.map, self._ready.map.velocities(self.lin.v)
         count, nv = len(rates.c) + 1, len(nu)
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
-        with_none = Rates(np.zeros((count, nv)), A[:, nv:], B[:, nv:], np.zeros((count, 3)))
+        with_none = AccelerationDerivatives(
+            np.zeros((count, nv)), A[:, nv:], B[:, nv:], np.zeros((count, 3))
+        )
         for part, of_parameters in zip(with_none, rates, strict=True):
             part[:-1] = of_parameters
         f0 = assemble(
@@ -105,7 +107,7 @@ class ModelSlopes:
         C, D, y0 = np.split(self._seen(parameters, rates), (state.nx, -1), axis=2)
         return A, B, C, D, f0, y0[..., 0]
 
-    def _seen(self, parameters: Sequence[Parameter], rates: Rates) -> Array:
+    def _seen(self, parameters: Sequence[Parameter], rates: AccelerationDerivatives) -> Array:
         """Return dC, dD and dy0 side by side (P, ny, ..), of outputs that feel or weigh."""
         # The robot's mass times such an output is quadratic in a parameter, with rates that are
         # linear in it: of three values the slope is exact, whatever the step.
@@ -124,7 +126,7 @@ class ModelSlopes:
         def weighed(one: Parameter, by: Sequence[Array], size: float) -> Array:
             for joint, body in with_bodies(self.robot, one, size).items():
                 other.model.inertias[joint] = body
-            moved = Rates(*(a + size * b for a, b in zip(now, by, strict=True)))
+            moved = AccelerationDerivatives(*(a + size * b for a, b in zip(now, by, strict=True)))
             made = output_equations(sensing, actuation, data, self._chart, moved, lin.x0, point)
             seen = np.column_stack((made["C"], made["D"], made["y0"]))[rows]
             total = pin.computeTotalMass(other.model)
@@ -198,12 +200,12 @@ def _units() -> Array:
     return found
 
 
-_UNITS = _units()
+UNITS = _units()
 # Bodies that Pinocchio can hold, whose parameters span all ten: at the joint, and beside it.
 _BODIES = (
     pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3))),
     *(pin.Inertia(1.0, axis, np.zeros((3, 3))) for axis in _E),
-    *(pin.Inertia(0.0, np.zeros(3), unit[3:, 3:]) for unit in _UNITS[4:]),
+    *(pin.Inertia(0.0, np.zeros(3), unit[3:, 3:]) for unit in UNITS[4:]),
 )
 _OF_BODIES = np.linalg.inv([body.toDynamicParameters() for body in _BODIES]).round()
 
@@ -211,7 +213,9 @@ _OF_BODIES = np.linalg.inv([body.toDynamicParameters() for body in _BODIES]).rou
 class BodySlopes:
     """Derivatives over the ten dynamic parameters of every body at one point, (12.1) and (12.2)."""
 
-    def __init__(self, ready: Prepared, rates: Rates, q: Array, v: Array, inverse: Array) -> None:
+    def __init__(
+        self, ready: Prepared, rates: AccelerationDerivatives, q: Array, v: Array, inverse: Array
+    ) -> None:
         self.state, self.model = ready.map, ready.robot.model
         self.q, self.v, self.inverse = q.copy(), v.copy(), inverse
         # Nothing depends on where the base is and how fast it moves along, see `Accelerations`.
@@ -223,13 +227,15 @@ class BodySlopes:
         self.data, self.rates = ready.robot.create_data(), rates
         self.joints = range(ROOT, self.model.njoints)
 
-    def all(self) -> Rates:
+    def all(self) -> AccelerationDerivatives:
         """Return them as rates, (bodies * 10, ..), of the joints in Pinocchio's order."""
         rates, size = self.rates, len(self.inverse)
         given = np.concatenate((rates.by_u, rates.slopes), axis=1)
         moved = self._by_inertia(given).reshape(-1, size, given.shape[1])
         by_u, slopes = np.split(moved, rates.by_u.shape[1:], axis=2)
-        found = Rates(np.zeros((len(moved), size)), slopes, by_u, np.zeros((len(moved), 3)))
+        found = AccelerationDerivatives(
+            np.zeros((len(moved), size)), slopes, by_u, np.zeros((len(moved), 3))
+        )
         if self.v.any() or rates.c.any():
             F, F_q, F_nu, F_turn = self._forces()
             found.c[:] = -F @ self.inverse
@@ -257,7 +263,7 @@ class BodySlopes:
         )
         bodies, _, size = J.shape
         X, k = J @ self.inverse, given.shape[1]
-        Z = _UNITS.reshape(60, 6) @ (J @ given)
+        Z = UNITS.reshape(60, 6) @ (J @ given)
         Z = Z.reshape(bodies, 10, 6, k).transpose(0, 2, 1, 3).reshape(bodies, 6, 10 * k)
         product = -(X.mT @ Z)
         return product.reshape(bodies, size, 10, k).transpose(0, 2, 1, 3)
@@ -297,9 +303,13 @@ class BodySlopes:
         return state.forces(tau), project(by_q)[:, 6:], project(by_v), state.forces(by_turn)
 
 
-def slopes_of(parameters: Sequence[Parameter], at: BodySlopes, of_bodies: Rates, u: Array) -> Rates:
+def slopes_of(
+    parameters: Sequence[Parameter], at: BodySlopes, of_bodies: AccelerationDerivatives, u: Array
+) -> AccelerationDerivatives:
     """Return the derivatives of the rates over each parameter, (P, ..); u (nu,) in base axes."""
-    found = Rates(*(np.zeros((len(parameters), *part.shape[1:])) for part in of_bodies))
+    found = AccelerationDerivatives(
+        *(np.zeros((len(parameters), *part.shape[1:])) for part in of_bodies)
+    )
     for block, joint in enumerate(at.joints):
         rows = [row for row, each in enumerate(parameters) if joint in each.bodies]
         changes = np.array([parameters[row].bodies[joint] for row in rows])
@@ -313,7 +323,7 @@ def slopes_of(parameters: Sequence[Parameter], at: BodySlopes, of_bodies: Rates,
     return found
 
 
-def _of_force(parameter: Parameter, at: BodySlopes, u: Array) -> Rates:
+def _of_force(parameter: Parameter, at: BodySlopes, u: Array) -> AccelerationDerivatives:
     """Return the derivatives over what changes the forces alone: F_p, F_qp, F_nup and B_p."""
     state, rates, size = at.state, at.rates, len(at.inverse)
     F: Array = np.zeros(size)
@@ -340,7 +350,9 @@ def _of_force(parameter: Parameter, at: BodySlopes, u: Array) -> Rates:
             still = np.zeros_like(at.v)
             by_q = pin.computeRNEADerivatives(at.model, at.data, at.q, still, still, pushed)[0]
             F_q = state.project(by_q)[:, 6:]
-    found = Rates(-at.inverse @ F, np.zeros((size, 2 * size)), at.inverse @ B, np.zeros(3))
+    found = AccelerationDerivatives(
+        -at.inverse @ F, np.zeros((size, 2 * size)), at.inverse @ B, np.zeros(3)
+    )
     if found.c.any():
         F_q = F_q + at._slope(at.model, np.zeros_like(at.v), found.c)[1]
     found.by_q_m[:], found.by_nu[:] = -at.inverse @ F_q, -at.inverse @ F_nu

@@ -23,6 +23,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.mass_properties import Piece
+from fflin.uncertainty.derivatives import UNITS
 from fflin.uncertainty.parameters import AXES, ENTRIES, OF_PIECES, Parameter
 
 _LOCAL = pin.ReferenceFrame.LOCAL
@@ -201,7 +202,7 @@ class _Form:
             self.force -= np.outer(given, self.times(at, u[[column]])[0])
         else:
             change = sum(
-                self.jacobians[joint].T @ _matrix(parameters) @ self.jacobians[joint]
+                self.jacobians[joint].T @ np.tensordot(parameters, UNITS, 1) @ self.jacobians[joint]
                 for joint, parameters in one.bodies.items()
             )
             values, vectors = np.linalg.eigh(change)
@@ -237,11 +238,3 @@ class _Form:
         x, u, w = (-np.linalg.solve(M, each) for each in others)
         zx, zu, zw = (d + Z @ each for d, each in zip(direct, (x, u, w), strict=True))
         return Fraction((x, w, u), (zx, zw, zu))
-
-
-def _matrix(parameters: Array) -> Array:
-    """Return the spatial inertia (6, 6), linear first, of dynamic parameters (10,)."""
-    m, first = parameters[0], skew(parameters[1:4])
-    xx, xy, yy, xz, yz, zz = parameters[4:]
-    about = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
-    return np.block([[m * np.eye(3), -first], [first, about]])

@@ -286,7 +286,9 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
         if tied:
             together.append(_tied(key, ones, own))
         else:
-            alone |= {one.name: _alone(_range(one, own)) for one in ones}
+            for one in ones:
+                _, middle, half = each = _range(one, own)
+                alone[one.name] = Block(one.name, one.unit, middle, half, (each,))
     made = Uncertain(robot, (*alone.values(), *together), variants)
     _refuse_overlap(variants.pieces, made.ranges)
     if why := made._refusal(np.zeros(len(made.blocks))):
@@ -336,10 +338,6 @@ def _range(one: Parameter, value: Any) -> Range:
             "relative half width, such as 0.2 for 20 %, or (least, largest), or LEAST:LARGEST"
         )
     return Range(one, 0.5 * (least + largest), 0.5 * (largest - least))
-
-
-def _alone(one: Range) -> Block:
-    return Block(one.parameter.name, one.parameter.unit, one.middle, one.half, (one,))
 
 
 def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:

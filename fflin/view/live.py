@@ -22,7 +22,6 @@ from fflin.view.page import (
     rounded,
     stage_info,
     subtitle,
-    triads,
 )
 from fflin.view.playback import body_poses
 from fflin.view.scene import Drawing, Visualizer, body_paths
@@ -75,7 +74,9 @@ class Live:
         drawing = Drawing(robot, self.meshcat["robot"])
         self.notes = drawing.notes
         poses = body_poses(robot, self._data, q)
-        info = stage_info(robot, drawing, poses, scene=scene, subtitle=subtitle(robot), frame=frame)
+        info = stage_info(
+            robot, drawing, poses, scene=scene, subtitle=subtitle(robot), tool=tool, frame=frame
+        )
         info |= {
             "mode": "live",
             "follow": follow,
@@ -83,7 +84,6 @@ class Live:
             "joints": self._joints,
             "names": [name.partition(".")[2] for name in self._state_map.names[-6 - robot.n :]],
             "bodies": [["meshcat", "robot", path] for path in body_paths(robot)],
-            "triads": triads(robot, tool, info["size"]),
         }
         info["names"][:6] = [
             f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"

@@ -21,7 +21,6 @@ from fflin.view.page import (
     rounded,
     stage_info,
     subtitle,
-    triads,
 )
 from fflin.view.playback import body_poses
 from fflin.view.scene import Drawing, Visualizer, body_paths
@@ -59,7 +58,9 @@ def mode_page(
     drawing.place(at_rest)
     Drawing(robot, scenery["rest"], "ghost", sent).place(at_rest)
     about = f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}"
-    info = stage_info(robot, drawing, at_rest, scene=scene, subtitle=about, frame=lin.frame)
+    info = stage_info(
+        robot, drawing, at_rest, scene=scene, subtitle=about, tool=tool, frame=lin.frame
+    )
     swings = [_swing(state, drawing, mode, lin, info["size"]) for mode in found.vibrations]
     energies = energy_by_body(robot, lin, [mode.shape for mode in found.vibrations])
     points = [corner_points(drawing, poses) for swing in swings for poses in swing[:: _PHASES // 4]]
@@ -67,7 +68,6 @@ def mode_page(
         "mode": "modes",
         "period": _PERIOD,
         "bodies": [["meshcat", "robot", path] for path in body_paths(robot)],
-        "triads": triads(robot, tool, info["size"]),
         "points": rounded(np.concatenate(points), info["size"]),
         "modes": [
             {

@@ -13,6 +13,7 @@ from fflin.dynamics.impact import Impact
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
+from fflin.view.equipment import thrusters
 from fflin.view.overlays import cloud_of, tubes
 from fflin.view.page import (
     Recorder,
@@ -22,7 +23,6 @@ from fflin.view.page import (
     rounded,
     stage_info,
     subtitle,
-    triads,
 )
 from fflin.view.panel import panel
 from fflin.view.playback import (
@@ -31,7 +31,6 @@ from fflin.view.playback import (
     frame_indices,
     payloads,
     play_back,
-    thrusters,
 )
 from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
 
@@ -79,7 +78,10 @@ def motion_page(
     drawing = Drawing(robot, scenery["robot"], sent=sent)
     ghosts = _ghosts(scenery, motion, state, shown, goals, sent)
     held = {
-        caught.prefix: (Drawing(caught.payload, scenery["held"][caught.prefix], "held", sent), at)
+        caught.prefix: (
+            Drawing(caught.payload, scenery["held"][caught.prefix], "held", sent, caught.prefix),
+            at,
+        )
         for caught, at in payloads(motion, shown)
     }
     moving = [(drawing, film.poses), *ghosts, *held.values()]
@@ -95,7 +97,14 @@ def motion_page(
     names = [each.name.replace("+", " + ") for each in flown]
     about = [f"{subtitle(each)}, {t[-1] - t[0]:.4g} s" for each in flown]
     info = stage_info(
-        robot, drawing, film.poses[0], scene=scene, subtitle=about[0], frame=motion.frame
+        robot,
+        drawing,
+        film.poses[0],
+        scene=scene,
+        subtitle=about[0],
+        tool=tool,
+        frame=motion.frame,
+        held=[each for each, _ in held.values()],
     )
     size = info["size"]
     points = _points(film, size, (drawing, goals), held.values())
@@ -244,5 +253,4 @@ def marks(
             for k, (name, joint, position, direction) in enumerate(thrusters(robot))
             if most
         ],
-        "triads": triads(robot, tool, size),
     }

@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from html import escape
 from importlib.resources import files
@@ -19,8 +20,9 @@ from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.names import frame_of
 from fflin.dynamics.orbital import field_of
-from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
+from fflin.view.equipment import equipment
 from fflin.view.scene import Drawing, body_paths
 
 Lowered = dict[str, Any]
@@ -29,7 +31,10 @@ Lowered = dict[str, Any]
 VIEWS = {"space": (1.0, -0.62, 0.50), "lab": (1.0, -0.62, 0.36)}
 SUN = (0.62, -0.78, 0.62)
 
-_SCRIPTS = ("sky", "orbit", "look", "stage", "marks", "plots", "player", "live", "modes", "main")
+_SCRIPTS = (
+    *("sky", "orbit", "look", "camera", "stage", "marks", "equipment", "pick", "keys"),
+    *("chart", "plots", "large", "player", "live", "modes", "main"),
+)
 
 
 def build_page(info: dict[str, Any], commands: Iterable[bytes] = (), connect: str = "") -> str:
@@ -70,6 +75,7 @@ def _asset(name: str) -> str:
 @cache
 def _scripts() -> str:
     body = "\n".join(_asset(f"{name}.js") for name in _SCRIPTS)
+    body = re.sub(r"(?m)^ *(//.*\n)?", "", body)  # indentation and comments
     # Names of our own, beside those of meshcat's bundle.
     return f'(() => {{\n"use strict";\nconst THREE = MeshCat.THREE;\n{body}\nmain();\n}})();'
 
@@ -163,7 +169,9 @@ def stage_info(
     *,
     scene: str,
     subtitle: str,
+    tool: str | None,
     frame: str | None = None,
+    held: Sequence[Drawing] = (),
 ) -> dict[str, Any]:
     """Return what the page's stage needs, of the first frame's poses (njoints - 1, 7)."""
     points = corner_points(drawing, poses)
@@ -181,7 +189,9 @@ def stage_info(
             "up": [along.tolist(), radial.tolist(), (-normal).tolist()],
             "orbit": {"body": robot.orbit.body, "distance": far, "rate": robot.orbit.mean_motion},
         }
-    return orbit | {
+    return {
+        **orbit,
+        **equipment(robot, [drawing, *held], tool, size),
         "title": robot.name,
         "subtitle": subtitle,
         "scene": scene,
@@ -192,21 +202,3 @@ def stage_info(
         "direction": direction.tolist(),
         "base": ["meshcat", "robot", body_paths(robot)[0]],
     }
-
-
-def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
-    """Return the axes drawn at the base and the tool."""
-    paths = body_paths(robot)
-    found = [(paths[0], pin.SE3.Identity(), 0.3)]
-    if tool:
-        joint, placement = find_frame(robot.model, tool)
-        found.append((paths[joint - ROOT], placement, 0.12))
-    return [
-        {
-            "path": ["meshcat", "robot", path],
-            "position": placement.translation.tolist(),
-            "quaternion": pin.SE3ToXYZQUAT(placement)[3:].tolist(),
-            "length": share * size,
-        }
-        for path, placement, share in found
-    ]

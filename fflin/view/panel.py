@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from itertools import compress
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.names import input_keys
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.simulation.motion_plot import resting_from
+from fflin.simulation.curves import Curve, curves, resting_from
 from fflin.view.page import packed
 
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
-
-# A limit is drawn where a curve comes to this share of it.
-_NEAR = 1.0 / 3.0
 
 # What is below this, in SI units, is rounding.
 _NOTHING = 1e-14
@@ -27,7 +22,6 @@ _NOTHING = 1e-14
 # Nor is a line drawn that is below this share of the largest of its plot.
 _UNSEEN = 1e-6
 
-_OPEN = np.full(2, np.inf)
 _NONE = np.zeros(0)
 
 # Titles of states and inputs of a group and a unit; in a family a name has one colour.
@@ -50,20 +44,6 @@ _CHARTS: tuple[dict[tuple[str, str], str], ...] = (
         ("momentum", "N m s"): "wheel momentum",
     },
 )
-
-
-class _Line(NamedTuple):
-    """Values (N,) of a name, its limits (2,), infinite where open, and a reference (N,) or (0,)."""
-
-    name: str
-    values: Array
-    limits: Array
-    reference: Array = _NONE
-
-    @property
-    def size(self) -> float:
-        """The largest of its values."""
-        return float(np.abs((*self.values, *self.reference)).max())
 
 
 def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
@@ -100,20 +80,24 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     of = "{} error" if len(target) else "{} change"
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
     plots = [
-        _plot(title, unit, [_Line("", values, _OPEN)])
+        _plot(title, unit, [("", Curve("", "", "", unit, values, _NONE))])
         for title, unit, values in readouts[: 4 if len(target) > 1 else 2]
         if values.any()
     ]
     readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
     if len(motion.com_drift):  # a file may not tell
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
-    reference = motion.target[shown] if len(target) > 1 else np.zeros((0, motion.x.shape[1]))
-    lines = _lines(robot, motion, shown, reference)
+    lines = _lines(robot, motion, shown, followed=len(target) > 1)
     for family, charts in enumerate(_CHARTS):
         for key, title in charts.items():
-            sizes = [line.size for line in lines.get(key, [])]
-            seen = [x > _UNSEEN * max(sizes) for x in sizes]
-            plot = _plot(title, key[1], list(compress(lines.get(key, []), seen)), family)
+            found_here = lines.get(key, [])
+            sizes = [_size(curve) for curve in found_here]
+            seen = [
+                (curve.key.partition(".")[2], curve)
+                for curve, size in zip(found_here, sizes, strict=True)
+                if size > _UNSEEN * max(sizes)
+            ]
+            plot = _plot(title, key[1], seen, family)
             # Of rates their limits alone are of interest.
             if any(each["limits"] or not title.endswith("rates") for each in plot["lines"]):
                 plots.append(plot)
@@ -129,50 +113,39 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
 
 
 def _lines(
-    robot: Robot, motion: Motion, shown: Array, reference: Array
-) -> dict[tuple[str, str], list[_Line]]:
-    """Return the lines of states and inputs that are not zero all along, by group and unit."""
-    limits = dict(zip(motion.limit_names, motion.limits, strict=True))
-    found: dict[tuple[str, str], list[_Line]] = {}
-    names, inputs = motion.state_names, motion.input_names
-    for name, key, unit, column, followed in (
-        *zip(names, names, motion.state_units, motion.x.T, reference.T, strict=True),
-        *zip(
-            *(inputs, input_keys(motion), motion.input_units, motion.u.T, [_NONE] * len(inputs)),
-            strict=True,
-        ),
-    ):
-        group, _, entry = key.partition(".")
-        line = _Line(entry, column[shown], limits.get(name, _OPEN), followed)
-        if line.size < _NOTHING:
-            continue
-        if group in ("q_m", "qdot_m") and entry in robot.wheels:
-            if group == "q_m":
-                continue
-            group, inertia = "speed", robot.wheels[entry]
-            momentum = _Line(entry, *(inertia * each for each in line[1:]))
-            found.setdefault(("momentum", "N m s"), []).append(momentum)
-        found.setdefault((group, unit), []).append(line)
+    robot: Robot, motion: Motion, shown: Array, *, followed: bool
+) -> dict[tuple[str, str], list[Curve]]:
+    """Return the curves that are not zero all along, at the rows shown, by group and unit."""
+    found: dict[tuple[str, str], list[Curve]] = {}
+    for each in curves(motion, robot.wheels):
+        reference = each.reference[shown] if followed and each.reference is not None else None
+        curve = each._replace(values=each.values[shown], reference=reference)
+        if _size(curve) >= _NOTHING:
+            found.setdefault((curve.group, curve.unit), []).append(curve)
     return found
 
 
-def _plot(title: str, unit: str, lines: list[_Line], family: int = -1) -> dict[str, Any]:
-    """Return a plot, with those limits of each line that it comes near."""
+def _size(curve: Curve) -> float:
+    """Return the largest of a curve's values."""
+    rows = curve.values if curve.reference is None else (*curve.values, *curve.reference)
+    return float(np.abs(rows).max())
+
+
+def _plot(
+    title: str, unit: str, lines: list[tuple[str, Curve]], family: int = -1
+) -> dict[str, Any]:
+    """Return a plot of labelled curves, with those limits of each that it comes near."""
     return {
         "title": title,
         "unit": unit,
         "family": family,
         "lines": [
             {
-                "label": line.name,
-                "values": packed(line.values),
-                "reference": packed(line.reference),
-                "limits": [
-                    level
-                    for level in line.limits[np.isfinite(line.limits)].tolist()
-                    if level and (line.values / level).max() >= _NEAR
-                ],
+                "label": label,
+                "values": packed(curve.values),
+                "reference": "" if curve.reference is None else packed(curve.reference),
+                "limits": curve.near,
             }
-            for line in lines
+            for label, curve in lines
         ],
     }

@@ -15,7 +15,6 @@ from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.impact import Capture, inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import StateMap
-from fflin.robot.inputs import Thruster
 from fflin.robot.joints import ROOT, find_frame, find_joint, frame_index
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
@@ -107,20 +106,6 @@ def play_back(
     thrust = u[:, groups.get("thrust", np.zeros(0, dtype=int))]
     poses, com, tools, force, torque = map(np.array, zip(*frames, strict=True))
     return Playback(t, poses, com, tools, force, torque, thrust)
-
-
-def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
-    """Return name, joint, position and direction of push, in its frame, of each thruster."""
-    found: list[tuple[str, int, Array, Array]] = []
-    actuation = Actuation(StateMap(robot))
-    names = [actuation.names[index] for index in actuation.groups.get("thrust", ())]
-    for item in robot.inputs:
-        if isinstance(item, Thruster):
-            joint, placement = find_frame(robot.model, item.frame)
-            position = placement.act(np.array(item.position))
-            direction = placement.rotation @ np.array(item.direction)
-            found.append((names[len(found)], joint, position, direction))
-    return found
 
 
 def payloads(motion: Motion, shown: Array) -> Iterator[tuple[Capture, Array]]:

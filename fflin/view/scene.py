@@ -13,7 +13,9 @@ import pinocchio as pin
 import umsgpack
 
 from fflin.base.validation import Array
+from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
+from fflin.view.bending import bendings
 from fflin.view.meshes import Indices, Mesh, load_mesh
 from fflin.view.shapes import PLAIN, Shape, shapes
 
@@ -64,18 +66,27 @@ class Drawing:
     """A robot drawn below a node of a meshcat scene, whose children are named as its joints."""
 
     def __init__(
-        self, robot: Robot, visualizer: Visualizer, look: str = "real", sent: set[str] | None = None
+        self,
+        robot: Robot,
+        visualizer: Visualizer,
+        look: str = "real",
+        sent: set[str] | None = None,
+        prefix: str = "",
     ) -> None:
         self.robot = robot
         self._visualizer = visualizer
         self._paths = body_paths(robot)
         sent = set() if sent is None else sent  # meshes that the page has, of these too
         found, self.notes = shapes(robot)  # and what could not be drawn
+        self.links = dict[str, list[float]]()  # {name: mass [kg] and pose on its joint}
         corners: dict[int, list[Array]] = {}
         for index, shape in enumerate(found):
             node = visualizer[self._paths[shape.joint - ROOT]]
             for part, (geometry, matrix, color, box) in enumerate(_pieces(shape)):
                 about = {"finish": shape.finish, "color": color, "look": look}
+                if look in ("real", "held"):
+                    about["link"] = ".".join(filter(None, (prefix, shape.link)))
+                    self.links.setdefault(about["link"], _link(robot, shape))
                 shown = geometry
                 if geometry["type"] == "BufferGeometry":
                     about["mesh"] = geometry["uuid"]
@@ -107,6 +118,20 @@ class Drawing:
             clip = {"fps": 1, "name": path, "tracks": [{**each, "times": times} for each in tracks]}
             clips.append({"path": self._visualizer[path].path.lower(), "clip": clip})
         return clips
+
+
+def _link(robot: Robot, shape: Shape) -> list[float]:
+    """Return the mass [kg] of a shape's link, and its pose (7,) in the joint's frame."""
+    model, pieces = robot.model, robot.pieces
+    if not model.existFrame(shape.link, pin.FrameType.BODY):  # a body with boxes of its inertia
+        mass, at = model.inertias[shape.joint].mass, pin.SE3.Identity()
+    else:
+        known = pieces.get(shape.link) or robot.links.get(shape.link)
+        mass, at = known.mass if known else 0.0, find_frame(model, shape.link)[1]
+        for bending in bendings(robot).values():
+            if bending.node == shape.joint:
+                at = bending.frame.actInv(at)
+    return [mass, *pin.SE3ToXYZQUAT(at).round(6).tolist()]
 
 
 class Animation(SetAnimation):

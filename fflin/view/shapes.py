@@ -35,6 +35,7 @@ class Shape:
     color: Color | None = PLAIN  # red, green, blue, opacity; None where a mesh brings its own
     finish: str = ""  # name of its material, which may tell gold from paint
     mesh: Path | None = None
+    link: str = ""  # or the body, where inertias are drawn
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
@@ -57,7 +58,8 @@ def _carried(robot: Robot, prefix: str, other: Robot, shape: Shape) -> Shape:
     if shape.joint > ROOT:
         held_by = find_joint(robot.model, f"{prefix}.{other.model.names[shape.joint]}")
     joint, held = held_by
-    return replace(shape, joint=joint, placement=held * shape.placement)
+    link = f"{prefix}.{shape.link}"
+    return replace(shape, joint=joint, placement=held * shape.placement, link=link)
 
 
 def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
@@ -104,7 +106,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
                 except ValueError:
                     unreadable.append(file.name)
                     continue
-            yield Shape(joint, kind, size, placement, color, finish, file)
+            yield Shape(joint, kind, size, placement, color, finish, file, frame.name)
     yield from (
         Shape(joint, kind, size, pin.SE3(np.eye(3), position))
         for joint, kind, size, position in balls(robot, bent)
@@ -183,4 +185,6 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
         sides = np.sqrt(np.maximum(squares, 0.0))
         sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
         size = (float(sides[0]), float(sides[1]), float(sides[2]))
-        yield Shape(joint, "box", size, pin.SE3(axes, inertia.lever), finish="inertia")
+        placement = pin.SE3(axes, inertia.lever)
+        link = "base" if joint == ROOT else robot.model.names[joint]
+        yield Shape(joint, "box", size, placement, finish="inertia", link=link)

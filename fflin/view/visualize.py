@@ -63,10 +63,11 @@ def visualize(
 
     - the robot in its colours, with triads at base and tool;
     - the trails of the tool and of the centre of mass;
-    - arrows of force and torque on the base, and plumes of thrusters with lengths proportional to
-      u(t);
+    - arrows of force and torque on the base, thrusters, plumes with lengths proportional to u(t),
+      and wheels at their frames;
     - a translucent robot at the target, and another at the linear prediction, if there is one;
-    - a time slider, and a panel with errors and inputs over time.
+    - a time slider, views of the camera, and a panel with errors and inputs over time: a click
+      enlarges a chart, and a click on a link shows its mass and pose.
 
     Along a trajectory, a translucent robot moves with the reference. Dashed lines are the reference
     paths of base and tool; pale curves are the reference joint positions. A dotted line marks the

@@ -1,4 +1,4 @@
-"""Sweeps on executors: in order, the robot sent once, workers that die."""
+"""Sweeps on executors: in order, the robot unpickled once, workers that die."""
 
 import os
 import signal
@@ -45,42 +45,17 @@ def test_processes_give_what_this_one_gives(moving, pool, robot):
     assert batch[0].certificate.inertia_residual < 1e-13
 
 
-class Counting:
-    """A thread pool that notes what is sent."""
-
-    def __init__(self):
-        self.pool, self.sent = ThreadPoolExecutor(2), []
-        self._max_workers = 2
-
-    def submit(self, function, parcel, *arguments):
-        self.sent.append(parcel.content is not None)
-        return self.pool.submit(function, parcel, *arguments)
-
-
-@pytest.mark.compiled
 @pytest.mark.process
-def test_the_robot_is_sent_to_each_worker_once(robot, monkeypatch):
-    monkeypatch.setattr(dispatching, "_JOBS", {})
-    executor = Counting()
+def test_a_worker_unpickles_the_robot_once(robot, monkeypatch):
+    dispatching._unpickled.cache_clear()
+    made = []
+    load = dispatching.pickle.loads
+    monkeypatch.setattr(dispatching.pickle, "loads", lambda job: made.append(job) or load(job))
     q, _, _ = points(robot, 60)
-    batch = fflin.sweep(robot, q, executor=executor, chunk=2)
-    assert len(executor.sent) == 30 and sum(executor.sent) <= 4
+    with ThreadPoolExecutor(1) as executor:
+        batch = fflin.sweep(robot, q, engine="python", executor=executor, chunk=2)
+    assert len(made) == 1
     assert np.array_equal(batch.q, q)
-    # A worker that has lost it, or is new, asks for it.
-    lost = iter([False] * 9 + [True] + [False] * 99)
-
-    class Forgetful(Counting):
-        def submit(self, function, parcel, *arguments):
-            if next(lost):
-                dispatching._JOBS.clear()
-            return super().submit(function, parcel, *arguments)
-
-    forgetful = Forgetful()
-    again = fflin.sweep(robot, q, executor=forgetful, chunk=2)
-    assert len(forgetful.sent) > 30
-    assert np.array_equal(again.B_lower, batch.B_lower)
-    executor.pool.shutdown()
-    forgetful.pool.shutdown()
 
 
 def kill_at(start_to_kill, marker, original=batch_chunks.ChunkJob.run):

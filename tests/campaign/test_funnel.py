@@ -264,7 +264,7 @@ def test_page_and_command(arm, found, tmp_path, monkeypatch):
     kept = ("-o", "f.npz", "--html", "f.html", "--plot", "f.png", "--seed", "3")
     goal = ("--goal", "attitude=5", "--goal", "joints=0.1", "--limits", "none")
     code, out, err = run(
-        *given, "8", "--trajectory", "plan.csv", *goal, "--step", "0.05", *kept, "--threads", "2"
+        *given, "8", "--trajectory", "plan.csv", *goal, "--dt", "0.05", *kept, "--threads", "2"
     )
     assert code == 0 and not err and out.count("wrote") == 3
     made = fflin.funnel(

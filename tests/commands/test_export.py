@@ -8,7 +8,7 @@ from tests.support.policies import compensated
 
 @needs_compiler
 def test_a_gain_and_a_compensator_become_c_code(tmp_path):
-    code, _, err = run("lqr", "servicer_7dof", "--dt", "0.1", "-o", tmp_path / "gain.npz")
+    code, _, err = run("lqr", "servicer_7dof", "--sample", "0.1", "-o", tmp_path / "gain.npz")
     assert (code, err) == (0, "")
     compensated(fflin.load("servicer_7dof"))[2].save(tmp_path / "by.mat")
     for file, options in (

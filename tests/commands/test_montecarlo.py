@@ -16,7 +16,7 @@ from tests.support.messages import says
 from tests.support.patience import finished
 
 TOML = '[dispersions]\nq_b = 0.05\n"*.mass" = 0.1\nq_m = {uniform = [-0.2, 0.2]}\n'
-SHORT = ("u.toml", "--duration", "0.4", "--step", "0.02")
+SHORT = ("u.toml", "--duration", "0.4", "--dt", "0.02")
 
 
 @pytest.fixture
@@ -81,7 +81,17 @@ def test_bad_input_is_one_line_and_leaves_nothing(arguments, said, folder):
 def test_noise_has_a_report_and_another_campaign_is_replaced_by_force(folder, monkeypatch):
     monkeypatch.chdir(folder)
     (folder / "u.toml").write_text('[dispersions]\n"q_b.x.noise" = 1e-4\n')
-    command = ("montecarlo", "planar_detumble", *SHORT, "--dt", "0.1", "--runs", "8", "-o", "c.npz")
+    command = (
+        "montecarlo",
+        "planar_detumble",
+        *SHORT,
+        "--sample",
+        "0.1",
+        "--runs",
+        "8",
+        "-o",
+        "c.npz",
+    )
     code, _, error = run(*command)
     assert (code, error) == (0, "")
     before = (folder / "c.npz").read_bytes()

@@ -48,7 +48,7 @@ def test_it_shows_and_saves_the_gain_that_the_library_gives(capsys, tmp_path):
 
 def test_dt_keeps_the_continuous_cost(capsys, tmp_path):
     path = tmp_path / "gain.json"
-    options = ("--weights", "identity", "--r", "tau_m=2", "--dt", "0.2", "-o", str(path))
+    options = ("--weights", "identity", "--r", "tau_m=2", "--sample", "0.2", "-o", str(path))
     assert run(capsys, "planar_detumble", *options)[0] == 0
     lin = fflin.linearize(fflin.load("planar_detumble"))
     cost = fflin.sampled_cost(lin, 0.2, 1.0, {"tau_b": 1.0, "F_b": 1.0, "tau_m": 2.0})
@@ -60,7 +60,7 @@ def test_dt_keeps_the_continuous_cost(capsys, tmp_path):
 @pytest.mark.parametrize("dt", [None, 0.2])
 def test_without_weights_the_limits_of_the_urdf_choose_them(capsys, tmp_path, dt):
     path = tmp_path / "gain.json"
-    options = () if dt is None else ("--dt", str(dt))
+    options = () if dt is None else ("--sample", str(dt))
     assert main(["lqr", "servicer_7dof", *options, "-o", str(path)]) == 0
     lin = fflin.linearize(fflin.load("servicer_7dof"))
     expected = fflin.lqr(lin.discretize(dt) if dt else lin)
@@ -93,7 +93,7 @@ def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
         "'q_b'": ("--bryson", "q_b=1", "--q", "q_b=1"),
         "eigenvalue -1": ("--q", "q_b=-1"),
         "eigenvalue 0": ("--r", "F_b.y=0"),
-        "-1 s": ("--dt", "-1"),
+        "-1 s": ("--sample", "-1"),
         "q_b.x": ("--velocity", "omega_b.x=0.1"),
         "--equilibrium": ("--gravity", "0", "0", "-9.81", "--q", "q_b=1"),
         "--q": ("--q", "q_b=1", "--q", "q_b=2"),
@@ -139,9 +139,9 @@ def test_the_speeds_of_wheels_are_chosen_and_weighed(capsys, tmp_path):
         assert run(capsys, *common, *options)[0] == 0
         kept = fflin.Gain.load(path).regulated
         assert sum(name.startswith("qdot_m.wheel_") for name in kept) == speeds
-    assert run(capsys, *common, "--dt", "0.1", "--bryson", "qdot_m.wheel_z=0.5")[0] == 0
+    assert run(capsys, *common, "--sample", "0.1", "--bryson", "qdot_m.wheel_z=0.5")[0] == 0
     quick = fflin.Gain.load(path)
-    assert run(capsys, *common, "--dt", "0.1")[0] == 0
+    assert run(capsys, *common, "--sample", "0.1")[0] == 0
     slow = fflin.Gain.load(path)
     at = slow.state_names.index("qdot_m.wheel_z")
     assert np.abs(quick.K[:, at]).max() > 10.0 * np.abs(slow.K[:, at]).max()

@@ -54,8 +54,8 @@ def test_an_arm_with_slow_joints_comes_back_within_its_limits(tmp_path):
 
 def test_target_sampling_limits_and_delay(tmp_path):
     code, _, err = run(
-        *("simulate", "ets_vii", "--target-joint", "joint_1=0.5", "--dt", 0.1),
-        *("--limit", "tau_m=3", "--delay", 0.1, "--duration", 40, "--step", 0.02),
+        *("simulate", "ets_vii", "--target-joint", "joint_1=0.5", "--sample", 0.1),
+        *("--limit", "tau_m=3", "--delay", 0.1, "--duration", 40, "--dt", 0.02),
         *("-o", "m.json"),
         cwd=tmp_path,
     )
@@ -70,7 +70,7 @@ def test_target_sampling_limits_and_delay(tmp_path):
 @pytest.mark.process
 def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
     command = ("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 20, 0, 0, "--duration", 80)
-    command = [sys.executable, "-m", "fflin", *map(str, command), "--dt", "0.1"]
+    command = [sys.executable, "-m", "fflin", *map(str, command), "--sample", "0.1"]
     settled = []
     for option in (("--no-allocate",), ()):
         done = finished(
@@ -115,7 +115,7 @@ def test_the_share_of_cut_thrust_is_that_of_the_motion(tmp_path):
 
 def test_the_linear_model_is_shown_between_samples_and_inputs_stay_with_their_units(tmp_path):
     code, out, _ = run(
-        *("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 5, 0, 0, "--dt", 0.5),
+        *("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 5, 0, 0, "--sample", 0.5),
         *("--duration", 5, "-o", "m.npz", "--no-allocate"),
         cwd=tmp_path,
     )
@@ -236,7 +236,7 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
         (["--free", "--reduce"], "--free"),
         (["--free", "--weights", "identity"], "--free"),
         (["--free", "--limit", "tau_m=1"], "--free"),
-        (["--step", "5"], "fastest pole"),
+        (["--dt", "5"], "fastest pole"),
         (["--method", "rk4"], "method"),
     ],
 )
@@ -250,7 +250,7 @@ def test_inputs_are_cut_to_the_limits_of_the_robot_unless_told_otherwise(tmp_pat
         "[[input]]\ntype = 'base_torque'\nmax = 1e-3\n[[input]]\ntype = 'base_force'\n"
     )
     command = ("simulate", "cubesat", "--inputs", "weak.toml", "--weights", "identity")
-    command = (*command, "--rpy", 20, 0, 0, "--duration", 5, "--step", 0.01, "-o", "m.npz")
+    command = (*command, "--rpy", 20, 0, 0, "--duration", 5, "--dt", 0.01, "-o", "m.npz")
 
     def largest(*options):
         code, out, _ = run(*command, *options, cwd=tmp_path)
@@ -282,7 +282,7 @@ def wheels_file(tmp_path, count=3):
     return path
 
 
-@pytest.mark.parametrize("options", [(), ("--reduce",), ("--dt", 0.2)])
+@pytest.mark.parametrize("options", [(), ("--reduce",), ("--sample", 0.2)])
 def test_three_wheels_settle_the_attitude(tmp_path, options):
     code, _, err = run(
         *("simulate", "cubesat", "--inputs", wheels_file(tmp_path), "--rpy", 30, 0, 0),
@@ -309,7 +309,7 @@ def test_a_target_velocity_is_the_points_and_is_held(tmp_path):
     assert target == 500.0 and speed == pytest.approx(np.full(len(speed), 500.0), abs=1e-9)
     # With thrusters it comes back from another speed, and the body hardly notices.
     options = ("--inputs", "cubesat", "--target-velocity", "wheel_z=500", "--duration", 300)
-    speed, target, motion = speeds(*options, "--velocity", "wheel_z=450", "--step", 0.05)
+    speed, target, motion = speeds(*options, "--velocity", "wheel_z=450", "--dt", 0.05)
     assert (speed[0], target) == (450.0, 500.0) and abs(speed[-1] - 500.0) < 1.0
     assert motion.attitude_error.max() < 2.0 and motion.attitude_error[-1] < 0.01
     assert "--free" in refused("simulate", "cubesat", "--free", "--target-velocity", "omega_b.x=1")
@@ -347,7 +347,7 @@ def test_an_on_off_thruster_without_samples_is_told_of_dt(tmp_path):
         'frame = "base"\nposition = [0, 0, 0]\ndirection = [1, 0, 0]\nmax = 1\non_off = true\n'
     )
     said = refused("simulate", tmp_path / "t.toml", "--no-allocate", "--rpy", 9, 0, 0, "--reduce")
-    assert says(said, "(--dt)")
+    assert says(said, "(--sample)")
 
 
 @pytest.mark.exhaustive
@@ -359,7 +359,7 @@ def test_a_controller_from_a_file_closes_the_loop(tmp_path, dt):
     by = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
     turned = {"A": by.A, "B": by.B, "C": -by.C, "D": np.zeros((len(by.C), by.B.shape[1])), "Ts": dt}
     scipy.io.savemat(tmp_path / "K.mat", turned)
-    options = ("simulate", "ets_vii", "--output", "base", "--output", "joints", "--step", 0.02)
+    options = ("simulate", "ets_vii", "--output", "base", "--output", "joints", "--dt", 0.02)
     options = (*options, "--rpy", 10, 0, 0, "--controller", "K.mat", "--negative-feedback")
     code, out, err = run(*options, "-o", "m.npz", cwd=tmp_path)
     assert (code, err) == (0, "") and "settled" in out
@@ -381,7 +381,7 @@ def test_controllers_that_do_not_fit_are_refused(tmp_path):
     assert "A, B, C, D" in refused(*robot, cwd=tmp_path)
     scipy.io.savemat(tmp_path / "K.mat", {"D": np.eye(3)})
     assert "3 inputs" in refused(*robot, cwd=tmp_path)
-    assert "--dt: --controller" in refused(*robot, "--dt", 1, cwd=tmp_path)
+    assert "--sample: --controller" in refused(*robot, "--sample", 1, cwd=tmp_path)
     assert "--free" in refused(*robot, "--free", cwd=tmp_path)
     assert "--controller" in refused("simulate", "cubesat", "--negative-feedback")
     assert "none.mat" in refused(*robot[:3], "none.mat", cwd=tmp_path)

@@ -53,7 +53,7 @@ def test_the_chain_goes_from_a_file_to_gains(flown):
     assert "A and B hold" in out
 
     weights = ("--bryson", "q_b=0.05", "--bryson", "tau_m=0.5", "--qf", "q_b=9")
-    code, out, err = run("tvlqr", *given, *weights, "--dt", "0.1", "-o", folder / "gains.npz")
+    code, out, err = run("tvlqr", *given, *weights, "--sample", "0.1", "-o", folder / "gains.npz")
     assert (code, err) == (0, "")
     schedule = fflin.GainSchedule.load(folder / "gains.npz")
     assert schedule.dt == 0.1
@@ -76,7 +76,7 @@ def test_what_is_no_motion_is_said_and_what_is_no_trajectory_refused(flown):
     assert "--reduce" in refused("tvlqr", *given, "--reduce")
     assert "'q_m.joint_4'" in refused("linearize", "ets_vii", "--trajectory", folder / "flown.csv")
     assert "nosuch.csv" in refused("tvlqr", "planar_detumble", "--trajectory", "nosuch.csv")
-    assert "0.3 s" in refused("tvlqr", *given, "--frame", "world", "--dt", "0.3")
+    assert "0.3 s" in refused("tvlqr", *given, "--frame", "world", "--sample", "0.3")
 
 
 def chain(folder, *options, file="flown.csv"):
@@ -145,7 +145,16 @@ def test_an_offset_may_be_more_than_half_a_turn(flown):
 def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
     folder = flown[0]
     code, _, err = chain(
-        folder, "--dt", 0.1, "--offset", "yaw=1", "--duration", 60, "-o", "d.npz", file="flown.mat"
+        folder,
+        "--sample",
+        0.1,
+        "--offset",
+        "yaw=1",
+        "--duration",
+        60,
+        "-o",
+        "d.npz",
+        file="flown.mat",
     )
     assert (code, err) == (0, "")
     motion = fflin.Motion.load(folder / "d.npz")
@@ -186,7 +195,7 @@ def test_gains_of_another_robot_are_refused(flown):
     assert "--trajectory" in refused("simulate", "ets_vii", "--offset", "yaw=1")
 
 
-@pytest.mark.parametrize("options", [(), ("--dt", "0.1")])
+@pytest.mark.parametrize("options", [(), ("--sample", "0.1")])
 def test_a_gain_from_a_file_regulates_as_the_one_that_is_designed(tmp_path, options):
     lqr = ("lqr", "ets_vii", "--joint", "joint_1=0.5", "--weights", "identity", *options)
     assert run(*lqr, "-o", "gain.npz", cwd=tmp_path)[0] == 0

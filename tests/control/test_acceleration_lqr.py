@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.control.riccati import solve
+from fflin.control.optimal.riccati import solve
 from tests.support.robots import BUNDLED, random_point
 
 # The spacecraft of Yang (2012), section 7 of the specification.

@@ -290,7 +290,7 @@ def test_a_gain_that_bears_little_is_warned_of_wherever_it_is_shown():
     assert says(shown, "warning: ") and says(shown, "diagonal R")
     assert "warning" not in str(fflin.lqr(lin))
     options = ("--weights", "identity", "--r", "tau_b=1e-9", "--r", "F_b=1e-9", "--r", "tau_m=1e-9")
-    command = [sys.executable, "-m", "fflin", "lqr", "ets_vii", "--dt", "0.5", *options]
+    command = [sys.executable, "-m", "fflin", "lqr", "ets_vii", "--sample", "0.5", *options]
     done = finished(command, capture_output=True, text=True, check=True)
     out, err = done.stdout, done.stderr
     told = [line for line in err.splitlines() if "disk margin" in line]

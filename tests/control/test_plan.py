@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.control.shooting import Shooting
+from fflin.control.optimal.shooting import Shooting
 from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
 
@@ -190,7 +190,7 @@ def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monke
     """Of a motion whose limits hold at knots alone: with a warning, unless that much is allowed."""
     robot, goal = one_joint
     options = {"knots": 6, "hold": "linear", "limits": SPEEDS}
-    monkeypatch.setattr("fflin.control.plan_search._LIMITED", np.inf)
+    monkeypatch.setattr("fflin.control.optimal.plan_search._LIMITED", np.inf)
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.1)
     motion = fflin.plan(robot, (goal, None), 10.0, **options)
     found = re.search(

@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import linprog, lsq_linear
 
 from fflin.control.policies import gives_every_wrench, nearest
+from fflin.kernel import allocation
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -31,6 +32,18 @@ def test_of_all_that_do_the_same_it_is_the_least():
     u = nearest(np.ones((1, 4)), np.array([2.0]), np.zeros(4), np.full(4, np.inf))
     assert u == pytest.approx([0.5] * 4, abs=1e-9)
     assert not nearest(np.ones((2, 3)), np.zeros(2), np.zeros(3), np.ones(3)).any()
+
+
+def test_an_input_that_leaves_its_bound_adds_one_column_to_the_factor(monkeypatch):
+    added = []
+    whole = allocation._orthogonalise
+    monkeypatch.setattr(
+        allocation, "_orthogonalise", lambda *given: added.append(given[2]) or whole(*given)
+    )
+    wanted = np.arange(1.0, 7.0)  # the last thruster leaves its bound first
+    u = nearest(np.eye(6), wanted, np.zeros(6), np.full(6, np.inf))
+    assert u == pytest.approx(wanted, rel=1e-12)
+    assert added == [0, 1, 2, 3, 4, 5]
 
 
 def test_thrusters_that_push_every_way():

@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg as sl
 
 import fflin
-from fflin.control.riccati import (
+from fflin.control.optimal.riccati import (
     ModalMatrix,
     Riccati,
     _bilinear,

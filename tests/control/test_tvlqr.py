@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.control.differential_riccati import Coefficients, Passage, passage, solve_back
+from fflin.control.optimal.differential_riccati import Coefficients, Passage, passage, solve_back
 from fflin.linear.sampling import GAUSS
 from tests.support.messages import says
 from tests.support.motions import motion

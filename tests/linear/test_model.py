@@ -3,7 +3,7 @@
 import copy
 import pickle
 import sys
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pinocchio as pin
@@ -101,3 +101,12 @@ def test_what_is_made_when_asked_for_survives_copies_and_pickles(robots):
         assert lin.reference.translation == pytest.approx([1.0, 2.0, 3.0])
         with pytest.raises(AttributeError, match="'x1'"):
             lin.x1  # noqa: B018 - the access raises
+
+
+def test_a_changed_model_copies_the_array_that_it_is_given(rest):
+    A = rest.A.copy()
+    changed = replace(rest, A=A)
+    A[0, 0] = 7.0
+    assert changed.A[0, 0] == rest.A[0, 0] and not changed.A.flags.writeable
+    with pytest.raises(FrozenInstanceError):
+        changed.A = A

@@ -10,7 +10,7 @@ import fflin
 from fflin.base.rotation import skew
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Standing
-from fflin.dynamics.rnea import Accelerations, Rates
+from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.linear.state_equations import assemble, at_rest
 from tests.support.robots import random_point, random_pose
 
@@ -49,7 +49,9 @@ def assembled(state, actuation, chart, nu, u, rates, moving):
     A = np.zeros((*nu.shape[:-1], state.nx, state.nx))
     A[:] = at_rest(state)
     A[..., state.nx // 2 :, :] = rates.slopes
-    own = Rates(rates.c, A[..., state.nx // 2 :, :], rates.by_u.copy(), rates.gravity)
+    own = AccelerationDerivatives(
+        rates.c, A[..., state.nx // 2 :, :], rates.by_u.copy(), rates.gravity
+    )
     f0 = assemble(state, actuation, chart, nu, u, own, A, moving=moving)
     return A, own.by_u, f0
 
@@ -58,7 +60,7 @@ def assembled(state, actuation, chart, nu, u, rates, moving):
 def test_many_rows_are_the_same_as_one_after_the_other(robots, frame, own, moving, fields):
     robot = robots["planar_detumble"].replace(**fields)
     state, actuation, (chart, nu, u, rates), points = rows_of(robot, frame, own)
-    many = Rates(*(np.array(part) for part in zip(*rates, strict=True)))
+    many = AccelerationDerivatives(*(np.array(part) for part in zip(*rates, strict=True)))
     found = assembled(state, actuation, chart, nu, u, many, moving)
     for row, point in enumerate(points):
         for all_rows, one in zip(found, assembled(state, actuation, *point, moving), strict=True):

@@ -6,7 +6,8 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
-from fflin.view.playback import play_back, thrusters
+from fflin.view.equipment import thrusters
+from fflin.view.playback import play_back
 from tests.support.robots import random_point, random_pose
 
 FRAMES = ("hybrid", "local", "world")

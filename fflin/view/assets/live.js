@@ -49,7 +49,7 @@ function makeSlider(parent, joint, long, send) {
   };
 }
 
-function makeLive({ viewer, aim, keepFramed, turn }, info) {
+function makeLive({ viewer, camera, turn }, info) {
   const panel = document.getElementById("panel");
   let socket = null;
   const send = (message) => { if (socket && socket.readyState === 1) socket.send(JSON.stringify(message)); };
@@ -65,11 +65,8 @@ function makeLive({ viewer, aim, keepFramed, turn }, info) {
   const long = info.joints.some((joint) => joint.name.length > 11); // than there is room for beside a slider
   const sliders = info.joints.map((joint) => makeSlider(panel, joint, long, send));
   const showHeat = makeHeatMap(panel, info.names);
-  info.triads.forEach((each, k) => viewer.scene_tree.find([...each.path, `frame ${k}`]).object.add(triad(each)));
+  const showEquipment = makeEquipment(viewer, info), showLink = makePicking(viewer, info);
   const nodes = info.bodies.map((path) => viewer.scene_tree.find(path).object);
-  const centre = yUp(info.centre);
-  const gone = new THREE.Vector3(); // how far the camera has followed
-  let last = null;
   const live = { ready: false, state: null, messages: 0 };
 
   const place = (node, pose) => {
@@ -83,15 +80,10 @@ function makeLive({ viewer, aim, keepFramed, turn }, info) {
     state.joints.forEach((x, k) => sliders[k](x));
     if (state.coupling) showHeat(state.coupling);
     document.querySelector("header p").textContent = state.time === null ? info.subtitle : `t = ${state.time.toFixed(2)} s`;
-    const base = yUp(state.poses[0]);
-    if (last) {
-      const shift = base.clone().sub(last);
-      centre.add(shift);
-      if (info.follow) { viewer.camera.position.add(shift); viewer.controls.target.add(shift); gone.add(shift.clone().applyQuaternion(upright.clone().invert())); }
-    }
-    last = base;
+    showEquipment();
+    showLink();
     turn(state.time ?? 0);
-    aim(centre);
+    camera.step();
     live.state = state;
     viewer.set_dirty();
   };
@@ -110,7 +102,8 @@ function makeLive({ viewer, aim, keepFramed, turn }, info) {
     };
     socket.onclose = () => { problem("The connection to fflin is lost; reconnecting."); setTimeout(connect, 1000); };
   };
-  keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y + gone.y, z + gone.z]), info.direction]);
+  makeKeys(viewKeys(camera, camera.setView));
+  camera.reframe();
   connect();
   return live;
 }

@@ -24,10 +24,12 @@ function extent(points) {
 
 // What is drawn beside the robot and can be seen; each can be switched off.
 function legendOf(info) {
-  const entry = (label, colour, ...path) => ({ label, colour, path: ["meshcat", ...path] });
+  const entry = (label, colour, ...path) => ({ label, colour, paths: [["meshcat", ...path]] });
   if (info.mode === "modes") return [entry("at rest", GHOST, "rest")];
   const entries = [
     ...info.trails.filter(({ points }) => extent(points) > 0.02 * info.size).map(({ name, colour }) => entry(`path of the ${name}`, colour, "trails", name)),
+    ...Object.entries({ wheel: WHEEL, nozzle: NOZZLE }).filter(([kind]) => info[`${kind}s`].length).map(([kind, colour]) => (
+      { label: kind === "wheel" ? "wheels" : "thrusters", colour, paths: info[`${kind}s`].map(({ path }, k) => [...path, `${kind} ${k}`]) })),
     ...info.arrows.map(({ kind, colour }) => entry(`${kind} on the base`, colour, "wrench", kind)),
   ];
   entries.push(...(info.cloud ?? []).map(({ name, label, colour }) => entry(label, colour, "cloud", name)));
@@ -43,7 +45,7 @@ function legendOf(info) {
 
 function makeLegend(viewer, entries) {
   const legend = document.getElementById("legend");
-  for (const { label, colour, path, strip, dashed } of entries) {
+  for (const { label, colour, paths = [], strip, dashed } of entries) {
     const row = document.createElement("label"), check = document.createElement("input");
     row.className = strip ? "strip" : "";
     const swatch = document.createElement("i");
@@ -52,7 +54,7 @@ function makeLegend(viewer, entries) {
     swatch.style.setProperty("--swatch", colour);
     swatch.className = dashed ? "dashed" : "";
     const set = () => {
-      if (path) viewer.set_property(path, "visible", check.checked);
+      for (const path of paths) viewer.set_property(path, "visible", check.checked);
       viewer.set_dirty();
     };
     check.addEventListener("change", set);
@@ -74,7 +76,7 @@ function main() {
     console.warn(error);
     return;
   }
-  const { viewer, aim, keepFramed, turn } = stage;
+  const { viewer, camera, turn } = stage;
   window.viewer = viewer;
   for (const command of info.commands) {
     try {
@@ -83,12 +85,6 @@ function main() {
       console.warn("a piece cannot be drawn:", error);
     }
   }
-  window.addEventListener("keydown", (event) => {
-    if (event.key === "g" && !event.target.matches("input, select, textarea")) {
-      document.body.classList.toggle("tree");
-      if (document.body.classList.contains("tree")) viewer.gui.open();
-    }
-  });
   if (info.mode === "live") {
     window.fflin = makeLive(stage, info);
     return;
@@ -113,48 +109,49 @@ function main() {
   const showMarks = makeMarks(viewer, info);
   const showFigures = makeReadouts(panel, info.readouts);
   const showPhase = makePhases(panel, info.phases, (time) => goTo(time));
-  const stamp = document.getElementById("stamp");
-  const base = viewer.scene_tree.find(info.base).object;
-  const centre = yUp(info.centre), last = new THREE.Vector3().copy(base.position);
-  const camera = viewer.camera, controls = viewer.controls;
-  const gone = new THREE.Vector3(); // how far the camera has followed
-  let follow = info.follow;
-  let plots = [];
+  const stamp = document.getElementById("stamp"), bar = document.getElementById("bar");
+  const showEquipment = makeEquipment(viewer, info), showLink = makePicking(viewer, info);
+  let charts = [];
   const player = makePlayer(viewer, info, (i, time) => {
     turn(time);
     showMarks(i);
+    showEquipment();
     showFigures(i);
+    showLink();
     stamp.textContent = `t = ${figure(time, 3)} s${showPhase(time)}`;
-    for (const show of plots) show(i, time);
-    const moved = base.position.clone().sub(last);
-    last.copy(base.position);
-    const shift = moved.clone().applyQuaternion(upright);
-    if (follow) { camera.position.add(shift); controls.target.add(shift); gone.add(moved); }
-    centre.add(shift);
-    aim(centre);
+    for (const show of charts) show(i, time);
+    camera.step();
   });
   const goTo = (time) => { player.pause(); player.seek(time); };
   makePassed(panel, info.passed, goTo);
   const marks = [...info.phases.slice(1).map(([, start]) => start), info.rest].filter((time) => time !== null);
-  plots = info.plots.map((plot) => makePlot(panel, info.t, plot, goTo, marks));
-  if (plots.length) makeSpan(panel, info.t);
+  const large = makeLarge(info, goTo, marks);
+  charts = [...info.plots.map((plot) => makePlot(panel, info.t, plot, goTo, marks, large.open)), large.show];
+  if (info.plots.length) makeSpan(panel, info.t);
   fitPlots(panel);
-  window.addEventListener("resize", () => { if (fitPlots(panel)) window.dispatchEvent(new Event("resize")); });
+  const again = () => window.dispatchEvent(new Event("resize"));
+  window.addEventListener("resize", () => { if (fitPlots(panel)) again(); });
   makeLegend(viewer, legendOf(info));
-  const button = document.createElement("button");
-  const press = () => button.setAttribute("aria-pressed", follow);
-  button.textContent = "follow";
-  button.title = "follow the base with the camera";
-  button.addEventListener("click", () => { follow = !follow; press(); });
-  press();
-  document.getElementById("bar").append(button);
+
+  const toggle = (text, title, pressed, act) => {
+    const button = element("button", { title }, text);
+    const press = (on) => { button.setAttribute("aria-pressed", on); act(on); };
+    button.addEventListener("click", () => press(button.getAttribute("aria-pressed") !== "true"));
+    button.setAttribute("aria-pressed", pressed);
+    bar.append(button);
+    return () => button.click();
+  };
+  const views = makeViews(bar, camera);
+  const follow = toggle("follow", "follow the base with the camera", camera.following(), camera.follow);
+  const fold = toggle("panel", "show or fold the panel", true, (on) => { document.body.classList.toggle("folded", !on); again(); });
+  makeHelpButton(bar, makeKeys([...player.keys, ...views, ["f", "F", "follow the base", follow], ["p", "P", "show or fold the panel", fold]]));
   player.seek(player.first);
-  keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y + gone.y, z + gone.z]), info.direction]);
+  camera.reframe();
   window.addEventListener("resize", () => requestAnimationFrame(() => player.seek(player.state.time)));
   const plain = (on, keyed) => {
     document.body.classList.toggle("plain", on);
     document.body.classList.toggle("keyed", Boolean(keyed));
-    window.dispatchEvent(new Event("resize"));
+    again();
   };
   window.fflin = { ...player, plain, plots: info.plots, ready: true };
   if (!/[#&]pause\b/.test(location.hash)) player.play();

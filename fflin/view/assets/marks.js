@@ -1,4 +1,4 @@
-// What is drawn about the robot: frames, trails, forces, torques and plumes of thrusters.
+// What is drawn about the robot: trails, forces, torques and plumes of thrusters.
 
 function flat(colour) {
   return new THREE.MeshBasicMaterial({ color: new THREE.Color(colour).convertSRGBToLinear(), toneMapped: false });
@@ -30,19 +30,6 @@ function seenThrough(colour) {
 }
 
 const UP = new THREE.Vector3(0, 1, 0);
-
-function triad({ length, position, quaternion }) {
-  const group = new THREE.Group();
-  [[0xff5a52, [1, 0, 0]], [0x5fd068, [0, 1, 0]], [0x4c8dff, [0, 0, 1]]].forEach(([colour, axis]) => {
-    const one = arrow(colour, 0.022 * length);
-    one.setLength(length);
-    one.quaternion.setFromUnitVectors(UP, new THREE.Vector3(...axis));
-    group.add(one);
-  });
-  group.position.set(...position);
-  group.quaternion.set(...quaternion);
-  return group;
-}
 
 // A tube along all of the path, of which as much is drawn as has been passed; or all, in dashes.
 function trail({ name, points, colour, radius, dashed }) {
@@ -228,7 +215,6 @@ function makeMarks(viewer, info) {
     viewer.scene_tree.find(path).object.add(mark);
     if (mark.show) shows.push(mark.show);
   };
-  info.triads.forEach((each, k) => add([...each.path, `frame ${k}`], triad(each)));
   info.trails.forEach((each) => add(["meshcat", "trails", each.name], trail(each)));
   info.followed.forEach((each, k) => add(["meshcat", "target", `path ${k}`], trail({ ...each, colour: GHOST, dashed: true })));
   (info.cloud ?? []).forEach((each) => add(["meshcat", "cloud", each.name], cloud(each)));

@@ -10,11 +10,11 @@ function nameOf({ energy }) {
   return second && energy[1][1] > 0.5 * energy[0][1] ? `${first}, ${second}` : first;
 }
 
-function makeModes({ viewer, aim, keepFramed }, info) {
+function makeModes({ viewer, camera }, info) {
   const panel = document.getElementById("panel"), bar = document.getElementById("bar");
   const nodes = info.bodies.map((path) => viewer.scene_tree.find(path).object), n = nodes.length;
   info.modes.forEach((mode) => { mode.poses = floats(mode.poses); });
-  info.triads.forEach((each, k) => viewer.scene_tree.find([...each.path, `frame ${k}`]).object.add(triad(each)));
+  makeEquipment(viewer, info)();
 
   const list = document.createElement("div"), shape = document.createElement("div");
   const head = document.createElement("div");
@@ -85,15 +85,17 @@ function makeModes({ viewer, aim, keepFramed }, info) {
   };
   button.addEventListener("click", () => (state.playing ? pause() : play()));
   slider.addEventListener("input", () => { pause(); seek(Number(slider.value)); });
-  window.addEventListener("keydown", (event) => {
-    if (event.target.matches("input")) return;
-    const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
-    if (step) { event.preventDefault(); pick(state.mode + step); }
-    else if (event.key === " " && !event.target.matches("button")) { event.preventDefault(); state.playing ? pause() : play(); }
-  });
+  makePicking(viewer, info);
+  const views = makeViews(bar, camera);
+  makeHelpButton(bar, makeKeys([
+    [" ", "space", "play or pause", () => (state.playing ? pause() : play())],
+    ["ArrowDown", "↓", "next mode", () => pick(state.mode + 1)],
+    ["ArrowUp", "↑", "mode before", () => pick(state.mode - 1)],
+    ...views,
+  ]));
   mark();
   pick(0);
-  aim(yUp(info.centre));
-  keepFramed(() => [info.points, info.direction]);
+  camera.step();
+  camera.reframe();
   return { seek, pick, play, pause, state, ready: true };
 }

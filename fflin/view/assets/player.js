@@ -68,15 +68,14 @@ function makePlayer(viewer, info, onTime) {
   slider.addEventListener("input", () => { pause(); seek(slider.value); });
   button.addEventListener("click", () => (state.playing ? pause() : play()));
   speeds.addEventListener("change", () => setSpeed(speeds.value));
-  window.addEventListener("keydown", (event) => {
-    if (event.target.matches("input, select, button, textarea")) return;
-    const step = (last - first) / 100;
-    if (event.key === " ") { event.preventDefault(); state.playing ? pause() : play(); }
-    else if (event.key === "ArrowRight") { pause(); seek(state.time + step); }
-    else if (event.key === "ArrowLeft") { pause(); seek(state.time - step); }
-    else if (event.key === "Home") seek(first);
-    else if (event.key === "End") seek(last);
-  });
+  const step = (share) => { pause(); seek(state.time + share * (last - first)); };
+  const keys = [
+    [" ", "space", "play or pause", () => (state.playing ? pause() : play())],
+    ["ArrowRight", "→", "a hundredth on", () => step(0.01)],
+    ["ArrowLeft", "←", "a hundredth back", () => step(-0.01)],
+    ["Home", "Home", "to the start", () => seek(first)],
+    ["End", "End", "to the end", () => seek(last)],
+  ];
   mark();
-  return { seek, play, pause, setSpeed, state, first, last };
+  return { seek, play, pause, setSpeed, state, first, last, keys };
 }

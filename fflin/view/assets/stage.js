@@ -1,11 +1,9 @@
-// The stage: meshcat's viewer with our light, sky and camera. The scene is z-up below a root that
+// The stage: meshcat's viewer with our light and sky. The scene is z-up below a root that
 // three.js turns to y-up: (x, y, z) of the scene is (x, z, -y) to the camera, or in orbit what its
 // `up` says.
 
 const upright = new THREE.Quaternion();
 const yUp = ([x, y, z]) => new THREE.Vector3(x, y, z).applyQuaternion(upright);
-
-const FIELD_OF_VIEW = 34;
 
 function makeStage(info) {
   const viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"), false);
@@ -61,86 +59,12 @@ function makeStage(info) {
   if (space) scene.add(stars);
   else viewer.scene_tree.find(["Floor"]).object.add(makeFloor(info));
 
-  const camera = viewer.camera;
-  camera.fov = FIELD_OF_VIEW;
-  camera.near = 0.01 * size;
-  camera.far = 400 * size;
-  const controls = viewer.controls;
-  controls.minDistance = 0.2 * size;
-  controls.maxDistance = 60 * size;
-  controls.enableDamping = false;
-
-  // The part of the window that the panels leave free.
-  const free = () => {
-    if (document.body.classList.contains("plain")) {
-      const legend = document.getElementById("legend").getBoundingClientRect();
-      return { right: 0, top: 30, bottom: legend.height + 16 };
-    }
-    const panel = document.getElementById("panel").getBoundingClientRect();
-    const bar = document.getElementById("bar").getBoundingClientRect();
-    const w = window.innerWidth, h = window.innerHeight;
-    const bottom = bar.height ? h - bar.top : 70;
-    if (!panel.width) return { right: 0, top: 40, bottom };
-    if (panel.width < 0.6 * w) return { right: w - panel.left, top: 40, bottom };
-    // In a narrow window the panel takes all of the width, above or below.
-    return panel.top < 0.3 * h ? { right: 0, top: panel.bottom, bottom } : { right: 0, top: 60, bottom: h - panel.top };
-  };
-  const resize = () => {
-    viewer.set_3d_pane_size();
-    const { right, top, bottom } = free();
-    const w = window.innerWidth, h = window.innerHeight;
-    camera.setViewOffset(w, h, right / 2, (bottom - top) / 2, w, h);
-    viewer.set_dirty();
-  };
-  // Until somebody takes the camera, it frames the robot anew in every window.
-  let taken = false, framed = null;
-  const before = new THREE.Vector3();
-  controls.addEventListener("start", () => before.copy(camera.position));
-  controls.addEventListener("end", () => { taken ||= !before.equals(camera.position); });
-  window.addEventListener("resize", () => {
-    resize();
-    if (framed && !taken) frame(...framed());
-  });
-  const keepFramed = (what) => { framed = what; frame(...what()); };
-
-  // Stand back along a direction until every point lies within the free part of the window.
-  const frame = (points, direction) => {
-    resize();
-    const { right, top, bottom } = free();
-    const back = yUp(direction).normalize();
-    const side = new THREE.Vector3(0, 1, 0).cross(back).normalize();
-    const up = back.clone().cross(side);
-    const tall = Math.tan((FIELD_OF_VIEW / 2) * (Math.PI / 180));
-    const h = window.innerHeight, w = window.innerWidth;
-    const ty = (tall * Math.max(h - top - bottom, 0.2 * h)) / h * 0.90, tx = (tall * Math.max(w - right, 0.4 * w)) / h * 0.90;
-    const seen = points.map(yUp).map((p) => [p.dot(side), p.dot(up), p.dot(back)]);
-    const middle = (k) => (Math.min(...seen.map((p) => p[k])) + Math.max(...seen.map((p) => p[k]))) / 2;
-    let centre = [middle(0), middle(1), middle(2)], distance = 0;
-    for (let round = 0; round < 8; round++) {
-      distance = 0;
-      for (const p of seen) {
-        const z = p[2] - centre[2];
-        distance = Math.max(distance, z + Math.abs(p[0] - centre[0]) / tx, z + Math.abs(p[1] - centre[1]) / ty);
-      }
-      // Perspective shifts what is near; centre what is seen.
-      const shift = [0, 1].map((k) => {
-        const angles = seen.map((p) => (p[k] - centre[k]) / (distance - (p[2] - centre[2])));
-        return ((Math.min(...angles) + Math.max(...angles)) / 2) * distance;
-      });
-      centre = [centre[0] + 0.7 * shift[0], centre[1] + 0.7 * shift[1], centre[2]];
-    }
-    const target = new THREE.Vector3().addScaledVector(side, centre[0]).addScaledVector(up, centre[1]).addScaledVector(back, centre[2]);
-    controls.target.copy(target);
-    camera.position.copy(target).addScaledVector(back, distance);
-    controls.update();
-    viewer.set_dirty();
-  };
   // What comes from Python is dressed on its way in.
   const setObject = viewer.set_object.bind(viewer);
   viewer.set_object = (path, object) => { object.traverse(dress); setObject(path, object); };
   aim(new THREE.Vector3());
   viewer.animate();
-  return { viewer, aim, keepFramed, turn };
+  return { viewer, turn, camera: makeCamera(viewer, info, aim) };
 }
 
 function makeFloor(info) {

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.control.shooting import Point, Shooting
-from fflin.control.stage_qp import StageQP, StageRows
+from fflin.control.optimal.shooting import Point, Shooting
+from fflin.control.optimal.stage_qp import StageQP, StageRows
 from fflin.dynamics.state import StateMap
 
 # The goal and the limits are sought to this accuracy in rad, m and s.

@@ -1,0 +1,63 @@
+// What is fixed to the robot's bodies and has no shape in its URDF: axes, thrusters and wheels.
+
+const NOZZLE = "#c9d2e0", WHEEL = "#8fe0ff";
+
+function triad({ length, position, quaternion }) {
+  const group = new THREE.Group();
+  [[0xff5a52, [1, 0, 0]], [0x5fd068, [0, 1, 0]], [0x4c8dff, [0, 0, 1]]].forEach(([colour, axis]) => {
+    const one = arrow(colour, 0.022 * length);
+    one.setLength(length);
+    one.quaternion.setFromUnitVectors(UP, new THREE.Vector3(...axis));
+    group.add(one);
+  });
+  group.position.set(...position);
+  group.quaternion.set(...quaternion);
+  return group;
+}
+
+// A bell that opens against the push.
+function nozzle({ position, direction }, size) {
+  const length = 0.035 * size;
+  const material = once("nozzle", () => new THREE.MeshStandardMaterial({ color: NOZZLE, metalness: 0.8, roughness: 0.35, side: THREE.DoubleSide }));
+  const bell = new THREE.Mesh(new THREE.CylinderGeometry(0.3 * length, 0.6 * length, length, 24, 1, true).translate(0, -length / 2, 0), material);
+  bell.castShadow = true;
+  const group = new THREE.Group();
+  group.add(bell);
+  group.position.set(...position);
+  group.quaternion.setFromUnitVectors(UP, new THREE.Vector3(...direction));
+  return group;
+}
+
+// A rim with spokes about z, seen through the body; it turns as the wheel does, if that is a state.
+function wheel({ position, quaternion, spins, path }, size, viewer) {
+  const radius = 0.05 * size, material = seenThrough(WHEEL);
+  material.opacity = 0.7;
+  const group = new THREE.Group(), thin = 0.08 * radius;
+  group.add(new THREE.Mesh(new THREE.TorusGeometry(radius, 1.5 * thin, 10, 40), material));
+  for (const angle of [0, 1, 2]) {
+    const spoke = new THREE.Mesh(new THREE.CylinderGeometry(thin, thin, 2 * radius, 8), material);
+    spoke.rotation.z = (angle * Math.PI) / 3;
+    group.add(spoke);
+  }
+  group.children.forEach((each) => { each.renderOrder = 5; });
+  group.position.set(...position);
+  group.quaternion.set(...quaternion);
+  if (spins) {
+    const [carrier, rotor] = [path, spins].map((each) => viewer.scene_tree.find(each).object);
+    group.show = () => group.quaternion.copy(carrier.quaternion).invert().multiply(rotor.quaternion);
+  }
+  return group;
+}
+
+// Put the equipment on the robot. Returns what shows it at the poses that the bodies have.
+function makeEquipment(viewer, info) {
+  const shows = [];
+  const add = (each, name, mark) => {
+    viewer.scene_tree.find([...each.path, name]).object.add(mark);
+    if (mark.show) shows.push(mark.show);
+  };
+  info.triads.forEach((each, k) => add(each, `frame ${k}`, triad(each)));
+  info.nozzles.forEach((each, k) => add(each, `nozzle ${k}`, nozzle(each, info.size)));
+  info.wheels.forEach((each, k) => add(each, `wheel ${k}`, wheel(each, info.size, viewer)));
+  return () => shows.forEach((show) => show());
+}

@@ -1,0 +1,90 @@
+"""The commands plan and equilibrium, simulate --mpc, and the names of the two time steps."""
+
+import json
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.support.commands import refused, run
+
+ROBOT = "planar_detumble"
+
+
+def test_a_plan_is_followed(tmp_path):
+    command = ("plan", ROBOT, "--target-joint", "joint_1=0.3", "--duration", 20, "--knots", 21)
+    code, out, _ = run(*command, "--limit", "tau_m=0.5", "-o", "p.npz", cwd=tmp_path)
+    assert code == 0 and "wrote p.npz" in out
+    robot = fflin.load(ROBOT)
+    motion = fflin.Trajectory.load(tmp_path / "p.npz", robot)
+    end = fflin.configuration(robot, {"joint_1": 0.3})
+    assert np.abs(motion.q[0] - robot.neutral()).max() < 1e-9
+    assert np.abs(motion.q[-1] - end).max() < 1e-6
+    assert motion.residual.max() < 1e-5 and np.abs(motion.u[:, 6:]).max() <= 0.5 + 1e-9
+    flown = run("simulate", ROBOT, "--trajectory", "p.npz", "-o", "m.npz", cwd=tmp_path)
+    assert flown[0] == 0
+    # One percent of the displacement.
+    assert np.abs(fflin.Motion.load(tmp_path / "m.npz").q[-1] - end).max() < 0.003
+    assert "--duration" in refused("plan", ROBOT)
+
+
+def test_an_equilibrium_has_its_inputs_and_its_stability(tmp_path):
+    spring = ("--stiffness", "joint_1=3", "--joint", "joint_1=0.2")
+    code, out, _ = run("equilibrium", ROBOT, *spring, "-o", "e.json", cwd=tmp_path)
+    assert code == 0 and "marginally stable" in out and "tau_m.joint_1 = 0.6 N m" in out
+    saved = json.loads((tmp_path / "e.json").read_text())
+    robot = fflin.load(ROBOT, stiffness={"joint_1": 3.0})
+    held = fflin.equilibrium(robot, fflin.configuration(robot, {"joint_1": 0.2}))
+    assert np.abs(saved["u"] - held.u).max() < 1e-9 and np.abs(saved["q"] - held.q).max() < 1e-9
+    circle = fflin.load("cubesat", orbit=fflin.CircularOrbit(400e3))
+    found = fflin.relative_equilibria(circle)
+    k = next(k for k, each in enumerate(found) if each.stable is False)
+    orbit = ("--orbit", 400e3, "--relative-equilibrium", k + 1)
+    said = json.loads(run("equilibrium", "cubesat", *orbit, "--json")[1])
+    assert said["stability"] == "unstable"
+    assert said["largest_real_part"] == pytest.approx(found[k].poles.real.max(), rel=1e-6)
+    assert "--effort" in refused("equilibrium", ROBOT, "--effort", "tau_m.joint_1=1")
+
+
+def test_predictive_control_keeps_the_limits(tmp_path):
+    command = ("simulate", ROBOT, "--joint", "joint_1=0.3", "--duration", 4, "--dt", 0.05)
+    mpc = ("--mpc", "--sample", 0.2, "--horizon", 10, "--limit", "tau_m=0.1")
+    code, *_ = run(*command, *mpc, "-o", "m.npz", cwd=tmp_path)
+    motion, robot = fflin.Motion.load(tmp_path / "m.npz"), fflin.load(ROBOT)
+    lin, limits = fflin.linearize(robot), ["urdf", {"tau_m": 0.1}]
+    policy = fflin.mpc(lin, dt=0.2, horizon=10, limits=limits)
+    q0 = fflin.configuration(robot, {"joint_1": 0.3})
+    there = fflin.simulate(robot, policy, q0=q0, duration=4.0, dt=0.05, limits=limits)
+    assert code == 0 and np.abs(motion.u - there.u).max() < 1e-9
+    assert 0.1 - 1e-6 < np.abs(motion.u[:, 6:]).max() <= 0.1 + 1e-9
+    assert "--sample" in refused(*command, "--mpc")
+    assert "--allocate" in refused(*command, *mpc, "--allocate")
+
+
+def test_the_former_names_of_the_time_steps_still_work(tmp_path, capsys):
+    def x(*words):
+        assert (
+            run(
+                "simulate",
+                ROBOT,
+                "--rpy",
+                0,
+                0,
+                5,
+                "--duration",
+                1,
+                *words,
+                "-o",
+                "m.npz",
+                "--force",
+                cwd=tmp_path,
+            )[0]
+            == 0
+        )
+        return fflin.Motion.load(tmp_path / "m.npz").x
+
+    new, former = x("--sample", 0.1, "--dt", 0.02), x("--dt", 0.1, "--step", 0.02)
+    assert np.array_equal(new, former) and not np.array_equal(new, x("--dt", 0.02))
+    assert np.array_equal(x("--dt", 0.02), x("--step", 0.02))
+    gains = [json.loads(run("lqr", ROBOT, name, 0.1, "--json")[1]) for name in ("--dt", "--sample")]
+    assert gains[0] == gains[1] and gains[0]["dt"] == 0.1
