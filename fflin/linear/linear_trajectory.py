@@ -245,7 +245,9 @@ def along(motion: Trajectory) -> LinearTrajectory:
     linearizer = Linearizer(motion.robot, moving=True)
     found: dict[str, Any] = motion._given | linearizer.along(motion.q, motion.v, motion.u_base)
     names = ("state_names", "input_names", "output_names")
-    return LinearTrajectory(**found, **{key: linearizer.prepared.common[key] for key in names})
+    made = LinearTrajectory(**found, **{key: linearizer.prepared.common[key] for key in names})
+    object.__setattr__(made, "flow", motion.flow)  # what it has found of the same motion
+    return made
 
 
 # Steps are halved until the transition of a sample is this accurate.
