@@ -14,7 +14,7 @@ _PUBLIC = {
         "robot.catalog": ["list_robots"],
         "robot.robot": ["Robot"],
         "robot.orbit": ["CircularOrbit"],
-        "robot.appendages": ["FlexibleAppendage", "Slosh"],
+        "robot.equipment.appendages": ["FlexibleAppendage", "Slosh"],
         "dynamics.points": ["configuration", "velocity", "effort"],
         "dynamics.impact": ["capture", "Capture", "jam", "Impact"],
     },

@@ -18,7 +18,7 @@ from fflin.base.validation import Array, FrozenArrays, instance
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
-from fflin.robot.appendage_bodies import effective_shares
+from fflin.robot.equipment.appendage_bodies import effective_shares
 from fflin.robot.joints import ROOT
 
 if TYPE_CHECKING:

@@ -57,6 +57,15 @@ def number(name: str, value: Any) -> float:
     return result
 
 
+def positive(name: str, value: Any, unit: str = "", hint: str = "") -> float:
+    """Return a number above 0, or raise `InputError`."""
+    found = number(name, value)
+    if found <= 0.0:
+        shown = f"{found:g} {unit}".rstrip()
+        raise InputError(f"{name} is {shown}, expected more than 0{hint}")
+    return found
+
+
 def share(name: str, value: Any) -> float:
     """Return a number between 0 and 1, or raise `InputError`."""
     found = number(name, value)

@@ -187,7 +187,7 @@ def _entries(path: Path) -> tuple[set[str], str]:
     if path.suffix == ".csv":
         with path.open(encoding="utf-8") as file:
             names = {*file.readline().strip().split(",")}
-        return names, "Motion" if {"t", "q_b.x"} <= names else ""
+        return names, "Motion" if {"t [s]", "q_b.x"} <= names else ""
     if path.suffix == ".h5":
         from fflin.batch.files import hdf5
 

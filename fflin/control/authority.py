@@ -12,10 +12,10 @@ from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
+from fflin.robot.equipment.wheels import carrier
 from fflin.robot.inputs import named_wheels
 from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
-from fflin.robot.wheels import carrier
 
 _FACETS = 20_000  # normals that are computed at once
 _MANY = 36  # thrusters, which have 400 000 facets

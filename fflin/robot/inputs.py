@@ -10,7 +10,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, dimension, number, refuse_masked, truth
+from fflin.base.validation import Array, dimension, number, positive, refuse_masked, truth
 
 Vector3: TypeAlias = Sequence[float]
 
@@ -200,7 +200,7 @@ class Thruster(WrenchInput):
                 "of a pulse, and leave min out"
             )
         if (impulse := self.least_impulse) is not None:
-            self._set("least_impulse", _positive("thruster least_impulse", impulse, "N s"))
+            self._set("least_impulse", positive("thruster least_impulse", impulse, "N s"))
         self._set("position", three_numbers("thruster position", self.position))
         self._set(
             "direction",
@@ -272,7 +272,7 @@ class ReactionWheel(WrenchInput):
         self._set("axis", unit_vector("wheel axis", self.axis, "the direction it turns about"))
         self._set("momentum", number("wheel momentum", self.momentum))
         if self.max_speed is not None:
-            speed = _positive("wheel max_speed", self.max_speed, "rad/s")
+            speed = positive("wheel max_speed", self.max_speed, "rad/s")
             self._set("max_speed", speed)
             if self.inertia is None:
                 raise InputError(
@@ -282,7 +282,7 @@ class ReactionWheel(WrenchInput):
         if self.inertia is None:
             return
         hint = "; leave it out to model the wheel by its momentum alone"
-        inertia = _positive("wheel inertia", self.inertia, "kg m^2", hint)
+        inertia = positive("wheel inertia", self.inertia, "kg m^2", hint)
         if self.momentum:
             raise InputError(
                 "wheel momentum is given together with an inertia, which makes its speed a state; "
@@ -309,13 +309,6 @@ def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
     if not math.isfinite(x + y + z):
         raise InputError(f"{what} is {value!r}, expected finite numbers")
     return x, y, z
-
-
-def _positive(what: str, value: float, unit: str, hint: str = "") -> float:
-    size = number(what, value)
-    if size <= 0.0:
-        raise InputError(f"{what} is {size:g} {unit}, expected more than 0{hint}")
-    return size
 
 
 def unit_vector(what: str, value: Vector3, hint: str) -> tuple[float, float, float]:

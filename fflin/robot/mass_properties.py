@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, listed, unknown
 from fflin.base.names import by_name
-from fflin.base.validation import Array, as_double, number, vector, whole
+from fflin.base.validation import Array, as_double, number, positive, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.urdf.links import TRIANGLE_SLACK, Link, is_impossible
@@ -69,9 +69,7 @@ def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
     for key in value:
         if key not in _KEYS:
             raise unknown("mass property", key, _KEYS)
-    mass = number(f"mass {of}", value.get("mass", old.mass))
-    if "mass" in value and not mass > 0.0:
-        raise InputError(f"mass {of} is {mass:g} kg, expected more than 0")
+    mass = positive(f"mass {of}", value["mass"], "kg") if "mass" in value else old.mass
     com = vector(f"com {of}", value.get("com", old.lever), 3, "a point in the body's frame")
     if "inertia" not in value:
         return pin.Inertia(mass, com, old.inertia * (mass / old.mass if old.mass else 1.0))

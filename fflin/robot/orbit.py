@@ -10,7 +10,7 @@ from dataclasses import KW_ONLY, asdict, dataclass
 from typing import Any
 
 from fflin.base.errors import FflinWarning, InputError, unknown
-from fflin.base.validation import number
+from fflin.base.validation import number, positive
 
 # Gravitational parameter [m^3/s^2] and equatorial radius [m]: JPL DE440, IAU 2015.
 BODIES = {
@@ -111,13 +111,13 @@ class CircularOrbit:
         mu, ground = (
             BODIES[self.body]
             if self.mu is None
-            else (_positive(name, x) for name, x in zip(("mu", "body_radius"), size, strict=True))
+            else (positive(name, x) for name, x in zip(("mu", "body_radius"), size, strict=True))
         )
         n = self.mean_motion
         if self.altitude is not None:
             altitude = number("altitude", self.altitude)
         else:
-            n = _positive("mean_motion", n)
+            n = positive("mean_motion", n)
             altitude = (mu / n) ** (1.0 / 3.0) / n ** (1.0 / 3.0) - ground
         if not 0.0 < altitude < 1e15:
             raise InputError(
@@ -160,7 +160,7 @@ class CircularOrbit:
         parts = json.loads(text)
         n = parts.pop("mean_motion")
         orbit = cls(**parts)
-        object.__setattr__(orbit, "mean_motion", _positive("mean_motion", n))
+        object.__setattr__(orbit, "mean_motion", positive("mean_motion", n))
         return orbit
 
     def __str__(self) -> str:
@@ -180,10 +180,3 @@ def checked_orbit(value: Any) -> CircularOrbit | None:
         if name not in CircularOrbit.__dataclass_fields__:
             raise unknown("part of orbit", name, CircularOrbit.__dataclass_fields__)
     return CircularOrbit(**value)
-
-
-def _positive(name: str, value: Any) -> float:
-    found = number(name, value)
-    if not found > 0.0:
-        raise InputError(f"{name} is {found:g}, expected more than 0")
-    return found

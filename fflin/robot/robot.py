@@ -14,8 +14,10 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array
-from fflin.robot.appendages import Appendage
-from fflin.robot.equipment import with_appendages, with_inputs
+from fflin.robot.equipment.appendages import Appendage
+from fflin.robot.equipment.assembly import with_appendages, with_inputs
+from fflin.robot.equipment.mounting import difference
+from fflin.robot.equipment.wheels import stored_momentum
 from fflin.robot.fields import Range, Scope, checked_fields, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
@@ -26,10 +28,8 @@ from fflin.robot.mass_properties import (
     pieces_of,
     random_bodies,
 )
-from fflin.robot.mounting import difference
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.outputs import FullState, Output
-from fflin.robot.wheels import stored_momentum
 
 
 class Springs(NamedTuple):

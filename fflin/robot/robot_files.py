@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields, replace
 from inspect import signature
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
 from fflin.base.names import stands_for_any
 from fflin.base.toml_file import NAME, NUMBER, NUMBERS, TRUTH, VECTOR, Kind, TomlFile, flat
-from fflin.robot.appendages import Appendage, FlexibleAppendage, Slosh
 from fflin.robot.catalog import find_inputs, find_robot
+from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
 from fflin.robot.fields import FIELDS, Field
 from fflin.robot.inputs import KINDS, Input, Vector3
 from fflin.robot.outputs import parse_output
@@ -255,9 +255,7 @@ def check_keys(document: TomlFile) -> None:
 
 def read_inputs(document: TomlFile) -> tuple[Input, ...]:
     """Return the inputs of a file, as `load_inputs` does."""
-    tables = document.record.get("input", [])
-    if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
-        raise document.error("input is not an array of tables; write [[input]]", "input")
+    tables = _tables(document, "input")
     if not tables:
         message = "the file holds no inputs; write [[input]] and its type below"
         raise InputError(f"{document.path}: {message}")
@@ -285,33 +283,57 @@ def read_appendages(document: TomlFile) -> list[Appendage]:
     ):
         # Keys that only files of Nastran, or cylinders, have.
         alone = set(signature(special).parameters) - set(signature(make).parameters)
-        tables = document.record.get(key, [])
-        if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
-            raise document.error(f"{key} is not an array of tables; write [[{key}]]", key)
-        for index, table in enumerate(tables):
+        for index, table in enumerate(_tables(document, key)):
             build: Any = special if alone & set(table) else make
             of, place = f"{key} {index + 1}: ", (key, index)
             hidden = {"inertia"} if build is special else {"inertia", "rigid"}
-            known = {k: x for k, x in signature(build).parameters.items() if k not in hidden}
-            for name in table:
-                if name not in known:
-                    problem = unknown(
-                        f"key of {key}", name, dict.fromkeys((*known, *sorted(alone)))
-                    )
-                    raise document.error(problem, *place, name)
-            for name, parameter in known.items():
-                if parameter.default is parameter.empty and name not in table:
-                    raise document.error(f"{of}needs the key '{name}'; add it", *place)
+            required = {
+                name: parameter.default is parameter.empty
+                for name, parameter in signature(build).parameters.items()
+                if name not in hidden
+            }
             values = dict(table)
             for name in {"op4", "asm"} & set(values):
                 document.require(NAME, values[name], *place, name, of=f"{of}{name}")
                 values[name] = document.path.parent / values[name]
-            try:
-                found.append(build(**values))
-            except FflinError as error:
-                with document.located(*place):
-                    raise type(error)(f"{of}{error}") from None
+            also = (*required, *sorted(alone))
+            found.append(_built(document, place, f"key of {key}", build, values, required, also))
     return found
+
+
+def _tables(document: TomlFile, key: str) -> list[dict[str, Any]]:
+    """Return an array of tables of a file, empty if there is none."""
+    tables = document.record.get(key, [])
+    if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
+        raise document.error(f"{key} is not an array of tables; write [[{key}]]", key)
+    return tables
+
+
+def _built(
+    document: TomlFile,
+    place: tuple[str, int],
+    what: str,
+    build: Any,
+    values: dict[str, Any],
+    required: Mapping[str, bool],
+    known: Iterable[str],
+) -> Any:
+    """Build the object of a table, with file and line in front of errors.
+
+    `required` says of each key whether it must be given; `known` are the keys that a message lists.
+    """
+    of = f"{place[0]} {place[1] + 1}: "
+    for name in values:
+        if name not in required:
+            raise document.error(unknown(what, name, dict.fromkeys(known)), *place, name)
+    for name, needed in required.items():
+        if needed and name not in values:
+            raise document.error(f"{of}needs the key '{name}'; add it", *place)
+    try:
+        return build(**values)
+    except FflinError as error:
+        with document.located(*place):
+            raise type(error)(f"{of}{error}") from None
 
 
 def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
@@ -325,21 +347,18 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
         shown = kind if isinstance(kind, str) else reprlib.repr(kind)
         raise document.error(unknown("type of input", shown, _TYPES), *place, "type")
     by_keyword_last = sorted(fields(_TYPES[kind]), key=lambda field: field.kw_only is True)
-    known = {field.name: field for field in by_keyword_last}
+    required = {field.name: field.default is MISSING for field in by_keyword_last}
     values = {key: value for key, value in table.items() if key != "type"}
-    for key, value in values.items():
-        if key not in known:
-            problem = unknown(f"key of a {kind}", key, ("type", *known))
-            raise document.error(problem, *place, key)
-        expected = _KINDS[known[key].type]
-        if expected is NUMBERS and len(_TYPES[kind].ENTRIES) == 1:
-            expected = NUMBER
-        document.require(expected, value, *place, key, of=f"{of}{key}")
-    for key, field in known.items():
-        if field.default is MISSING and key not in values:
-            raise document.error(f"{of}a {kind} needs the key '{key}'; add it", *place)
-    try:
-        return _TYPES[kind](**values)
-    except InputError as error:
-        with document.located(*place):
-            raise InputError(f"{of}{error}") from None
+    for field in by_keyword_last:
+        if field.name in values:
+            expected = _KINDS[field.type]
+            if expected is NUMBERS and len(_TYPES[kind].ENTRIES) == 1:
+                expected = NUMBER
+            document.require(
+                expected, values[field.name], *place, field.name, of=f"{of}{field.name}"
+            )
+    known = ("type", *required)
+    built: Input = _built(
+        document, place, f"key of a {kind}", _TYPES[kind], values, required, known
+    )
+    return built

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from typing import Any
@@ -14,12 +14,12 @@ import pinocchio as pin
 from fflin.base.errors import InputError, unknown
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
-from fflin.robot.equipment import with_inputs
+from fflin.robot.equipment.assembly import with_inputs
+from fflin.robot.equipment.mounting import Mounted, carry_over, with_mounted
 from fflin.robot.inputs import ReactionWheel, named_inputs
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame
 from fflin.robot.mass_properties import LinkMass
 from fflin.robot.model_checks import joint_of
-from fflin.robot.mounting import carry_over
 from fflin.robot.outputs import JointOutput
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
@@ -203,28 +203,29 @@ def _joined(
     model: pin.Model, joint: int, other: pin.Model, placement: pin.SE3, prefix: str
 ) -> pin.Model:
     """Return the model, in whose tree the other's joints come after all that the joint carries."""
-    new = pin.Model()
-    new.name, new.gravity = model.name, model.gravity
-    moved, others = {0: 0}, dict[int, int]()
-    for of, index in _in_order(model, joint, other):
-        one, there = (model, moved) if of is model else (other, others)
-        on = there[one.parents[index]]
-        place, name = one.jointPlacements[index], one.names[index]
-        if of is other:
-            name = f"{prefix}.{name}"
-            place = placement * place if one.parents[index] == ROOT else place
-        there[index] = new.addJoint(on, one.joints[index], place, name)
-        new.appendBodyToJoint(there[index], one.inertias[index], pin.SE3.Identity())
-        if of is model and index == joint:
-            others[ROOT] = there[index]
-            new.appendBodyToJoint(there[index], other.inertias[ROOT], placement)
-    carry_over(model, new, moved)
+    bodies = model.inertias.tolist()
+    bodies[joint] = bodies[joint] + placement.act(other.inertias[ROOT])
+    names = [f"{prefix}.{name}" for name in other.names]
+    parts = []
+    for index in range(ROOT + 1, other.njoints):
+        parent, at = other.parents[index], other.jointPlacements[index]
+        on_root = parent == ROOT
+        moved = joint_of(other, index)._replace(name=names[index])
+        parts.append(
+            Mounted(
+                moved,
+                joint if on_root else names[parent],
+                placement * at if on_root else at,
+                other.joints[index],
+                other.inertias[index],
+            )
+        )
+    new = with_mounted(model, bodies, parts)
+    on = new.getJointId(model.names[joint])
+    others = {ROOT: on} | {
+        index: new.getJointId(names[index]) for index in range(ROOT + 1, other.njoints)
+    }
     carry_over(other, new, {index: at for index, at in others.items() if index > ROOT})
-    for frame in model.frames.tolist()[1:]:
-        copy = pin.Frame(frame)
-        copy.parentJoint = moved[frame.parentJoint]
-        new.addFrame(copy, False)
-    on = others[ROOT]
     new.addFrame(pin.Frame(prefix, on, placement, pin.FrameType.BODY), False)
     for frame in other.frames.tolist()[1:]:
         if frame.parentJoint >= ROOT:
@@ -235,14 +236,3 @@ def _joined(
                 copy.placement = placement * frame.placement
             new.addFrame(copy, False)
     return new
-
-
-def _in_order(
-    model: pin.Model, joint: int, other: pin.Model, root: int = ROOT
-) -> Iterator[tuple[pin.Model, int]]:
-    """Yield the joints depth first; the other model's joints follow all that hang on the joint."""
-    yield model, root
-    for child in model.children[root]:
-        yield from _in_order(model, joint, other, child)
-    if root == joint:
-        yield from ((other, index) for index in range(ROOT + 1, other.njoints))

@@ -31,6 +31,7 @@ _CHARTS: tuple[dict[tuple[str, str], str], ...] = (
     {
         ("q_m", "rad"): "joints",
         ("q_m", "m"): "prismatic joints",
+        ("q_m", "kg^0.5 m"): "modal amplitudes",
         ("qdot_m", "rad/s"): "joint rates",
         ("qdot_m", "m/s"): "prismatic joint rates",
         ("tau_m", "N m"): "joint torques",

@@ -19,6 +19,7 @@ from fflin.robot.joints import ROOT, find_frame, find_joint, frame_index
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.plant import Plant
+from fflin.view.bending import bendings
 
 # Steps of the way on which a payload came: at most so long [s], and so much of its swing [rad].
 _STEP, _SWING = 0.05, 0.3
@@ -69,9 +70,15 @@ def default_tool(robot: Robot) -> str | None:
 
 
 def body_poses(robot: Robot, data: pin.Data, q: Array) -> Array:
-    """Return the pose (njoints - 1, 7) of every joint's frame at q (nq,)."""
+    """Return the pose (njoints - 1, 7) of every joint's frame at q (nq,).
+
+    The pose of the first mode of a flexible appendage is that of its bent frame.
+    """
     pin.forwardKinematics(robot.model, data, q)
-    return np.array([pin.SE3ToXYZQUAT(placement) for placement in data.oMi.tolist()[ROOT:]])
+    poses = np.array([pin.SE3ToXYZQUAT(placement) for placement in data.oMi.tolist()[ROOT:]])
+    for bending in bendings(robot).values() if robot.appendages else ():
+        poses[bending.node - ROOT] = pin.SE3ToXYZQUAT(bending.placement(data, q))
+    return poses
 
 
 def play_back(

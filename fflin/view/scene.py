@@ -15,6 +15,7 @@ import umsgpack
 from fflin.base.validation import Array
 from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
+from fflin.view.bending import bendings
 from fflin.view.meshes import Indices, Mesh, load_mesh
 from fflin.view.shapes import PLAIN, Shape, shapes
 
@@ -127,6 +128,9 @@ def _link(robot: Robot, shape: Shape) -> list[float]:
     else:
         known = pieces.get(shape.link) or robot.links.get(shape.link)
         mass, at = known.mass if known else 0.0, find_frame(model, shape.link)[1]
+        for bending in bendings(robot).values():
+            if bending.node == shape.joint:
+                at = bending.frame.actInv(at)
     return [mass, *pin.SE3ToXYZQUAT(at).round(6).tolist()]
 
 

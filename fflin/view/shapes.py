@@ -17,6 +17,7 @@ from fflin.robot.robot import Robot
 from fflin.robot.urdf.links import read_pose
 from fflin.robot.urdf.reader import expand, first_xacro, read_document
 from fflin.robot.urdf.xml import Element, named, parse
+from fflin.view.bending import balls, bent_links, node_of
 from fflin.view.meshes import Color, load_mesh
 
 # Where a URDF names no colour.
@@ -74,6 +75,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         for element in root.find_all("material")
         if "name" in element.attributes and (color := _color(element)) is not None
     }
+    bent = bent_links(robot, root)
     missing: list[str] = []
     unreadable: list[str] = []
     odd: list[int] = []
@@ -84,10 +86,11 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         frame = robot.model.frames[frame_id]
         if frame.parentJoint < ROOT:
             continue
+        joint, at = node_of(frame, bent)
         for visual in link.find_all("visual"):
             try:
                 kind, size, mesh = _geometry(visual)
-                placement = frame.placement * _placement(visual)
+                placement = at * _placement(visual)
                 color, finish = _material(visual, colors, kind)
             except (ValueError, LookupError):
                 odd.append(visual.line)
@@ -103,7 +106,11 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
                 except ValueError:
                     unreadable.append(file.name)
                     continue
-            yield Shape(frame.parentJoint, kind, size, placement, color, finish, file, frame.name)
+            yield Shape(joint, kind, size, placement, color, finish, file, frame.name)
+    yield from (
+        Shape(joint, kind, size, pin.SE3(np.eye(3), position))
+        for joint, kind, size, position in balls(robot, bent)
+    )
     if missing:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
         notes.append(

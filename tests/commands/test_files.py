@@ -11,7 +11,7 @@ from tests.support.commands import run
 from tests.support.messages import any_wording
 
 # Of options that every call of a command needs and that take no file.
-NEEDED = {"runs": "1", "vary": "base.mass=0.1"}
+NEEDED = {"runs": "1", "duration": "1", "vary": "base.mass=0.1"}
 
 
 def commands():

@@ -58,7 +58,7 @@ def test_the_inspector_with_flexible_arrays_and_a_tank_settles_within_its_limits
         text.replace("inspector.urdf", TOML.with_suffix(".urdf").as_posix()) + TANK,
         encoding="utf-8",
     )
-    given = ("simulate", "flexible.toml", "--duration", "400", "-o", "a.npz")
+    given = ("simulate", "flexible.toml", "--duration", "400", "-o", "a.npz", "--html", "a.html")
     code, out, err = run(*given, cwd=tmp_path)
     assert (code, err) == (0, "")
     assert out.startswith("simulate: settled after ")
@@ -67,3 +67,5 @@ def test_the_inspector_with_flexible_arrays_and_a_tank_settles_within_its_limits
     assert {"q_m.left_mode_3", "q_m.right_mode_1", "q_m.tank_y"} <= set(motion.state_names)
     assert not motion.passed and not motion.saturated
     assert motion.momentum_drift.max() < 1e-12
+    page = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert '"modal amplitudes"' in page and '"left_mode_1"' in page and '"tank_x"' in page

@@ -7,9 +7,9 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen
+from fflin.robot.equipment.mounting import Mounted, difference
 from fflin.robot.inputs import Input, ReactionWheel, named_wheels
 from fflin.robot.joints import ROOT, Joint, find_frame
-from fflin.robot.mounting import Mounted, difference
 from fflin.robot.urdf.links import is_impossible
 
 _Z = np.array([0.0, 0.0, 1.0])

@@ -8,18 +8,18 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.robot.appendage_bodies import mounted_appendages
-from fflin.robot.appendages import (
+from fflin.robot.equipment.appendage_bodies import mounted_appendages
+from fflin.robot.equipment.appendages import (
     Appendage,
     FlexibleAppendage,
     checked_appendages,
     rigid_inertia,
 )
+from fflin.robot.equipment.mounting import Mounted, difference, inertia_of, with_mounted
+from fflin.robot.equipment.wheels import mounted_wheels
 from fflin.robot.fields import checked_inputs, of_joints
 from fflin.robot.joints import find_frame
 from fflin.robot.mass_properties import LinkMass, as_inertia
-from fflin.robot.mounting import Mounted, difference, inertia_of, with_mounted
-from fflin.robot.wheels import mounted_wheels
 
 
 def with_inputs(robot: Any, inputs: Any) -> Any:
@@ -79,6 +79,8 @@ def _equipped(robot: Any, inputs: Any, appendages: Sequence[Appendage]) -> Any:
     if parts:
         _require_new_names(model, wheels, modes)
         model = with_mounted(model, bodies, parts)
+        for part in parts:
+            model.addJointFrame(model.getJointId(part.name))
         placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
         followers = tuple(

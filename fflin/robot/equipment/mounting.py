@@ -71,7 +71,10 @@ def _shift(mass: float, lever: Array) -> Array:
 def with_mounted(
     model: pin.Model, bodies: Sequence[pin.Inertia], parts: Sequence[Mounted]
 ) -> pin.Model:
-    """Return a model with one more joint for each part, and other inertias of its own bodies."""
+    """Return a model with one more joint for each part, and other inertias of its own bodies.
+
+    The joints of the parts have no frames yet.
+    """
     on: dict[int | str, list[Mounted]] = {}
     for part in parts:
         on.setdefault(part.carrier, []).append(part)
@@ -100,8 +103,6 @@ def with_mounted(
         copy = pin.Frame(frame)
         copy.parentJoint = moved[frame.parentJoint]
         new.addFrame(copy, False)
-    for part in parts:
-        new.addJointFrame(added[part.name])
     return new
 
 

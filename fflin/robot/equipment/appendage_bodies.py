@@ -17,11 +17,11 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array
-from fflin.robot.appendages import Appendage, FlexibleAppendage, Slosh, rigid_inertia
+from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh, rigid_inertia
+from fflin.robot.equipment.mounting import Mounted, difference, inertia_of
+from fflin.robot.equipment.wheels import turned_to
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.mass_properties import Piece, as_inertia
-from fflin.robot.mounting import Mounted, difference, inertia_of
-from fflin.robot.wheels import turned_to
 
 # An eigenvalue of M_rr - L L^T below minus this share of the largest of M_rr is negative.
 _NEGATIVE = 1e-9
@@ -304,38 +304,29 @@ def _balls(item: _Modes, body: pin.Inertia) -> list[_Ball]:
 def _liquid(slosh: Slosh, item: _Modes, bodies: list[pin.Inertia]) -> list[Mounted]:
     """Return two joints, the second with the mass, which is taken out of the body."""
     joint, placement = item.joint, item.placement
-    axes = placement.rotation @ slosh.axes
-    at = placement * np.array(slosh.position)
-    point = np.zeros((3, 3))
+    x, y, z = (placement.rotation @ slosh.axes).T
+    at, point = placement * np.array(slosh.position), np.zeros((3, 3))
     bodies[joint] = difference(bodies[joint], inertia_of(slosh.mass, at, point))
-    first, _ = slosh.modes
-    x, y, z = axes.T
-    empty = pin.Inertia.Zero()
-    if slosh.length is None:
-        across = [
-            Joint(name, 0, 0, False, prismatic=True, kind="slosh", inertia=slosh.modal_mass)
-            for name in slosh.modes
-        ]
-        along_x, along_y = turned_to(x), turned_to(y)
-        between = pin.SE3(along_x.T @ along_y, np.zeros(3))
-        mass = inertia_of(slosh.mass, np.zeros(3), point)
-        slide = pin.JointModelPZ
-        return [
-            Mounted(across[0], joint, pin.SE3(along_x, at), slide(), empty),
-            Mounted(across[1], first, between, slide(), mass),
-        ]
-    swings = [
+    # On springs the mass slides along x and y. As a pendulum it moves along them by turning about
+    # -y, then about x.
+    slides = slosh.length is None
+    arm = (slosh.length or 0.0) * z
+    first, second = (turned_to(axis) for axis in ((x, y) if slides else (-y, x)))
+    across = [
         Joint(
-            name, 0, 0, False, prismatic=False, kind="slosh", inertia=slosh.modal_mass, rotation=1.0
+            name,
+            idx_q=0,
+            idx_v=0,
+            unbounded=False,
+            prismatic=slides,
+            kind="slosh",
+            inertia=slosh.modal_mass,
+            rotation=0.0 if slides else 1.0,
         )
         for name in slosh.modes
     ]
-    # About -y, then about x, the mass moves along x and y.
-    about_y, about_x = turned_to(-y), turned_to(x)
-    between = pin.SE3(about_y.T @ about_x, np.zeros(3))
-    mass = inertia_of(slosh.mass, about_x.T @ (-slosh.length * z), point)
-    hinge = pin.JointModelRZ
-    return [
-        Mounted(swings[0], joint, pin.SE3(about_y, at + slosh.length * z), hinge(), empty),
-        Mounted(swings[1], first, between, hinge(), mass),
-    ]
+    motion = pin.JointModelPZ if slides else pin.JointModelRZ
+    between = pin.SE3(first.T @ second, np.zeros(3))
+    mass = inertia_of(slosh.mass, second.T @ -arm, point)
+    outer = Mounted(across[0], joint, pin.SE3(first, at + arm), motion(), pin.Inertia.Zero())
+    return [outer, Mounted(across[1], slosh.modes[0], between, motion(), mass)]

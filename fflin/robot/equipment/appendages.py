@@ -21,9 +21,9 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, FrozenArrays, as_double, number
+from fflin.base.validation import Array, FrozenArrays, as_double, number, positive
+from fflin.robot.equipment.mounting import about_origin, inertia_of
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
-from fflin.robot.mounting import about_origin, inertia_of
 
 # First root of J_1'(x) = 0: k R of the first lateral mode of a circular cylinder.
 _FIRST_ROOT = 1.8411837813406593
@@ -208,7 +208,7 @@ class FlexibleAppendage(Appendage):
         UnknownNameError
             If a unit is unknown.
         """
-        from fflin.robot.nastran import read_superelement
+        from fflin.robot.equipment.nastran import read_superelement
 
         found = read_superelement(op4, asm, origin=origin, modes=modes, length=length, mass=mass)
         return cls(
@@ -328,10 +328,7 @@ class Slosh(Appendage):
         for name, unit in (("mass", "kg"), ("frequency", "Hz"), ("length", "m")):
             value = getattr(self, name)
             if value is not None or name == "mass":
-                size = number(f"{name} of {what}", value)
-                if size <= 0.0:
-                    raise InputError(f"{name} of {what} is {size:g} {unit}, expected more than 0")
-                object.__setattr__(self, name, size)
+                object.__setattr__(self, name, positive(f"{name} of {what}", value, unit))
         if self.frequency is None and self.length is None:
             raise InputError(
                 f"{what} has neither a frequency nor a length; give the frequency [Hz] of a mass "
@@ -410,8 +407,7 @@ class Slosh(Appendage):
         """
         sizes = {"radius": radius, "height": height, "density": density}
         for what, value in (sizes | {"acceleration": acceleration}).items():
-            if number(f"{what} of the tank", value) <= 0.0:
-                raise InputError(f"{what} of the tank is {value:g}, expected more than 0")
+            positive(f"{what} of the tank", value)
         k = _FIRST_ROOT / radius
         along = unit_vector("axis of the tank", axis, "the direction from its bottom up")
         liquid = density * math.pi * radius**2 * height

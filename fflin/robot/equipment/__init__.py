@@ -1,0 +1,1 @@
+"""Equipment of a robot: reaction wheels, flexible appendages and slosh, as joints of its model."""
