@@ -339,9 +339,9 @@ def add_limits(group: Container) -> None:
     add(
         group,
         "--limits",
-        "keep the inputs within the limits of the robot (urdf, default), or of --limit alone "
-        "(none). The limits are the efforts of the URDF, max and min of the inputs, and the speeds "
-        "of the wheels",
+        "limits of the inputs: urdf (default) uses the limits of the robot and of --limit, none "
+        "uses --limit alone. The limits of the robot are the efforts of the URDF, max and min of "
+        "the inputs, and the speeds of the wheels",
         choices=("urdf", "none"),
         default="urdf",
     )

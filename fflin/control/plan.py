@@ -69,9 +69,9 @@ def plan(
     ----------
     robot : Robot
     goal : LinearModel, (q, v) or array_like (nx,)
-        End of the motion: the point of a model, a configuration and velocity in Pinocchio's
-        order, or a state of `StateMap` in frame "hybrid". In (q, v), None means neutral or at
-        rest. Wheels may end at any angle.
+        End of the motion: a model, for its operating point; a configuration and velocity in
+        Pinocchio's order; or a state of `StateMap` in frame "hybrid". In (q, v), None means
+        neutral or at rest. Wheels may end at any angle.
     duration : float
         Duration of the motion [s].
     x0, q0, v0 : array_like, optional

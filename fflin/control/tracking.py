@@ -143,7 +143,7 @@ class TrajectoryFeedback(Feedback):
         return steady_regulator(self.end, by.Q, by.R, by.dt)[1]
 
     def beside(self, offset: Mapping[str, float]) -> tuple[Array, Array]:
-        """Return q (nq,) and v (nv,) at an offset from the start of the trajectory.
+        """Return q (nq,) and v (nv,) displaced from the initial state of the trajectory.
 
         Parameters
         ----------

@@ -103,7 +103,7 @@ def equilibrium(
         u_k \ge 0 \text{ for every thruster } k.
 
     The norm is computed from the numbers in u, each in its own unit. The rows of the force balance,
-    in N m and N, are weighted by the mobilities :math:`\sqrt{(M^{-1})_{ii}}` to make them
+    in N m and N, are scaled by :math:`\sqrt{(M^{-1})_{ii}}` to make the rows
     comparable. The weighted residual must not exceed 1e-9 of the balanced forces.
 
     A joint with a spring and without a `JointTorque` sags if no input holds it. Newton's method

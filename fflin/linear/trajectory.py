@@ -56,7 +56,8 @@ class Trajectory(Design):
         knot, like a digital controller. The default is "linear", or "previous" if u has N - 1
         rows.
     frame : {"local", "hybrid", "world"}
-        Axes in which the inputs on the base are given and held. local: base axes. hybrid: force in
+        Axes in which the force and torque on the base are expressed, and constant between knots if
+        they are held. local: base axes. hybrid: force in
         world axes, torque in base axes. world: both in world axes.
     verified : bool
         False for data from a file without a SHA-256 digest. Damage to such a file cannot be

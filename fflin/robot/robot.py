@@ -286,7 +286,7 @@ class Robot(Coordinates):
 
         A number d is drawn uniformly from [-1, 1], independently for each body and axis:
 
-        - The mass is multiplied by 1 + `mass` d.
+        - The mass is multiplied by 1 + d `mass`, with the argument `mass`.
         - The second moments per mass along the axes of the body's frame are multiplied by
           1 + `inertia` d.
         - The centre of mass is shifted along each axis by `com` d times the root mean square

@@ -88,7 +88,7 @@ CASES = {
         lambda x, py: [(x["A"], py.lft.A), (x["D11"], py.lft.D11)],
     ),
     "funnel": (
-        f"{ROBOT} --trajectory plan.npz --goal attitude=1 --knots 2 --samples 4 --threads 1",
+        f"{ROBOT} --schedule gains.npz --goal attitude=1 --knots 2 --samples 4 --threads 1",
         lambda x, py: [(x["P"], py.funnel.P), (x["tried"], py.funnel.tried)],
     ),
     "lqr": (ROBOT, lambda x, py: [(x["K"], py.gain.K), (x["P"], py.gain.P)]),
@@ -127,6 +127,7 @@ def python(tmp_path_factory):
     there = Python(folder)
     there.check = fflin.check(robot, there.lin)
     there.schedule = fflin.tvlqr(there.along)
+    there.schedule.save(folder / "gains.npz")
     there.sprung = fflin.modes(fflin.linearize(fflin.load(ROBOT, stiffness={"joint_1": 3.0})))
     sprung = fflin.load(ROBOT, stiffness={"joint_1": 3.0})
     there.held = fflin.equilibrium(sprung, fflin.configuration(sprung, {"joint_1": 0.2}))

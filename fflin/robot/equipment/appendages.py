@@ -185,7 +185,7 @@ class FlexibleAppendage(Appendage):
             Point of the file [m], in its basic coordinates, that is at the frame's origin; the mean
             of the boundary grids by default.
         modes : int, optional
-            Number of modes to use, the slowest first; all by default.
+            Number of modes to use, the lowest frequency first; all by default.
         length : {"m", "mm", "cm", "in", "ft"}
             Unit of length in the file.
         mass : {"kg", "g", "tonne", "lb", "slug", "lbf s^2/in"}
