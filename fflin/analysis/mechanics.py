@@ -5,10 +5,9 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.analysis.ranks import (
     EPS,
@@ -23,6 +22,9 @@ from fflin.analysis.ranks import (
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, instance
 from fflin.linear.model import LinearModel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 # Springs or dampers with a larger relative asymmetry are not symmetric.
 _SYMMETRIC = 1e-8

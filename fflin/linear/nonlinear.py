@@ -1,11 +1,13 @@
 """Nonlinear model in the chart, its derivatives by differences, and motions to compare it with."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from copy import copy
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
@@ -19,6 +21,9 @@ from fflin.linear.certificate import mobilities
 from fflin.linear.fit import require_fit, require_sensed
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 # Where the base flies faster than this [m/s], the rounding of its speed would hide the rest.
 _FAST = 100.0

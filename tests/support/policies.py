@@ -36,9 +36,21 @@ def coarse(values):
     return np.round(values / unit) * unit
 
 
+def coarse_cost(P):
+    """Round each entry (i, j) of costs (m, nx, nx) relative to the largest P_ii and P_jj.
+
+    Gains between knots are computed from P, whose entries differ in unit by many orders.
+    """
+    largest = np.sqrt(P.diagonal(axis1=1, axis2=2).max(axis=0))
+    units = 2.0 ** np.ceil(np.log2(np.where(largest > 0.0, largest, 1.0)))
+    units = np.outer(units, units)
+    return coarse(P / units) * units
+
+
 def coarsened(made, *names):
     """Return a design with some of its arrays rounded."""
-    return replace(made, **{name: coarse(getattr(made, name)) for name in names})
+    by_name = {name: coarse_cost if name == "P" else coarse for name in names}
+    return replace(made, **{name: by_name[name](getattr(made, name)) for name in names})
 
 
 def motors(robot):
