@@ -47,6 +47,21 @@ def test_panels_of_an_array_turn_about_the_frame_at_which_it_is_clamped():
     assert (sides > 0.0).all() and np.ptp(sides) > 0.5
 
 
+def test_an_array_without_rotation_moves_along_its_momentum():
+    t = np.array([[0.0], [1.0], [2.0]])
+    array = fflin.FlexibleAppendage("panel_left_1", 0.25, t, np.zeros((3, 1)), name="left")
+    robot = fflin.load("inspector", lock=["hinge_*"], appendages=[array])
+    before = posed(robot, robot.neutral())
+    after = posed(robot, fflin.configuration(robot, {"left_mode_1": 0.3}))
+    moved = [(b, a) for b, a in zip(before, after, strict=True) if not a.isApprox(b, 1e-12)]
+    assert moved
+    frame = robot.model.frames[robot.model.getFrameId("panel_left_1")].placement
+    # A mass |t|^2 with the momentum t has moved by t / |t|^2 for a unit of the amplitude.
+    shift = frame.rotation @ (0.3 * t[:, 0] / 5.0)
+    for b, a in moved:
+        assert a.isApprox(pin.SE3(np.eye(3), shift) * b, 1e-12)
+
+
 def test_appendages_of_the_root_link_and_slosh_are_balls():
     boom = fflin.FlexibleAppendage("base", 0.3, [[2], [0], [0]], [[0], [6], [0]], name="boom")
     twist = fflin.FlexibleAppendage("base", 0.3, np.zeros((3, 1)), [[0], [0], [1]], name="twist")
