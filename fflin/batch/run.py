@@ -85,7 +85,7 @@ def check_workers(executor: Any, workers: Any, threads: Any, chunk: Any, progres
         raise InputError("executor and workers are both given; give only one of them")
     if executor is not None and not hasattr(executor, "submit"):
         raise InputError(
-            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
+            f"executor has type {type(executor).__name__}, expected a concurrent.futures.Executor"
         )
     for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
         if value is not None:

@@ -276,7 +276,7 @@ def settle(
 def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     """Return the loop of a gain, or raise `InputError` where it cannot settle at the point."""
     if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
-        given = f"robot is a {type(robot).__name__}, lin is a {type(lin).__name__}"
+        given = f"robot has type {type(robot).__name__}, lin has type {type(lin).__name__}"
         raise InputError(f"{given}; expected a fflin.Robot and its fflin.LinearModel")
     K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
     kept = getattr(gain, "regulated", ())

@@ -22,7 +22,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 Container: TypeAlias = "argparse._ActionsContainer"
 
 # Titles of groups of options in the help. Those of ROBOT repeat settings of a robot.toml.
-POINT, ROBOT, OUTPUT = "operating point", "robot, in place of robot.toml", "output"
+POINT, ROBOT, OUTPUT = "operating point", "robot (these options override robot.toml)", "output"
 TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 
 
@@ -142,7 +142,7 @@ def command(
         description=f"{summary[0].upper()}{summary[1:]}.",
         epilog=f"example: {example}",
     )
-    about = "show the common options; --help all describes every option"
+    about = "show help for the common options; --help all shows help for all options"
     command.add_argument("-h", "--help", nargs="?", metavar="all", action=_Help, help=about)
     command.set_defaults(run=run, command=command, common=[*common.split(), "json"] * bool(common))
     switch(group_of(command, OUTPUT), "--json", "print the results as one JSON object")
@@ -182,7 +182,7 @@ def short_help(command: argparse.ArgumentParser) -> str:
         formatter.end_section()
     formatter.add_text(command.epilog)
     if options:
-        formatter.add_text(f"all {len(every) - 1} options in full: {command.prog} --help all")
+        formatter.add_text(f"help for all {len(every) - 1} options: {command.prog} --help all")
     return formatter.format_help()
 
 
@@ -227,7 +227,9 @@ class _FormerName(argparse.Action):
 
     def __call__(self, _: Any, given: argparse.Namespace, value: Any, option: Any = None) -> None:
         new = f"--{self.dest.replace('_', '-')}"
-        warnings.warn(f"{option} is now {new}; write {new} {value}", FflinWarning, stacklevel=2)
+        warnings.warn(
+            f"{option} has the new name {new}; write {new} {value}", FflinWarning, stacklevel=2
+        )
         setattr(given, self.dest, value)
 
 
@@ -266,13 +268,13 @@ def outputs_of(arguments: argparse.Namespace) -> list[tuple[Path, OutputFile]]:
 
 def add_robot(command: argparse.ArgumentParser) -> None:
     """Add ROBOT and --lock."""
-    what = "name of a robot in `fflin robots`, or path of a URDF or of a robot.toml"
+    what = "robot name listed by `fflin robots`, or path of a URDF or robot.toml"
     command.add_argument("robot", metavar="ROBOT", type=input_name, help=what)
     add(
         group_of(command, ROBOT),
         "--lock",
-        "lock a joint at VALUE [rad|m], or at its neutral position; NAME may be a pattern such as "
-        "'hinge_*', here and in all other options",
+        "lock a joint at VALUE [rad|m]; by default at its neutral position. In all options, NAME "
+        "may be a pattern such as 'hinge_*'",
         lock,
         repeatable=True,
     )
@@ -294,7 +296,7 @@ def add_pose(group: Container) -> None:
     add(
         group,
         "--joint",
-        "position of a joint [rad|m]; other joints are as in robot.toml, or at their neutral "
+        "position of a joint [rad|m]. The default is the position in robot.toml, or the neutral "
         "position",
         assignment,
         repeatable=True,
@@ -305,7 +307,8 @@ def add_pose(group: Container) -> None:
     add(
         group,
         "--velocity",
-        "velocity of a joint or wheel [rad/s|m/s], or omega_b.x ... v_b.z of the base in base axes",
+        "velocity of a joint or wheel [rad/s|m/s], or a component omega_b.x ... v_b.z of the base "
+        "velocity in base axes",
         assignment,
         repeatable=True,
     )
@@ -316,8 +319,8 @@ def add_target(group: Container) -> None:
     add(
         group,
         "--target-joint",
-        "target position of a joint [rad|m]; by default [target] of robot.toml, then its [point], "
-        "then the neutral position",
+        "target position of a joint [rad|m]. The default is the value in [target] of robot.toml, "
+        "then in [point], then the neutral position",
         assignment,
         repeatable=True,
     )
@@ -327,8 +330,8 @@ def add_target(group: Container) -> None:
     add(
         group,
         "--target-velocity",
-        "target velocity, such as the speed of a wheel. In a simulation it is also the initial "
-        "velocity unless --velocity is given",
+        "target velocity, such as the speed of a wheel. In a simulation, the target velocity is "
+        "also the initial velocity unless --velocity is given",
         assignment,
         repeatable=True,
     )
@@ -339,17 +342,17 @@ def add_limits(group: Container) -> None:
     add(
         group,
         "--limits",
-        "limits of the inputs: urdf (default) uses the limits of the robot and of --limit, none "
-        "uses --limit alone. The limits of the robot are the efforts of the URDF, max and min of "
-        "the inputs, and the speeds of the wheels",
+        "limits of the inputs. `urdf` (default) uses the limits of the robot and of --limit; "
+        "`none` uses only --limit. The limits of the robot are the efforts in the URDF, max and "
+        "min of the inputs, and the speeds of the wheels",
         choices=("urdf", "none"),
         default="urdf",
     )
     add(
         group,
         "--limit",
-        "largest magnitude of an input, or of all inputs of a group such as tau_m or a pattern. "
-        "This value takes precedence over --limits",
+        "largest magnitude of an input, or of all inputs in a group or pattern such as tau_m. This "
+        "limit replaces the limit of the robot",
         assignment,
         repeatable=True,
     )
@@ -365,13 +368,13 @@ def settle_step(arguments: argparse.Namespace) -> None:
     """Set --dt and --sample from their former names, --step and --dt, with a warning."""
     said = ""
     if arguments.step is not None:
-        said = "--step is now --dt, the integration step"
+        said = "the integration step --step has the new name --dt"
         if arguments.dt is not None:
-            said += ", and --dt is now --sample, the sample time of the controller"
+            said += ", and the sample time --dt has the new name --sample"
             arguments.sample = arguments.dt
         arguments.dt = arguments.step
     elif arguments.dt is not None and arguments.sample is None:
-        said = "--dt is the integration step; the sample time of the controller is --sample"
+        said = "--dt is the integration step; give the sample time of the controller by --sample"
     if said:
         warnings.warn(said, FflinWarning, stacklevel=2)
 
@@ -381,23 +384,24 @@ def add_inputs_there(group: Container) -> None:
     add(
         group,
         "--effort",
-        "input at the operating point, by its name in u, such as tau_m.joint_1",
+        "value of an input at the operating point. NAME is the name of the input in u, such as "
+        "tau_m.joint_1",
         assignment,
         repeatable=True,
     )
     switch(
         group,
         "--equilibrium",
-        "apply the minimum-norm inputs that balance springs, gravity and the inertial forces of a "
-        "steady motion at the operating point. Passive joints sag on their springs. If no inputs "
-        "hold the point, the command reports an error",
+        "apply the minimum-norm inputs that make the operating point an equilibrium under springs "
+        "and gravity, or a steady motion. Passive joints deflect their springs to balance the "
+        "load. If no inputs hold the point, the command reports an error",
     )
     add(
         group,
         "--relative-equilibrium",
-        "in orbit, use the N-th (default: first) of the 24 attitudes without gravity-gradient "
-        "torque, and the inputs that --equilibrium computes. Attitude and position in the state "
-        "are relative to this pose",
+        "for a robot in orbit: use the N-th of the 24 attitudes without gravity-gradient torque (1 "
+        "by default), and the inputs that --equilibrium computes. Attitude and position in the "
+        "state are relative to the pose of this equilibrium",
         count_of,
         "N",
         nargs="?",
@@ -411,8 +415,8 @@ def add_reference(group: Container) -> None:
     add(
         group,
         "--reference",
-        "reference of attitude and position in the state: the base pose of the operating point "
-        "(default), or the world",
+        "reference pose of attitude and position in the state: the base pose at the operating "
+        "point (base, default), or the world frame (world)",
         choices=("base", "world"),
         default="base",
     )
@@ -423,11 +427,12 @@ def add_frame(group: Container) -> None:
     add(
         group,
         "--frame",
-        "axes of velocities and wrenches. hybrid (default): angular parts in base axes, linear "
-        "parts in reference axes; local: all in base axes; world: all in reference axes. For a "
-        "robot in orbit, the axes are as in hybrid, and the orbital frame is the world. lvlh "
-        "(default): x along the orbit, y opposite to the orbit normal, z towards the central body; "
-        "hill: x away from the central body, y along the orbit, z along the orbit normal",
+        "axes of base velocities and wrenches. `hybrid` (default) uses base axes for angular parts "
+        "and reference axes for linear parts. `local` uses base axes for all parts, and `world` "
+        "uses reference axes for all parts. A robot in orbit has the axes of `hybrid`, and an "
+        "orbital frame is its world. In `lvlh` (default in orbit), x is along the orbit, y "
+        "opposite to the orbit normal and z towards the central body. In `hill`, x is away from "
+        "the central body, y along the orbit and z along the orbit normal",
         choices=("hybrid", "local", "world", "lvlh", "hill"),
     )
 
@@ -437,8 +442,8 @@ def add_orbit(group: Container) -> None:
     add(
         group,
         "--orbit",
-        "circular orbit at an altitude [m] above the earth (default), moon, mars ...; the world is "
-        "then the frame of the orbit",
+        "circular orbit at an altitude [m] above a central body: earth (default), moon, mars ... "
+        "The world is then the orbital frame",
         orbit,
     )
 
@@ -457,8 +462,8 @@ def add_system(command: argparse.ArgumentParser) -> None:
     add(
         group,
         "--damping",
-        "damping of a joint [N m s/rad|N s/m], or one value for all joints; `urdf` uses the "
-        "damping in the URDF",
+        "damping of a joint [N m s/rad|N s/m], or one value for all joints. The value `urdf` means "
+        "the damping in the URDF",
         joint_or_all,
         repeatable=True,
     )
@@ -467,15 +472,15 @@ def add_system(command: argparse.ArgumentParser) -> None:
     add(
         group,
         "--passive",
-        "treat this joint as having no motor: the default inputs omit its torque",
+        "joint without a motor: the default inputs do not include a torque at this joint",
         metavar="NAME",
         repeatable=True,
     )
     add(
         group,
         "--inputs",
-        "inputs of the robot: a file for fflin.load_inputs, a bundled name, `joints` (joint "
-        "torques only) or `base` (base torque and force only). The default is the inputs of "
+        "inputs of the robot: a TOML file of inputs, a bundled name such as cubesat, `joints` "
+        "(joint torques only) or `base` (base torque and force only). The default is the inputs in "
         "robot.toml, or base torque, base force and all joint torques",
         input_name,
     )
@@ -484,8 +489,8 @@ def add_system(command: argparse.ArgumentParser) -> None:
         "--output",
         "outputs of the model: state (default), base, joints, rates, joints:NAME, rates:NAME (a "
         "joint or a pattern), com, momentum, frame:NAME (pose and velocity), pose:NAME, "
-        "velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (NAME relative to "
-        "frame TO)",
+        "velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (frame NAME relative "
+        "to frame TO)",
         metavar="SPEC",
         repeatable=True,
     )
@@ -501,7 +506,10 @@ def add_output_file(
     what = f"save {what} to FILE: {endings}"
     group.add_argument("-o", "--output-file", metavar="FILE", type=endings, help=what)
     if kinds:
-        force = "allow -o to replace a file that does not contain the same kind of result"
+        force = (
+            "let -o replace a file of any content; by default -o replaces only results of the same "
+            "kind"
+        )
         group.set_defaults(kinds=kinds)
     switch(group, "--force", force)
 

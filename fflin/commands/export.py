@@ -29,20 +29,23 @@ def add_commands(commands: Commands) -> None:
     what = "gain, compensator or gain schedule saved by fflin: .npz, .mat or .json"
     export.add_argument("file", metavar="FILE", type=input_file, help=what)
     group = group_of(export, OUTPUT)
-    folder = "folder of the code; it is made if necessary"
+    folder = "folder for the code; a missing folder is created"
     group.add_argument("-o", "--output-folder", metavar="FOLDER", required=True, help=folder)
     add(
         group,
         "--robot",
-        "robot that the design was made for: a name in `fflin robots`, a URDF or a robot.toml. By "
-        "default the robot that FILE names",
+        "robot of the design: a name listed by `fflin robots`, or the path of a URDF or "
+        "robot.toml. The default is the robot named in FILE",
         metavar="ROBOT",
         type=input_name,
     )
-    limits = "limit the inputs as in simulate (urdf), or not (none, default)"
+    limits = (
+        "urdf: saturate the inputs at the limits of the robot, as `fflin simulate` does; none "
+        "(default): do not saturate the inputs"
+    )
     add(group, "--limits", limits, choices=("urdf", "none"), default="none")
-    add(group, "--name", "prefix of the names in C", metavar="NAME", default="controller")
-    real = "type of the numbers; double by default"
+    add(group, "--name", "prefix of all names in the C code", metavar="NAME", default="controller")
+    real = "floating-point type in the C code; double by default"
     add(group, "--real", real, choices=("double", "float"), default="double")
 
 
@@ -58,7 +61,7 @@ def _export(arguments: argparse.Namespace) -> Report:
     kind = kind_of(arguments.file)
     if kind not in kinds and arguments.file.is_file():
         raise FileError(
-            f"{arguments.file} holds {kind or 'no result of fflin'}, expected a Gain, a "
+            f"{arguments.file} contains {kind or 'no result of fflin'}, expected a Gain, a "
             "GainSchedule or a Compensator"
         )
     law = kinds.get(kind, Gain).load(arguments.file)

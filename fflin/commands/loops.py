@@ -69,12 +69,16 @@ def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> 
 
 def refuse_law(arguments: argparse.Namespace) -> None:
     """Refuse the options of a regulator together with --free."""
-    _refuse(arguments, ("limit", "delay"), "--free has no input to limit or delay")
+    _refuse(
+        arguments,
+        ("limit", "delay"),
+        "--free means no inputs, so that limits and delays have no effect",
+    )
     names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "reduce", "allocate", "gain", "controller", "mpc")
     _refuse(
         arguments,
         names,
-        "--free has no regulator, so that weights, a target or thrusters have no effect",
+        "--free means no regulator, so that weights, a target or thrusters have no effect",
     )
 
 
@@ -86,8 +90,8 @@ def add_loop(command: argparse.ArgumentParser) -> None:
     add(
         start,
         "--offset",
-        "initial error relative to the start of the trajectory, in base axes. NAME is a state, "
-        "group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]",
+        "initial error from the start of the trajectory, in base axes. NAME is a state, group or "
+        "pattern such as r_b.x, q_m or omega_b.z (SI units), or roll, pitch or yaw [deg]",
         assignment,
         repeatable=True,
     )
@@ -100,13 +104,13 @@ def add_loop(command: argparse.ArgumentParser) -> None:
     add(
         run,
         "--duration",
-        "duration [s]; by default the duration of the trajectory, or the settling time of the "
-        "linear loop, between 60 and 600 s",
+        "duration [s]. The default is the duration of the trajectory; without a trajectory, the "
+        "settling time of the linear loop, limited to 60 ... 600 s",
         number,
         "T",
     )
     add_step(run)
-    methods = "integrator: cf4 (default), rkmk4 or semi_implicit_euler"
+    methods = "integration method: cf4 (default), rkmk4 or semi_implicit_euler"
     add(run, "--method", methods, metavar="METHOD", default="cf4")
     add_system(command)
     add_frame(run)
@@ -116,45 +120,45 @@ def _add_controllers(group: Container) -> None:
     add(
         group,
         "--schedule",
-        "follow the trajectory with the gains that tvlqr saved; without this option, gains are "
-        "designed along --trajectory",
+        "follow the trajectory with gains saved by `fflin tvlqr`. By default, gains are designed "
+        "along --trajectory",
         input_file,
     )
     add(
         group,
         "--gain",
-        "use a gain that lqr saved, and regulate to the operating point for which this gain was "
-        "designed",
+        "use a gain saved by `fflin lqr`, and regulate to the operating point of its design",
         input_file,
     )
     add(
         group,
         "--controller",
-        "use a linear controller K with positive feedback, u - u0 = K (y - y0) about the target: "
-        ".mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled. y is set by --output",
+        "use a linear controller K with positive feedback, u - u0 = K (y - y0), about the target. "
+        "FILE (.mat, .npz or .json) contains A, B, C, D, and dt or Ts if the controller is "
+        "sampled. --output defines y",
         input_file,
     )
     switch(
         group,
         "--negative-feedback",
-        "the controller assumes negative feedback, u - u0 = -K (y - y0)",
+        "use the controller of --controller with negative feedback, u - u0 = -K (y - y0)",
     )
     yes_or_no(
         group,
         "--allocate",
-        "design with torque and force on the base, and allocate the nearest wrench to the "
-        "thrusters, which cannot pull. This is the default if the thrusters can push in every "
-        "direction. With --no-allocate, negative thrust is set to zero",
+        "design the regulator with base torque and force, and let thrusters produce the nearest "
+        "possible wrench. Allocation is the default if the thrusters can push in every direction. "
+        "With --no-allocate, negative thrust is set to zero",
     )
     switch(
         group,
         "--mpc",
-        "use model predictive control with the limits of the robot; it needs --sample",
+        "use model predictive control (MPC) with the limits of the robot; MPC requires --sample",
     )
     add(group, "--horizon", "number of samples in the horizon of --mpc", count_of, default=20)
-    switch(group, "--free", "simulate without a regulator and without inputs")
+    switch(group, "--free", "simulate the robot without a regulator and without inputs")
     add_limits(group)
-    delay = "time [s] from a sample until its command acts"
+    delay = "delay [s] from a sample until the command computed from this sample acts"
     add(group, "--delay", delay, number, "T", default=0.0)
 
 
@@ -172,7 +176,7 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         "duration": arguments.duration,
     }
     if not arguments.controller:
-        _refuse(arguments, ("negative_feedback",), "only a --controller has a feedback sign")
+        _refuse(arguments, ("negative_feedback",), "only --controller has a feedback sign")
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
         return Loop(policy, options | start)
@@ -361,7 +365,8 @@ def require_held(robot: Robot, policy: Any, q: Array) -> None:
     if loose and loose == beside:
         raise InputError(
             f"the start differs from the target only in states that are not regulated: "
-            f"{listed(loose)}; no input would act: give inputs that move them, or another start"
+            f"{listed(loose)}, so that no input would act; give inputs that move these states, or "
+            "another start"
         )
     if loose:
         text = (

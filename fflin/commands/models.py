@@ -45,7 +45,8 @@ def add_commands(commands: Commands) -> None:
         commands,
         "info",
         _info,
-        "show mass, inertia, wheels and thrusters at a point, and tree, limits and settings",
+        "show mass, inertia, wheels and thrusters at a configuration, and the joint tree, limits "
+        "and settings",
         example="fflin info servicer_7dof",
     )
     add_robot(info)
@@ -55,10 +56,10 @@ def add_commands(commands: Commands) -> None:
         commands,
         "init",
         _init,
-        "write a first robot.toml from a URDF: inputs, limits, joints without a motor",
+        "write a first robot.toml for a URDF, with its inputs, limits and joints without a motor",
         example="fflin init my.urdf && fflin simulate my.toml",
     )
-    urdf = "path of a URDF, or name of a robot in `fflin robots`"
+    urdf = "path of a URDF, or a robot name listed by `fflin robots`"
     init.add_argument("robot", metavar="URDF", type=input_name, help=urdf)
     what = "the robot file (by default the URDF's name with .toml, in the current folder)"
     add_output_file(
@@ -80,11 +81,11 @@ def _add_linearize(commands: Commands) -> None:
     )
     add_point(linearize)
     made = group_of(linearize, OUTPUT)
-    add(made, "--dt", "sample the model, with inputs held for H [s]", number, "H")
+    add(made, "--dt", "sample the model at the sample time H [s] with zero-order hold", number, "H")
     add(
         made,
         "--for",
-        "convert the model to the coordinates of this tool; needs -o FILE",
+        "convert the model to the coordinates of a tool, and save the result; requires -o FILE",
         choices=("drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"),
         dest="tool",
     )
@@ -107,7 +108,7 @@ def _add_check(commands: Commands) -> None:
     add_point(check)
     add_trajectory(check)
     shown = group_of(check, OUTPUT)
-    tolerance = "relative tolerance of all errors; by default each error has its own"
+    tolerance = "relative tolerance of all errors. By default, each error has a different tolerance"
     add(shown, "--tolerance", tolerance, number, "X")
     add_figure(check, "the errors and their tolerances")
 
@@ -186,11 +187,13 @@ def _init(arguments: argparse.Namespace) -> Report:
 
     found = find_robot(arguments.robot)
     if found.path.suffix.lower() == ".toml":
-        raise InputError(f"{found.path} is already a robot file; give a URDF")
+        raise InputError(f"{found.path} is already a robot file; give the path of a URDF")
     target = arguments.output_file or Path(f"{found.name}.toml")
     check_place(target)
     if target.exists() and not arguments.force:
-        raise FileError(f"{target} already exists; give another name with -o, or add --force")
+        raise FileError(
+            f"{target} already exists; give another name with -o, or replace the file with --force"
+        )
     urdf = found.name
     if found.origin == "file":
         urdf = os.path.relpath(os.path.realpath(found.path), os.path.realpath(target.parent))
@@ -199,14 +202,18 @@ def _init(arguments: argparse.Namespace) -> Report:
         robot = load(arguments.robot)
     write_whole({target: draft(robot, urdf).encode()})
     load(target)  # warns of settings that the file leaves open
-    text = f"robot file of '{robot.name}'; try: fflin simulate {target}"
+    text = (
+        f"robot file of '{robot.name}' in {target}; to simulate the robot, run: "
+        f"fflin simulate {target}"
+    )
     return Report(robot.name, {}, text, {target: None})
 
 
 def _linearize(arguments: argparse.Namespace) -> Report:
     if arguments.tool and (arguments.trajectory or not arguments.output_file):
         raise InputError(
-            "--for saves a model at a point; give it with -o FILE and without --trajectory"
+            "--for converts a model at a point and saves it; use --for with -o FILE and without "
+            "--trajectory"
         )
     if arguments.output_file and (arguments.tool or arguments.trajectory):
         check_ending(arguments.output_file, RECORD.endings)

@@ -45,11 +45,11 @@ def add_commands(commands: Commands) -> None:
     group = group_of(plan, TRAJECTORY)
     add(group, "--duration", "duration of the motion [s]", number, "T", required=True)
     add(group, "--knots", "number of equally spaced knots", count_of, default=101)
-    hold = "inputs between knots: held (previous, default), or interpolated (linear)"
+    hold = "inputs between knots: constant (previous, default) or linearly interpolated (linear)"
     add(group, "--hold", hold, choices=("previous", "linear"), default="previous")
-    free = "state whose final value is free: a name, group or pattern"
+    free = "state whose final value is free. NAME is a state, group or pattern"
     add(group, "--free-end", free, metavar="NAME", repeatable=True)
-    weight = "weight on an input, a group or a pattern; by default 1/limit^2"
+    weight = "weight on an input, a group or a pattern. The default is 1/limit^2"
     add(group, "--r", weight, assignment, "NAME=W", repeatable=True)
     add_limits(group)
     add_output_file(group_of(plan, OUTPUT), "the trajectory", TABLE, "Trajectory", "Motion")

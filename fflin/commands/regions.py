@@ -58,7 +58,7 @@ def _add_validity(commands: Commands) -> None:
         commands,
         "validity",
         _validity,
-        "measure how far the robot can be displaced until the linear model or its regulator fails",
+        "find how far the robot can be displaced before the linear model or its regulator fails",
         example="fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
         common="joint inputs weights q r bryson sample reduce attitude offset spread samples seed "
         "jobs limits frames plot",
@@ -71,18 +71,19 @@ def _add_validity(commands: Commands) -> None:
     add(runs, "--spread", "largest displacement of a joint [rad|m]", number, "X", default=1.0)
     add(runs, "--samples", "number of random runs", count_of, default=100)
     add(runs, "--seed", "random seed of the runs", whole, "S", default=0)
-    add(runs, "--jobs", "number of processes, at most one for each core", count_of, default=1)
+    add(runs, "--jobs", "number of processes; at most one per core", count_of, default=1)
     add(
         runs,
         "--limits",
-        "saturate the inputs at the limits of the robot (urdf), or never (none, default)",
+        "urdf: saturate the inputs at the limits of the robot; none (default): do not saturate the "
+        "inputs",
         choices=("urdf", "none"),
         default="none",
     )
     add(
         runs,
         "--frames",
-        "also test the loop with base velocities and inputs in these axes",
+        "also test the regulator with base velocities and wrenches in these axes",
         choices=("hybrid", "local", "world"),
         nargs="+",
         default=(),
@@ -95,7 +96,7 @@ def _add_funnel(commands: Commands) -> None:
         commands,
         "funnel",
         _funnel,
-        "measure from which errors the regulator along a trajectory still reaches a goal",
+        "find the initial errors from which the regulator along a trajectory reaches a goal",
         example="fflin funnel arm.toml --trajectory plan.csv --schedule gains.npz "
         "--goal attitude=1",
         common="trajectory schedule goal within weights q r knots samples seed threads "
@@ -110,20 +111,19 @@ def _add_funnel(commands: Commands) -> None:
     add(
         group_of(funnel, CONTROLLER),
         "--schedule",
-        "use the gains that tvlqr saved; without this option, gains are designed along the "
-        "trajectory",
+        "use gains saved by `fflin tvlqr`. By default, gains are designed along the trajectory",
         input_file,
     )
     goal = f"largest error allowed at the end: {_ERRORS}"
     add(runs, "--goal", goal, assignment, repeatable=True)
-    within = "largest error allowed at any time of a run; names as in --goal"
+    within = "largest error allowed at any time of a run. NAME is as in --goal"
     add(runs, "--within", within, assignment, repeatable=True)
     add_limits(runs)
     add(runs, "--knots", "number of knots to test", count_of, default=10)
     add(runs, "--samples", "number of runs from each knot", count_of, default=100)
     add(runs, "--seed", "random seed of the runs", whole, "S", default=0)
     add(runs, "--confidence", "confidence level of the intervals", number, "P", default=0.95)
-    add(runs, "--threads", "number of threads; by default one for each core", count_of)
+    add(runs, "--threads", "number of threads; by default one per core", count_of)
     add_step(runs)
     add(shown, "--html", "write a page that plays the motion with the funnel as a tube", PAGE)
     add_figure(funnel, "the funnel")
@@ -131,7 +131,7 @@ def _add_funnel(commands: Commands) -> None:
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 
-_FREE = "as large as it takes; --limits urdf cuts them"
+_FREE = "not limited; --limits urdf saturates the inputs"
 
 
 def _validity(arguments: argparse.Namespace) -> Report:
@@ -164,7 +164,7 @@ def _validity(arguments: argparse.Namespace) -> Report:
         bar.close()
     text = str(found)
     if cut or any(name in lin.limits for name in lin.input_names):
-        text += "\ninputs were " + ("cut to the limits of the robot" if cut else _FREE)
+        text += "\ninputs were " + ("saturated at the limits of the robot" if cut else _FREE)
     return Report(robot.name, found, text, {arguments.plot: figure_of("plot_validity", found)})
 
 

@@ -47,7 +47,7 @@ def add_commands(commands: Commands) -> None:
     add_point(lqr)
     add_weights(lqr)
     add_output_file(group_of(lqr, OUTPUT), "the gain", RECORD, "Gain")
-    add_figure(lqr, "the poles, and the loop of each input with its margins,")
+    add_figure(lqr, "the poles, and the loop gain of each input with its margins,")
 
 
 def add_weights(command: argparse.ArgumentParser, *, integrated: bool = False) -> None:
@@ -59,15 +59,16 @@ def add_weights(command: argparse.ArgumentParser, *, integrated: bool = False) -
     add(
         group,
         "--weights",
-        "rule that sets all weights not given by --q, --r or --bryson. `urdf` (default) keeps the "
-        "inputs within the limits of the URDF for displacements of 30 deg of the base and 0.3 rad "
-        "of the joints; `identity` sets every weight to 1",
+        "rule for all weights that --q, --r and --bryson do not set. `urdf` (default) keeps the "
+        "inputs within the limits of the URDF after displacements of 30 deg of the base and 0.3 "
+        "rad of the joints. `identity` sets every weight to 1",
         choices=("urdf", "identity"),
     )
     add(
         group,
         "--q",
-        "weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b, q_m.hinge_*",
+        "weight on states. NAME is a state, a group or a pattern, such as q_m.joint_1, q_b or "
+        "q_m.hinge_*",
         assignment,
         "NAME=W",
         repeatable=True,
@@ -75,7 +76,7 @@ def add_weights(command: argparse.ArgumentParser, *, integrated: bool = False) -
     add(
         group,
         "--r",
-        "weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*",
+        "weight on inputs. NAME is an input, a group or a pattern, such as tau_b or tau_m.hinge_*",
         assignment,
         "NAME=W",
         repeatable=True,
@@ -83,16 +84,16 @@ def add_weights(command: argparse.ArgumentParser, *, integrated: bool = False) -
     add(
         group,
         "--bryson",
-        "largest acceptable value of a state, an input or a group, which gets the weight "
-        "1/VALUE^2. The other weights, from the rule, are scaled to match",
+        "largest acceptable value of a state, an input or a group. The weight is 1/VALUE^2, and "
+        "the weights of the rule are scaled to match",
         assignment,
         repeatable=True,
     )
     add(
         group,
         "--sample",
-        "sample time of the controller [s]: inputs are held for H; the continuous-time cost is "
-        "still minimised",
+        "sample time of the controller [s], with zero-order hold of the inputs. The sampled gain "
+        "minimises the continuous-time cost",
         number,
         "H",
     )
@@ -101,14 +102,14 @@ def add_weights(command: argparse.ArgumentParser, *, integrated: bool = False) -
     switch(
         group,
         "--reduce",
-        "if momentum is conserved, regulate only the states that the inputs can control",
+        "regulate only the states that the inputs can control if momentum is conserved",
     )
     yes_or_no(
         group,
         "--wheel-speeds",
-        "whether to return the speeds of reaction wheels to their values at the operating point. "
-        "By default, they are returned if thrusters or a base torque can absorb the wheel torque. "
-        "--wheel-speeds also returns the combinations of wheel speeds that exert no net torque on "
+        "regulate the speeds of reaction wheels to their values at the operating point, or not. By "
+        "default, wheel speeds are regulated if thrusters or a base torque can absorb the wheel "
+        "torque. --wheel-speeds also regulates combinations of wheel speeds without net torque on "
         "the robot (redundant wheels)",
     )
 

@@ -49,7 +49,7 @@ def add_commands(commands: Commands) -> None:
     add(
         group_of(simulate, SIMULATION),
         "--every",
-        "number of steps between saved rows; chosen automatically for long runs",
+        "save one row for every N integration steps; by default N is 1, or larger for long runs",
         count_of,
     )
     add_figure(simulate, "the nonlinear and the linear motion")
@@ -57,7 +57,8 @@ def add_commands(commands: Commands) -> None:
     add(
         shown,
         "--show",
-        "show only these curves in --plot: a state, input, group or pattern, as q_m or '*.hinge_*'",
+        "show only these curves in --plot. NAME is a state, input, group or pattern, such as q_m "
+        "or '*.hinge_*'",
         metavar="NAME",
         repeatable=True,
     )
@@ -121,8 +122,8 @@ def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> 
     pulled = (asked < -1e-9 * abs(asked).max(initial=0.0)).any(axis=1).mean()
     if pulled > 0.0:
         warnings.warn(
-            f"thrusters cannot pull: in {100.0 * pulled:.1f} % of the run a thrust below zero was "
-            "asked for and cut; --allocate gives the wrench with thrusts that push",
+            f"thrusters cannot pull: negative thrust was commanded in {100.0 * pulled:.1f} % of "
+            "the run and set to zero; --allocate produces the wrench with positive thrusts",
             FflinWarning,
             stacklevel=2,
         )

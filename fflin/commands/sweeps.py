@@ -62,14 +62,14 @@ def add_commands(commands: Commands) -> None:
     )
     points = sweep.add_argument_group(
         "points",
-        "give --grid, --random or --configurations; without --velocity, points are at rest, or "
-        "move as [point] of robot.toml does",
+        "give --grid, --random or --configurations. The default velocity of all points is the "
+        "velocity in [point] of robot.toml, or zero",
     )
     add(
         points,
         "--grid",
-        "N values of a joint [rad|m] from LO to HI; for several joints, all combinations are used, "
-        "and the last joint varies fastest",
+        "N values of a joint [rad|m] from LO to HI. With several joints, the points are all "
+        "combinations, and the last joint varies fastest",
         _axis,
         "JOINT=LO:HI:N",
         repeatable=True,
@@ -79,8 +79,8 @@ def add_commands(commands: Commands) -> None:
     add(
         points,
         "--configurations",
-        "q (N, nq) in Pinocchio's order, saved by numpy.savez, and optionally v (N, nv) and u (N, "
-        "nu)",
+        "file of numpy.savez with q (N, nq) in Pinocchio's order, and optionally v (N, nv) and u "
+        "(N, nu)",
         input_file,
         "FILE.npz",
     )
@@ -88,7 +88,7 @@ def add_commands(commands: Commands) -> None:
     add(
         points,
         "--range",
-        "with --random: range of a joint, which replaces the joint limits",
+        "range of a joint [rad|m] for --random; replaces the joint limits",
         _range,
         "JOINT=LO:HI",
         repeatable=True,
@@ -98,7 +98,8 @@ def add_commands(commands: Commands) -> None:
     add(
         point,
         "--effort",
-        "input at all points, by its name in u, such as tau_m.joint_1",
+        "value of an input at all points. NAME is the name of the input in u, such as "
+        "tau_m.joint_1",
         assignment,
         repeatable=True,
     )
@@ -110,16 +111,16 @@ def add_commands(commands: Commands) -> None:
     add(
         work,
         "--engine",
-        "compute the points in compiled code or in Python; by default compiled if numba is "
+        "compute the points in compiled code or in Python. The default is compiled if numba is "
         "installed and the outputs are the state",
         choices=("compiled", "python"),
     )
-    workers = "distribute the work over N processes, at most one for each core"
+    workers = "distribute the work over N processes; at most one per core"
     add(work, "--workers", workers, count_of)
     dask = "distribute the work over the workers of a dask scheduler"
     add(work, "--dask", dask, metavar="ADDRESS")
     switch(work, "--yes", "permit results of more than 10 GB")
-    what = "the models, which are collected in FILE.part, from which the same command resumes,"
+    what = "the models (after an interruption, the same command resumes from FILE.part)"
     add_output_file(group_of(sweep, OUTPUT), what, ROWS, "LinearBatch")
 
 
@@ -209,7 +210,8 @@ def _points(
     kinds = [bool(arguments.grid), arguments.random is not None, bool(arguments.configurations)]
     if sum(kinds) != 1:
         raise InputError(
-            "the points need exactly one of --grid, --random and --configurations; give one"
+            "the points of the sweep are not defined; give exactly one of --grid, --random and "
+            "--configurations"
         )
     if arguments.range and arguments.random is None:
         raise InputError("--range needs --random; --grid has its own ranges")
@@ -220,7 +222,8 @@ def _points(
             )
         if arguments.rpy or arguments.position:
             raise InputError(
-                "--rpy, --position and --configurations all set the base pose; give one"
+                "--rpy or --position is given with --configurations, which also sets the base "
+                "pose; give only one of them"
             )
         given = _given(arguments.configurations)
         for name, value in (("v", v), ("u", u)):

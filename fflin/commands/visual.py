@@ -54,13 +54,13 @@ def add_commands(commands: Commands) -> None:
     frames = "orbital frame used as the world; lvlh by default"
     add(page, "--frame", frames, choices=("lvlh", "hill"))
     _add_scene(page)
-    switch(page, "--no-open", "do not open a browser; the address appears on stderr")
+    switch(page, "--no-open", "do not open a browser, and print the address on stderr")
     port = "port on 127.0.0.1; a free port by default"
     add(page, "--port", port, int, "N", default=0)
 
 
 def add_pictures(
-    command: argparse.ArgumentParser, page: str = "that plays the motion without a network"
+    command: argparse.ArgumentParser, page: str = "that plays the motion offline"
 ) -> None:
     """Add the options of pages, pictures and animations of a motion."""
     group = group_of(command, OUTPUT)
@@ -68,12 +68,12 @@ def add_pictures(
     add(
         group,
         "--png",
-        "write a picture (needs Chromium): a strip of four images, or of images at the times of "
-        "--times",
+        "write a picture with a strip of images at the times of --times (four images by default); "
+        "requires Chromium",
         PICTURE,
     )
-    add(group, "--gif", "write an animation (needs Chromium)", ANIMATION)
-    add(group, "--times", "times of the pictures [s]", number, "T", nargs="+")
+    add(group, "--gif", "write an animation; requires Chromium", ANIMATION)
+    add(group, "--times", "times of the images in --png [s]", number, "T", nargs="+")
     _add_scene(group)
     add(group, "--fps", "frames per second of playback", number, "FPS", default=30.0)
     speed = "playback speed, in seconds of motion per second; 1 by default"
@@ -84,14 +84,16 @@ def _add_scene(group: Container) -> None:
     add(
         group,
         "--scene",
-        "show sky and planet (space), or a floor with a grid (lab, the default under gravity)",
+        "background: sky and planet (space), or a floor with a grid (lab). The default under "
+        "gravity is lab",
         choices=("space", "lab"),
     )
-    add(group, "--tool", "draw the axes and the trail of this frame", metavar="FRAME")
+    add(group, "--tool", "draw the axes and the path of this frame", metavar="FRAME")
     yes_or_no(
         group,
         "--follow",
-        "whether the camera follows the base; by default it does in long motions",
+        "let the camera follow the base, or not. By default, the camera follows the base in long "
+        "motions",
     )
 
 

@@ -53,13 +53,13 @@ class Feedback:
 class StateFeedback(Feedback):
     """State feedback ``u = u0 - K (x - x0)`` about the point of a linear model.
 
-    The angle of a continuous joint is unwrapped to within half a turn of x0.
+    The angle of a continuous joint is unwrapped to differ from x0 by at most half a turn.
 
     Parameters
     ----------
     lin : LinearModel
-        Model that K was designed for. With a reduced model, only the states of that model are
-        fed back.
+        Model that K was designed for. With a reduced model, only the states of the reduced model
+        are fed back.
     K : array_like (nu, nx)
         Gain.
 
@@ -83,7 +83,9 @@ class StateFeedback(Feedback):
 
     def __post_init__(self) -> None:
         if not isinstance(self.lin, LinearModel):
-            raise InputError(f"lin is a {type(self.lin).__name__}, expected a fflin.LinearModel")
+            raise InputError(
+                f"lin has type {type(self.lin).__name__}, expected a fflin.LinearModel"
+            )
         if self.lin.moving:
             raise InputError(
                 "the model is about a moving reference, expected one about a fixed point; follow "
@@ -127,8 +129,8 @@ class StateFeedback(Feedback):
 class Allocation:
     """Allocation of a policy's commands to thrusters and motors within their limits.
 
-    The policy commands the inputs of the robot `design`, such as torque and force on the base. The
-    thrusters and motors of the simulated robot then produce the generalised force that is closest
+    The policy commands the inputs of the robot `design`, such as torque and force on the base.
+    The thrusters and motors of the simulated robot produce the generalised force that is closest
     to the commanded force. The distance between two forces is the sum of squared differences
     between the accelerations that they cause. No thrust is negative, and no input exceeds its
     limit.
@@ -137,7 +139,7 @@ class Allocation:
     ----------
     policy : policy or StateFeedback
     design : Robot
-        The same robot with the inputs that the policy commands.
+        The simulated robot, but with the inputs that the policy commands.
 
     Examples
     --------
@@ -167,7 +169,9 @@ class Allocation:
             If the simulated robot and `design` have different joints.
         """
         if not isinstance(self.design, Robot):
-            raise InputError(f"design is a {type(self.design).__name__}, expected a fflin.Robot")
+            raise InputError(
+                f"design has type {type(self.design).__name__}, expected a fflin.Robot"
+            )
         if self.design.joint_names != robot.joint_names:
             raise InputError(
                 f"the design's joints differ from the joints of '{robot.name}'; give the same "
@@ -248,7 +252,7 @@ def bound(policy: Any, robot: Robot) -> Policy:
     result = policy.bind(robot) if hasattr(policy, "bind") else policy
     if not callable(result):
         raise InputError(
-            f"policy is a {type(policy).__name__}, expected policy(t, q, v) -> u, such as "
+            f"policy has type {type(policy).__name__}, expected policy(t, q, v) -> u, such as "
             "StateFeedback(lin, gain.K)"
         )
     return result

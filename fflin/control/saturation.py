@@ -91,13 +91,13 @@ def _pulses(
         if not sample:
             raise InputError(
                 f"thruster '{name}' is pulsed (on_off, least_impulse), which needs sampled "
-                "commands; give the time between samples, or a policy on a sampled model"
+                "commands; give sample=, or a policy for a sampled model"
             )
         if (item.least_impulse or 0.0) > largest * sample * dt:
             raise InputError(
                 f"thruster '{name}' has a least impulse of {item.least_impulse:g} N s, but "
                 f"can give only {largest * sample * dt:.3g} N s within a sample; give a longer "
-                "sampling time"
+                "sample time"
             )
     return Pulses(
         at=np.array(at),

@@ -262,8 +262,7 @@ class Coordinates:
         if size > _DATA_LIMIT:
             raise ModelError(
                 f"'{self.name}' has {self.n} joints, for which Pinocchio's Data takes about "
-                f"{size / 2**30:.1f} GiB, more than the limit of 1 GiB; lock joints that do not "
-                "matter"
+                f"{size / 2**30:.1f} GiB, more than the limit of 1 GiB; lock unimportant joints"
             )
 
 

@@ -120,7 +120,7 @@ def _asked(lock: Any) -> dict[str, float | None]:
         names = [None]
     if not all(isinstance(name, str) for name in names):
         raise InputError(
-            f"lock is a {type(lock).__name__}, expected {{joint: value}} or names of joints"
+            f"lock has type {type(lock).__name__}, expected {{joint: value}} or names of joints"
         )
     return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(names)
 

@@ -47,7 +47,8 @@ class Plant:
         self.actuation = self._aba.actuation
         if disturbance is not None and not callable(disturbance):
             raise InputError(
-                f"disturbance is a {type(disturbance).__name__}, expected a function of (t, q, v)"
+                f"disturbance has type {type(disturbance).__name__}, expected a function of (t, q, "
+                "v)"
             )
         self.disturbance = disturbance
         self._model, self._data = robot.model, robot.create_data()

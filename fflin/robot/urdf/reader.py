@@ -134,7 +134,7 @@ def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> p
     if nv > _LARGEST_NV:
         raise root.error(
             f"the joints have {nv - 6} degrees of freedom, expected at most {_LARGEST_NV - 6}, "
-            "which take 1 GiB in Pinocchio's Data; make fixed the joints that do not matter"
+            "for which Pinocchio's Data takes 1 GiB; change the type of unimportant joints to fixed"
         )
     root_joint = "root_joint"
     while root_joint in urdf.joints or root_joint in urdf.links:
