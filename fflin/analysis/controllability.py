@@ -283,6 +283,6 @@ def _notes(
         notes.append("fflin.momentum_reduction removes the conserved momenta")
     if not lin.is_equilibrium():
         notes.append(
-            "the operating point is not an equilibrium; the result holds for the frozen A and B"
+            "the operating point is not an equilibrium; the result is valid for the frozen A and B"
         )
     return tuple(notes)

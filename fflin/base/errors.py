@@ -260,8 +260,8 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     if near:
         hint = f"did you mean {', '.join(map(_visible, near))}?"
     elif not names:
-        hint = "there are none"
+        hint = "no such names exist"
     else:
-        hint = f"there are: {', '.join(map(_visible, names[:12]))}"
+        hint = f"known names: {', '.join(map(_visible, names[:12]))}"
         hint += f", ... ({len(names)} in all)" if len(names) > 12 else ""
     return UnknownNameError(f"no {kind} named '{name}'; {hint}")

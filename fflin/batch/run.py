@@ -155,10 +155,13 @@ def failure(
     if not kept.any():
         store.discard()
     elif store.part is not None:
-        message += f"; the other chunks are in {store.part}, and the same call resumes from them"
+        message += (
+            f"; the results of the other chunks are in {store.part}, from which the same call "
+            "resumes"
+        )
     else:
         batch = made(kept)
-        message += "; the other chunks are in the `batch` of this error"
+        message += "; the results of the other chunks are in the attribute `batch` of this error"
     return SweepError(message, tuple((*span, reason) for span, _, reason in failed), batch)
 
 

@@ -394,7 +394,7 @@ class Campaign(FrozenArrays):
             arrays, _, texts, _ = read_rows(source, verify=True)
             header = json.loads(texts["header"])
             if header["kind"] != "Campaign":
-                raise ValueError(f"it is a {header['kind']}")
+                raise ValueError(f"the file contains: {header['kind']}")
             return cls.of(arrays, header)
 
     @classmethod

@@ -145,14 +145,14 @@ class Dispersions:
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:
             raise InputError(
-                f"'{next(iter(spreads))}.{kind}' is dispersed, but a "
-                f"{type(self._policy).__name__} has no sensors; use a StateFeedback, "
+                f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy "
+                f"({type(self._policy).__name__}) has no sensors; use a StateFeedback, "
                 "OutputFeedback or LinearController"
             )
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
-                f"{kind} is dispersed, which needs a sampled policy, but this policy is "
-                "continuous; give sample=, a multiple of dt (--sample on the command line)"
+                f"{kind} is dispersed, but this policy is continuous, and only a sampled policy "
+                f"has a {kind}; give sample=, a multiple of dt (--sample on the command line)"
             )
         label = dict(zip(names, names, strict=True))
         try:

@@ -159,7 +159,7 @@ def settling_runs(
         raise InputError(
             f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
             f"1/s: a run would take {horizon / dt:.3g} steps, expected at most "
-            f"{_MOST_STEPS:,}; give a gain whose poles are closer together, or add damping"
+            f"{_MOST_STEPS:,}; give a gain with poles of more similar speed, or add damping"
         )
     if not lin.dt:
         every = max(1, int(horizon / dt / _CHECKS)) if predicts else 4

@@ -40,8 +40,9 @@ class Law:
         names = self._names
         if u.shape != self._shape:
             raise InputError(
-                f"policy(t, q, v) returned shape {u.shape} at t = {t:g} s, expected {self._shape}: "
-                f"one value for each of {', '.join(names[:8])}" + (", ..." if names[8:] else "")
+                f"policy(t, q, v) returned shape {u.shape} at t = {t:g} s, expected {self._shape} "
+                "with one value for each of "
+                f"{', '.join(names[:8])}" + (", ..." if names[8:] else "")
             )
         wrong = np.flatnonzero(~np.isfinite(np.clip(u, *self._limits)))
         if len(wrong) and float(v.dot(v)) < self._slow:

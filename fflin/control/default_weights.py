@@ -479,7 +479,7 @@ def rule_weights(
     if named:
         Q, R = _reweighed(lin, Q, R, terms, given_weights)
         rule = f"{', '.join(named)} as given, the others {rule}"
-        rule += " (figures of this rule alone)" if terms.any() else ""
+        rule += " (with this rule alone)" if terms.any() else ""
     if source.dt == lin.dt:
         return Q, R, None, rule
     return (*sampled_cost(source, lin.dt, Q, R), rule)

@@ -286,9 +286,9 @@ def _unregulated(gain: Gain) -> str:
             np.linalg.matrix_rank(selection(names, gain.state_names) @ B)
             for names in (gain.regulated, (*gain.regulated, *speeds))
         )
-        tied = "tied to the body's rate by the conserved momentum"
+        tied = "determined by the body's rate, as momentum is conserved"
         if gain.frame in ("lvlh", "hill"):
-            tied = "tied to the body's rate, except for the forces of the orbit"
+            tied = "determined by the body's rate, except for orbital forces"
         why = tied if held == both else "wheel_speeds=True regulates the controllable ones"
         parts.append(f"wheel speeds ({why})")
     return ", ".join(parts)

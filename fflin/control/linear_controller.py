@@ -223,9 +223,9 @@ class LinearController(Feedback):
         felt = lin.D.any(axis=1) & by.D.any(axis=0)
         if felt.any():
             raise InputError(
-                f"D of the controller acts on {listed(compress(lin.output_names, felt))}, which "
-                "depends directly on the inputs: an algebraic loop; set D to 0 there, for example "
-                "with a low-pass filter on this output"
+                "D of the controller forms an algebraic loop with "
+                f"{listed(compress(lin.output_names, felt))}, which depends directly on the "
+                "inputs; set D to 0 for this output, for example with a low-pass filter"
             )
         dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
         dt = lin.dt or dt if dt < 0.0 else dt

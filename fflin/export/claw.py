@@ -108,8 +108,8 @@ class CLaw:
         self.origin = None if placement is None else pin.XYZQUATToSE3(np.array(placement))
         if self._about["kind"] == "output" and placement is None:
             raise InputError(
-                "the C code was written from a Compensator alone, without the model about which "
-                "outputs are measured; write it from an OutputFeedback"
+                "the C code was written from a Compensator, which does not contain the model and "
+                "its outputs; write the C code from an OutputFeedback"
             )
         self._real = ctypes.c_double if self._about["real"] == "double" else ctypes.c_float
         self._step = getattr(_compiled(code, compiler), f"{self.name}_step")

@@ -262,8 +262,8 @@ def _model_of(gain: Gain, robot: Robot) -> LinearModel:
     """Return the model about the point of a gain from a file, relative to its reference."""
     if not gain.placement.size:
         raise InputError(
-            "the file of the gain does not contain the reference pose, since an older version "
-            "wrote it; design the gain again"
+            "the file of the gain does not contain the reference pose, because the file was "
+            "written by an older version; design the gain again"
         )
     if gain.urdf_sha256 != robot.urdf_sha256:
         raise InputError(

@@ -273,7 +273,7 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
         duration = traj.t[-1] - traj.t[0]
         raise InputError(
             f"dt is {dt:g} s, but the duration of the trajectory, {duration:g} s, is not a "
-            "multiple of it; give a dt that divides the duration"
+            "multiple of dt; give a dt that divides the duration"
         )
     cuts = []
     for start, end in pairwise(times.tolist()):

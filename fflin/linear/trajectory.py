@@ -102,8 +102,7 @@ class Trajectory(Design):
         if (back := np.flatnonzero(np.diff(times) <= 0.0)).size:
             late, early = times[back[0] : back[0] + 2]
             raise InputError(
-                f"t[{back[0] + 1}] is {early:.9g} s, after {late:.9g} s; expected each time later "
-                "than the one before"
+                f"t[{back[0] + 1}] is {early:.9g} s, after {late:.9g} s; expected increasing times"
             )
         if self.hold is not None and str(self.hold) not in ("linear", "previous"):
             raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
@@ -243,7 +242,7 @@ class Trajectory(Design):
         if turns[k] > _FARTHEST_TURN:
             return (
                 f"the base rotates by {turns[k]:.2g} rad from t = {self.t[k]:g} to "
-                f"{self.t[k + 1]:g} s, which two knots cannot represent; give knots at most "
+                f"{self.t[k + 1]:g} s, which is too far for one interval; give knots at most "
                 f"{_FARTHEST_TURN:g} rad apart"
             )
         return ""

@@ -236,7 +236,7 @@ class Coordinates:
                 raise InputError(
                     f"joint '{joint.name}' is at {joint.value(q):.9g}, but it mimics "
                     f"'{leader.name}', which puts it at {joint.value(placed):.9g}; "
-                    "fflin.configuration places mimic joints"
+                    "use fflin.configuration, which sets mimic joints"
                 )
         return placed
 

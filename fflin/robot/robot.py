@@ -432,5 +432,7 @@ class Robot(Coordinates):
         joints = checked_passive(passive, bare.joint, bare.joint_names, self.locked)
         inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
         if not inputs:
-            raise InputError("passive removes all inputs; a model needs at least one")
+            raise InputError(
+                "all inputs are torques of passive joints; a model needs at least one input"
+            )
         return replace(self, passive=joints, inputs=inputs)

@@ -42,7 +42,7 @@ def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
     ]
     if not inputs:
         raise InputError(
-            f"without {', '.join(values)} the robot has no input; a model needs at least one"
+            f"without {', '.join(values)} the robot has no input; a model needs at least one input"
         )
     outputs = [
         replace(each, joints=tuple(x for x in each.joints if x not in gone))

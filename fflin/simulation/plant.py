@@ -115,7 +115,7 @@ class Plant:
         finite = np.isfinite(force).all() or not np.abs(v).max() < _DIVERGED
         if force.shape != (self.robot.nv,) or not finite:
             raise InputError(
-                f"disturbance(t, q, v) gave shape {force.shape} at t = {t:g} s, expected "
+                f"disturbance(t, q, v) returned shape {force.shape} at t = {t:g} s, expected "
                 f"({self.robot.nv},) finite numbers: a generalised force in Pinocchio's order"
             )
         return force

@@ -314,7 +314,8 @@ def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> N
 def _range(one: Parameter, value: Any) -> Range:
     if one.part[:9] == "direction":
         said = (
-            "turns a unit vector, on which the model depends in no rational form; use sensitivity"
+            "rotates a unit vector, so that the model is not a rational function of it; use "
+            "fflin.sensitivity for this parameter"
         )
         raise InputError(f"'{one.name}' {said}")
     if isinstance(value, tuple | list):
