@@ -375,7 +375,7 @@ def _achieved(lin: LinearModel, trial: _Trial) -> str:
     said += f"damping ratio at least {(decay / fast).min():.2g}"
     slow = np.flatnonzero(decay < _AS_SLOW * math.sqrt(0.5) * trial.limit.bandwidth)
     if vibrating := _vibrations(lin, trial, slow.tolist()):
-        said += f"; not regulated because damped: {listed(list(dict.fromkeys(vibrating.values())))}"
+        said += f"; decaying by their own damping only: {listed(list(dict.fromkeys(vibrating.values())))}"
     slow = np.setdiff1d(slow, list(vibrating)).astype(int)
     if names := _moving_most(lin, trial.modes[:, slow]):
         said += f"; slowed by springs, gravity or motion: {listed(names)}"
