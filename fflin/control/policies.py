@@ -13,7 +13,7 @@ from fflin.base.validation import Array, as_double
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import Frame, StateMap, readout
-from fflin.kernel.allocation import least_squares, solve
+from fflin.kernel.allocation import nearest
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.limits import limits_of
@@ -270,20 +270,6 @@ def fed_back(policy: Any) -> tuple[str, ...]:
         return ()
     used = np.ones(len(of.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
     return tuple(name for name, size in zip(of.state_names, used, strict=True) if size)
-
-
-def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
-    """Return u (k,) within its bounds (k,) that makes A u nearest to b, the smallest of these."""
-    numbers, size = [0.0] * len(least), len(b)
-    # The entries of a list are read faster than the entries of an array.
-    problem = least_squares(least.tolist(), most.tolist(), size)._replace(
-        columns=np.concatenate((A.T.ravel(), b)),
-        state=[0] * len(least),
-        order=[0] * len(least),
-        **{name: numbers.copy() for name in ("x", "s", "low", "high")},
-    )
-    solve(problem, size, 0)
-    return np.array(problem.x)
 
 
 def gives_every_wrench(W: Array, pushing: NDArray[np.bool_]) -> bool:
