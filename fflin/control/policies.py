@@ -9,7 +9,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, as_double
+from fflin.base.validation import Array, as_double, instance
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import Frame, StateMap, readout
@@ -82,8 +82,7 @@ class StateFeedback(Feedback):
     K: Array
 
     def __post_init__(self) -> None:
-        if not isinstance(self.lin, LinearModel):
-            raise InputError(f"lin is a {type(self.lin).__name__}, expected a fflin.LinearModel")
+        instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
         if self.lin.moving:
             raise InputError(
                 "the model is about a moving reference, expected one about a fixed point; follow "
@@ -166,8 +165,7 @@ class Allocation:
         InputError
             If the simulated robot and `design` have different joints.
         """
-        if not isinstance(self.design, Robot):
-            raise InputError(f"design is a {type(self.design).__name__}, expected a fflin.Robot")
+        instance("design", self.design, Robot, "a fflin.Robot")
         if self.design.joint_names != robot.joint_names:
             raise InputError(
                 f"the design's joints differ from the joints of '{robot.name}'; give the same "
