@@ -215,7 +215,7 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
         "poles": poles,
     }
     entries = {"kind": "Equilibrium", **vars(held), "poles": poles}
-    write = partial(write_record, record=entries, sealed=True)
+    write = partial(write_record, record=entries, checksummed=True)
     return Report(robot.name, result, "\n".join(lines), {arguments.output_file: write})
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from fflin.base import __version__
 from fflin.base.errors import FflinError, FflinWarning, FileError
-from fflin.base.writing import check_ending, check_place, files_of_command, place
+from fflin.base.writing import check_ending, check_output_path, files_of_command, followed_path
 from fflin.commands import BAD_INPUT, DONE, parser
 from fflin.commands.results import finish
 
@@ -113,7 +113,7 @@ def _parser(asked: str) -> parser.Command:
 def check_outputs(arguments: argparse.Namespace) -> None:
     """Refuse output files that cannot be written, before any computation."""
     for path, kind in parser.outputs_of(arguments):
-        check_place(path)  # first, since it says that an output is an input
+        check_output_path(path)  # first, since it says that an output is an input
         check_ending(path, kind.endings)
         if kind is parser.FIGURE:
             from fflin.base.figures import require_matplotlib
@@ -131,7 +131,7 @@ def require_own_kind(arguments: argparse.Namespace) -> None:
         from fflin.linear.files import foreign_table
 
         path = foreign_table(path) or path
-        place(path)  # refuses a table that is an input file
+        followed_path(path)  # refuses a table that is an input file
     if not path.is_file():
         return
     found = kind_of(path)

@@ -165,7 +165,7 @@ def _info(arguments: argparse.Namespace) -> Report:
 
 
 def _init(arguments: argparse.Namespace) -> Report:
-    from fflin.base.writing import check_place, write_whole
+    from fflin.base.writing import check_output_path, write_atomically
     from fflin.robot.catalog import find_robot
     from fflin.robot.loading import load
     from fflin.robot.summary import draft
@@ -174,7 +174,7 @@ def _init(arguments: argparse.Namespace) -> Report:
     if found.path.suffix.lower() == ".toml":
         raise InputError(f"{found.path} is already a robot file; give a URDF")
     target = arguments.output_file or Path(f"{found.name}.toml")
-    check_place(target)
+    check_output_path(target)
     if target.exists() and not arguments.force:
         raise FileError(f"{target} already exists; give another name with -o, or add --force")
     urdf = found.name
@@ -183,7 +183,7 @@ def _init(arguments: argparse.Namespace) -> Report:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         robot = load(arguments.robot)
-    write_whole({target: draft(robot, urdf).encode()})
+    write_atomically({target: draft(robot, urdf).encode()})
     load(target)  # warns of settings that the file leaves open
     text = f"robot file of '{robot.name}'; try: fflin simulate {target}"
     return Report(robot.name, {}, text, {target: None})
