@@ -264,7 +264,7 @@ class Sensitivity:
         FileError
             If the file has another ending or cannot be written.
         """
-        write_record(as_path(path), sensitivity_record(self), sealed=self.lin.verified)
+        write_record(as_path(path), sensitivity_record(self), checksummed=self.lin.verified)
 
 
 def sensitivity_record(found: Sensitivity) -> Record:
