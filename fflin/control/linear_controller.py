@@ -87,10 +87,10 @@ class Compensation:
             self.rates.append(after)
         return u
 
-    def advance(self, shares: Array, last: bool) -> None:
+    def advance(self, weights: Array, last: bool) -> None:
         """Integrate z to the next stage from weights of z at the step's start and of its rates."""
         if not self.dt:
-            self.estimate, self.stages = shares @ np.array(self.rates), self.stages + 1
+            self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:
                 self.rates, self.stages = [self.estimate], 0
 
