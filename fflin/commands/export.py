@@ -5,21 +5,13 @@ from __future__ import annotations
 import argparse
 
 from fflin.base.errors import FileError
-from fflin.commands.arguments import (
-    OUTPUT,
-    Commands,
-    add,
-    command,
-    group_of,
-    input_file,
-    input_name,
-)
+from fflin.commands import parser
 from fflin.commands.results import Report
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add export."""
-    export = command(
+    export = parser.command(
         commands,
         "export",
         _export,
@@ -27,26 +19,25 @@ def add_commands(commands: Commands) -> None:
         example="fflin export gain.npz --robot servicer_7dof --limits urdf -o flight",
     )
     what = "gain, compensator or gain schedule saved by fflin: .npz, .mat or .json"
-    export.add_argument("file", metavar="FILE", type=input_file, help=what)
-    group = group_of(export, OUTPUT)
+    export.add_argument("file", metavar="FILE", type=parser.input_file, help=what)
+    group = export.group(parser.OUTPUT)
     folder = "folder for the code; a missing folder is created"
     group.add_argument("-o", "--output-folder", metavar="FOLDER", required=True, help=folder)
-    add(
-        group,
+    group.add(
         "--robot",
         "robot of the design: a name listed by `fflin robots`, or the path of a URDF or "
         "robot.toml. The default is the robot named in FILE",
         metavar="ROBOT",
-        type=input_name,
+        type=parser.input_name,
     )
     limits = (
         "urdf: saturate the inputs at the limits of the robot, as `fflin simulate` does; none "
         "(default): do not saturate the inputs"
     )
-    add(group, "--limits", limits, choices=("urdf", "none"), default="none")
-    add(group, "--name", "prefix of all names in the C code", metavar="NAME", default="controller")
+    group.add("--limits", limits, choices=("urdf", "none"), default="none")
+    group.add("--name", "prefix of all names in the C code", metavar="NAME", default="controller")
     real = "floating-point type in the C code; double by default"
-    add(group, "--real", real, choices=("double", "float"), default="double")
+    group.add("--real", real, choices=("double", "float"), default="double")
 
 
 def _export(arguments: argparse.Namespace) -> Report:

@@ -16,7 +16,7 @@ from fflin.base import record
 from fflin.base.errors import FflinError, FileError, InputError, unknown
 from fflin.base.record import Record, read_record, reading, text
 from fflin.base.validation import Array, as_double
-from fflin.base.writing import check_ending, csv_table, read_file, write_whole
+from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
@@ -40,7 +40,7 @@ def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
 
 def write_table(path: Path, names: Sequence[str], rows: Array, last: Sequence[str] = ()) -> None:
     """Write named columns, and behind them what is the same in every row."""
-    write_whole({path: csv_table([names, *([*row, *last] for row in rows.tolist())])})
+    write_atomically({path: csv_table([names, *([*row, *last] for row in rows.tolist())])})
 
 
 def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dict[str, Any]:

@@ -214,7 +214,7 @@ class Robot(Coordinates):
             If one of these holds:
 
             - a value is negative or not a number;
-            - a wheel has more inertia than its carrier;
+            - a wheel has a larger inertia than the link that carries it;
             - both gravity and an orbit are given.
         UnknownNameError
             If a field, a joint, a frame of an input or output, or a name in `limits` does not

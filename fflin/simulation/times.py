@@ -48,7 +48,7 @@ class Times(NamedTuple):
         """Remarks on the recorded rows, for the report."""
         said = f"one of {self.every} steps is recorded; every=1 (--every 1) "
         notes: tuple[str, ...] = (
-            (f"{said}records all {self.steps:,} steps",) if self.thinned else ()
+            (f"{said}records all steps {self.steps:,} steps",) if self.thinned else ()
         )
         if self.sample and self.every % self.sample and self.sample % self.every:
             aside = (
