@@ -155,7 +155,7 @@ class Campaign(FrozenArrays):
     input_units: tuple[str, ...]
     input_limits: tuple[
         float, ...
-    ]  # largest magnitudes that act, infinite where no such names exist
+    ]  # largest magnitudes that act, infinite where there are none
     times: tuple[float, ...]
     judged: tuple[str, ...]  # the kinds that are steered
     robot: str

@@ -110,7 +110,7 @@ def default_weights(
 
 
 def _damping(lin: LinearModel) -> Array:
-    """Return B (m, m) of viscous dampers, 0 where no such names exist."""
+    """Return B (m, m) of viscous dampers, 0 where there are none."""
     m = len(lin.M)
     if lin.dt or not lin.A[m:, m:].any():  # samples show springs as damping too
         return np.zeros_like(lin.M)
