@@ -5,21 +5,13 @@ from __future__ import annotations
 import argparse
 
 from fflin.base.errors import FileError
-from fflin.commands.arguments import (
-    OUTPUT,
-    Commands,
-    add,
-    command,
-    group_of,
-    input_file,
-    input_name,
-)
+from fflin.commands import parser
 from fflin.commands.results import Report
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add export."""
-    export = command(
+    export = parser.command(
         commands,
         "export",
         _export,
@@ -27,23 +19,22 @@ def add_commands(commands: Commands) -> None:
         example="fflin export gain.npz --robot servicer_7dof --limits urdf -o flight",
     )
     what = "gain, compensator or gain schedule saved by fflin: .npz, .mat or .json"
-    export.add_argument("file", metavar="FILE", type=input_file, help=what)
-    group = group_of(export, OUTPUT)
+    export.add_argument("file", metavar="FILE", type=parser.input_file, help=what)
+    group = export.group(parser.OUTPUT)
     folder = "folder of the code; it is made if necessary"
     group.add_argument("-o", "--output-folder", metavar="FOLDER", required=True, help=folder)
-    add(
-        group,
+    group.add(
         "--robot",
         "robot that the design was made for: a name in `fflin robots`, a URDF or a robot.toml. By "
         "default the robot that FILE names",
         metavar="ROBOT",
-        type=input_name,
+        type=parser.input_name,
     )
     limits = "limit the inputs as in simulate (urdf), or not (none, default)"
-    add(group, "--limits", limits, choices=("urdf", "none"), default="none")
-    add(group, "--name", "prefix of the names in C", metavar="NAME", default="controller")
+    group.add("--limits", limits, choices=("urdf", "none"), default="none")
+    group.add("--name", "prefix of the names in C", metavar="NAME", default="controller")
     real = "type of the numbers; double by default"
-    add(group, "--real", real, choices=("double", "float"), default="double")
+    group.add("--real", real, choices=("double", "float"), default="double")
 
 
 def _export(arguments: argparse.Namespace) -> Report:

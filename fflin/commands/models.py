@@ -10,25 +10,7 @@ from typing import TYPE_CHECKING
 
 from fflin.base.errors import FflinError, FflinWarning, FileError, InputError
 from fflin.base.writing import check_ending
-from fflin.commands.arguments import (
-    OUTPUT,
-    POINT,
-    RECORD,
-    TABLE,
-    Commands,
-    OutputFile,
-    add,
-    add_figure,
-    add_output_file,
-    add_point,
-    add_pose,
-    add_robot,
-    add_system,
-    command,
-    group_of,
-    input_name,
-    number,
-)
+from fflin.commands import options, parser
 from fflin.commands.points import configuration_of, linear_model, load_robot, velocity_of
 from fflin.commands.results import Report, figure_of
 from fflin.commands.tracking import add_trajectory, check_along, checked, linearize_along
@@ -37,21 +19,21 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add robots, info, init, linearize and check."""
     summary = "list the robots that can be loaded by name"
-    command(commands, "robots", _robots, summary, example="fflin robots")
-    info = command(
+    parser.command(commands, "robots", _robots, summary, example="fflin robots")
+    info = parser.command(
         commands,
         "info",
         _info,
         "show mass, inertia, wheels and thrusters at a point, and tree, limits and settings",
         example="fflin info servicer_7dof",
     )
-    add_robot(info)
-    add_pose(group_of(info, POINT))
-    add_system(info)
-    init = command(
+    options.add_robot(info)
+    options.add_pose(info.group(parser.POINT))
+    options.add_system(info)
+    init = parser.command(
         commands,
         "init",
         _init,
@@ -59,17 +41,20 @@ def add_commands(commands: Commands) -> None:
         example="fflin init my.urdf && fflin simulate my.toml",
     )
     urdf = "path of a URDF, or name of a robot in `fflin robots`"
-    init.add_argument("robot", metavar="URDF", type=input_name, help=urdf)
+    init.add_argument("robot", metavar="URDF", type=parser.input_name, help=urdf)
     what = "the robot file (by default the URDF's name with .toml, in the current folder)"
-    add_output_file(
-        group_of(init, OUTPUT), what, OutputFile((".toml",)), force="replace an existing file"
+    options.add_output_file(
+        init.group(parser.OUTPUT),
+        what,
+        parser.OutputFile((".toml",)),
+        force="replace an existing file",
     )
     _add_linearize(commands)
     _add_check(commands)
 
 
-def _add_linearize(commands: Commands) -> None:
-    linearize = command(
+def _add_linearize(commands: parser.Commands) -> None:
+    linearize = parser.command(
         commands,
         "linearize",
         _linearize,
@@ -78,11 +63,10 @@ def _add_linearize(commands: Commands) -> None:
         common="joint rpy position velocity effort equilibrium frame reference inputs dt tool "
         "trajectory output-file plot",
     )
-    add_point(linearize)
-    made = group_of(linearize, OUTPUT)
-    add(made, "--dt", "sample the model, with inputs held for H [s]", number, "H")
-    add(
-        made,
+    options.add_point(linearize)
+    made = linearize.group(parser.OUTPUT)
+    made.add("--dt", "sample the model, with inputs held for H [s]", float, "H")
+    made.add(
         "--for",
         "convert the model to the coordinates of this tool; needs -o FILE",
         choices=("drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"),
@@ -90,12 +74,14 @@ def _add_linearize(commands: Commands) -> None:
     )
     add_trajectory(linearize)
     what = "A, B, C, D (with .csv one file per matrix: NAME.A.csv, ...)"
-    add_output_file(made, what, TABLE, "LinearModel", "LinearTrajectory", "ToolModel")
-    add_figure(linearize, "the magnitudes of the entries of A and B")
+    options.add_output_file(
+        made, what, parser.TABLE, "LinearModel", "LinearTrajectory", "ToolModel"
+    )
+    options.add_figure(linearize, "the magnitudes of the entries of A and B")
 
 
-def _add_check(commands: Commands) -> None:
-    check = command(
+def _add_check(commands: parser.Commands) -> None:
+    check = parser.command(
         commands,
         "check",
         _check,
@@ -104,12 +90,12 @@ def _add_check(commands: Commands) -> None:
         common="joint rpy position velocity effort equilibrium frame reference inputs trajectory "
         "tolerance plot",
     )
-    add_point(check)
+    options.add_point(check)
     add_trajectory(check)
-    shown = group_of(check, OUTPUT)
+    shown = check.group(parser.OUTPUT)
     tolerance = "relative tolerance of all errors; by default each error has its own"
-    add(shown, "--tolerance", tolerance, number, "X")
-    add_figure(check, "the errors and their tolerances")
+    shown.add("--tolerance", tolerance, float, "X")
+    options.add_figure(check, "the errors and their tolerances")
 
 
 def _robots(_: argparse.Namespace) -> Report:
@@ -179,7 +165,7 @@ def _info(arguments: argparse.Namespace) -> Report:
 
 
 def _init(arguments: argparse.Namespace) -> Report:
-    from fflin.base.writing import check_place, write_whole
+    from fflin.base.writing import check_output_path, write_atomically
     from fflin.robot.catalog import find_robot
     from fflin.robot.loading import load
     from fflin.robot.summary import draft
@@ -188,7 +174,7 @@ def _init(arguments: argparse.Namespace) -> Report:
     if found.path.suffix.lower() == ".toml":
         raise InputError(f"{found.path} is already a robot file; give a URDF")
     target = arguments.output_file or Path(f"{found.name}.toml")
-    check_place(target)
+    check_output_path(target)
     if target.exists() and not arguments.force:
         raise FileError(f"{target} already exists; give another name with -o, or add --force")
     urdf = found.name
@@ -197,7 +183,7 @@ def _init(arguments: argparse.Namespace) -> Report:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         robot = load(arguments.robot)
-    write_whole({target: draft(robot, urdf).encode()})
+    write_atomically({target: draft(robot, urdf).encode()})
     load(target)  # warns of settings that the file leaves open
     text = f"robot file of '{robot.name}'; try: fflin simulate {target}"
     return Report(robot.name, {}, text, {target: None})
@@ -209,7 +195,7 @@ def _linearize(arguments: argparse.Namespace) -> Report:
             "--for saves a model at a point; give it with -o FILE and without --trajectory"
         )
     if arguments.output_file and (arguments.tool or arguments.trajectory):
-        check_ending(arguments.output_file, RECORD.endings)
+        check_ending(arguments.output_file, parser.RECORD.endings)
     if arguments.trajectory:
         return linearize_along(arguments)
     _, lin = linear_model(arguments)

@@ -4,32 +4,15 @@ from __future__ import annotations
 
 import argparse
 
-from fflin.commands.arguments import (
-    OUTPUT,
-    TABLE,
-    TRAJECTORY,
-    Commands,
-    add,
-    add_limits,
-    add_output_file,
-    add_pose,
-    add_robot,
-    add_system,
-    add_target,
-    assignment,
-    command,
-    count_of,
-    group_of,
-    number,
-)
+from fflin.commands import options, parser
 from fflin.commands.loops import target_of
 from fflin.commands.points import configuration_of, limits_of_options, load_robot, once, velocity_of
 from fflin.commands.results import Report
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add plan."""
-    plan = command(
+    plan = parser.command(
         commands,
         "plan",
         _plan,
@@ -38,21 +21,23 @@ def add_commands(commands: Commands) -> None:
         common="joint rpy position velocity target-joint target-rpy target-position "
         "target-velocity duration knots hold free-end r limits limit inputs output-file",
     )
-    add_robot(plan)
-    add_system(plan)
-    add_pose(group_of(plan, "start"))
-    add_target(group_of(plan, "target"))
-    group = group_of(plan, TRAJECTORY)
-    add(group, "--duration", "duration of the motion [s]", number, "T", required=True)
-    add(group, "--knots", "number of equally spaced knots", count_of, default=101)
+    options.add_robot(plan)
+    options.add_system(plan)
+    options.add_pose(plan.group("start"))
+    options.add_target(plan.group("target"))
+    group = plan.group(parser.TRAJECTORY)
+    group.add("--duration", "duration of the motion [s]", float, "T", required=True)
+    group.add("--knots", "number of equally spaced knots", int, default=101)
     hold = "inputs between knots: held (previous, default), or interpolated (linear)"
-    add(group, "--hold", hold, choices=("previous", "linear"), default="previous")
+    group.add("--hold", hold, choices=("previous", "linear"), default="previous")
     free = "state whose final value is free: a name, group or pattern"
-    add(group, "--free-end", free, metavar="NAME", repeatable=True)
+    group.add("--free-end", free, metavar="NAME", repeatable=True)
     weight = "weight on an input, a group or a pattern; by default 1/limit^2"
-    add(group, "--r", weight, assignment, "NAME=W", repeatable=True)
-    add_limits(group)
-    add_output_file(group_of(plan, OUTPUT), "the trajectory", TABLE, "Trajectory", "Motion")
+    group.add("--r", weight, parser.assignment, "NAME=W", repeatable=True)
+    options.add_limits(group)
+    options.add_output_file(
+        plan.group(parser.OUTPUT), "the trajectory", parser.TABLE, "Trajectory", "Motion"
+    )
     # Options of other commands, which the start and the target read.
     plan.set_defaults(relative_equilibrium=None)
 

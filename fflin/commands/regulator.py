@@ -8,23 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityError
-from fflin.commands.arguments import (
-    CONTROLLER,
-    OUTPUT,
-    RECORD,
-    Commands,
-    add,
-    add_figure,
-    add_former_name,
-    add_output_file,
-    add_point,
-    assignment,
-    command,
-    group_of,
-    number,
-    switch,
-    yes_or_no,
-)
+from fflin.commands import options, parser
 from fflin.commands.points import linear_model, once
 from fflin.commands.results import Report, figure_of
 
@@ -33,9 +17,9 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add lqr."""
-    lqr = command(
+    lqr = parser.command(
         commands,
         "lqr",
         _lqr,
@@ -44,67 +28,60 @@ def add_commands(commands: Commands) -> None:
         common="joint velocity equilibrium inputs frame weights q r bryson sample reduce "
         "wheel-speeds output-file plot",
     )
-    add_point(lqr)
+    options.add_point(lqr)
     add_weights(lqr)
-    add_output_file(group_of(lqr, OUTPUT), "the gain", RECORD, "Gain")
-    add_figure(lqr, "the poles, and the loop of each input with its margins,")
+    options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD, "Gain")
+    options.add_figure(lqr, "the poles, and the loop of each input with its margins,")
 
 
-def add_weights(command: argparse.ArgumentParser, *, integrated: bool = False) -> None:
+def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
     """Add the options of the cost, the sample time and the regulated states.
 
     If a loop is `integrated`, --dt is its integration step; otherwise it is the former --sample.
     """
-    group = group_of(command, CONTROLLER)
-    add(
-        group,
+    group = command.group(parser.CONTROLLER)
+    group.add(
         "--weights",
         "rule that sets all weights not given by --q, --r or --bryson. `urdf` (default) keeps the "
         "inputs within the limits of the URDF for displacements of 30 deg of the base and 0.3 rad "
         "of the joints; `identity` sets every weight to 1",
         choices=("urdf", "identity"),
     )
-    add(
-        group,
+    group.add(
         "--q",
         "weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b, q_m.hinge_*",
-        assignment,
+        parser.assignment,
         "NAME=W",
         repeatable=True,
     )
-    add(
-        group,
+    group.add(
         "--r",
         "weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*",
-        assignment,
+        parser.assignment,
         "NAME=W",
         repeatable=True,
     )
-    add(
-        group,
+    group.add(
         "--bryson",
         "largest acceptable value of a state, an input or a group, which gets the weight "
         "1/VALUE^2. The other weights, from the rule, are scaled to match",
-        assignment,
+        parser.assignment,
         repeatable=True,
     )
-    add(
-        group,
+    group.add(
         "--sample",
         "sample time of the controller [s]: inputs are held for H; the continuous-time cost is "
         "still minimised",
-        number,
+        float,
         "H",
     )
     if not integrated:
-        add_former_name(group, "--dt", "sample")
-    switch(
-        group,
+        options.add_former_name(group, "--dt", "sample")
+    group.switch(
         "--reduce",
         "if momentum is conserved, regulate only the states that the inputs can control",
     )
-    yes_or_no(
-        group,
+    group.yes_or_no(
         "--wheel-speeds",
         "whether to return the speeds of reaction wheels to their values at the operating point. "
         "By default, they are returned if thrusters or a base torque can absorb the wheel torque. "

@@ -9,19 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import chosen, input_keys
-from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.arguments import (
-    OUTPUT,
-    SIMULATION,
-    TABLE,
-    Commands,
-    add,
-    add_figure,
-    add_output_file,
-    command,
-    count_of,
-    group_of,
-)
+from fflin.commands import DONE, FELL_SHORT, options, parser
 from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
 from fflin.commands.results import Report
@@ -33,9 +21,9 @@ if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add simulate."""
-    simulate = command(
+    simulate = parser.command(
         commands,
         "simulate",
         _simulate,
@@ -46,22 +34,20 @@ def add_commands(commands: Commands) -> None:
         "free limits duration inputs output-file plot html",
     )
     add_loop(simulate)
-    add(
-        group_of(simulate, SIMULATION),
+    simulate.group(parser.SIMULATION).add(
         "--every",
         "number of steps between saved rows; chosen automatically for long runs",
-        count_of,
+        int,
     )
-    add_figure(simulate, "the nonlinear and the linear motion")
-    shown = group_of(simulate, OUTPUT)
-    add(
-        shown,
+    options.add_figure(simulate, "the nonlinear and the linear motion")
+    shown = simulate.group(parser.OUTPUT)
+    shown.add(
         "--show",
         "show only these curves in --plot: a state, input, group or pattern, as q_m or '*.hinge_*'",
         metavar="NAME",
         repeatable=True,
     )
-    add_output_file(shown, "the motion", TABLE, "Motion")
+    options.add_output_file(shown, "the motion", parser.TABLE, "Motion")
     add_pictures(simulate)
 
 

@@ -96,8 +96,8 @@ def thruster_report(robot: Robot, q: Array, center: Array) -> str:
     if "thrust" not in actuation.groups:
         return ""
     # Imported where there are thrusters: both take longer than all the rest of the report.
+    from fflin.control.channel import input_limits
     from fflin.control.policies import gives_every_wrench
-    from fflin.control.saturation import input_limits
 
     thrusters = actuation.groups["thrust"]
     W = actuation.columns(robot.create_data(), _at_origin(q))[:6, thrusters]

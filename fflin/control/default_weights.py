@@ -20,8 +20,8 @@ from fflin.analysis.reduction import (
 from fflin.base.errors import FflinWarning, InputError, listed, unknown
 from fflin.base.names import input_keys
 from fflin.base.validation import Array
+from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
-from fflin.control.saturation import warn_beyond
 from fflin.control.weights import GivenWeight, sampled_cost, weights_of
 from fflin.linear.model import LinearModel
 

@@ -366,11 +366,8 @@ class OutputFeedback(LinearController):
         compensator: Compensator,
         noise: Callable[[float], ArrayLike] | None = None,
     ) -> None:
-        if not isinstance(lin, LinearModel) or not isinstance(compensator, Compensator):
-            raise InputError(
-                f"OutputFeedback got a {type(lin).__name__} and a {type(compensator).__name__}, "
-                "expected a LinearModel and a Compensator, as fflin.lqg returns it"
-            )
+        instance("lin", lin, LinearModel, "a fflin.LinearModel")
+        instance("compensator", compensator, Compensator, "a Compensator, as fflin.lqg returns it")
         if not lin.dt or lin.moving:
             raise InputError(
                 "the model must be sampled and about a fixed point; use lin.discretize(dt), and "

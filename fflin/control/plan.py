@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array, number, whole
+from fflin.control.channel import input_limits
 from fflin.control.optimal.plan_search import Search, cost_of_inputs, excess, limited_values
 from fflin.control.optimal.shooting import Point, Shooting
-from fflin.control.saturation import input_limits
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
 from fflin.dynamics.actuation import Actuation

@@ -20,7 +20,7 @@ from fflin.base import record
 from fflin.base.errors import FflinError, FileError, InputError, unknown
 from fflin.base.record import Record, read_record, reading, text
 from fflin.base.validation import Array, as_double
-from fflin.base.writing import check_ending, csv_table, read_file, write_whole
+from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
@@ -35,9 +35,9 @@ def write_csv(path: Path, traj: Any) -> None:
     rows = np.column_stack((traj.t, traj.q, traj.v, traj.u)).tolist()
     table = [names, *([*row, traj.hold, traj.frame] for row in rows)]
     if traj.verified:
-        seal = _digest(table)
-        table = [[*names, record.SEAL], *([*row, seal] for row in table[1:])]
-    write_whole({path: csv_table(table)})
+        checksum = _digest(table)
+        table = [[*names, record.CHECKSUM], *([*row, checksum] for row in table[1:])]
+    write_atomically({path: csv_table(table)})
 
 
 def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
@@ -48,7 +48,7 @@ def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
 
 def write_table(path: Path, names: Sequence[str], rows: Array) -> None:
     """Write named columns."""
-    write_whole({path: csv_table([names, *rows.tolist()])})
+    write_atomically({path: csv_table([names, *rows.tolist()])})
 
 
 def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dict[str, Any]:
@@ -114,15 +114,15 @@ def _columns(path: Path) -> tuple[Record, bool]:
         if len(row) != len(header):
             cells = f"row {number} has {len(row)} cells, the header has {len(header)}"
             raise ValueError(f"{cells}; separate them by commas")
-    sealed = header[-1] == record.SEAL
-    if sealed:
+    checksummed = header[-1] == record.CHECKSUM
+    if checksummed:
         *header, _ = header
-        seals, rows = {row[-1] for row in rows}, [row[:-1] for row in rows]
-        if seals != {_digest([header, *rows])}:
+        found, rows = {row[-1] for row in rows}, [row[:-1] for row in rows]
+        if found != {_digest([header, *rows])}:
             raise ValueError(
-                f"{record.DAMAGED}; to read it as it is, delete the column {record.SEAL}"
+                f"{record.DAMAGED}; to read it as it is, delete the column {record.CHECKSUM}"
             )
-    return dict(zip(header, zip(*rows, strict=True), strict=True)), sealed
+    return dict(zip(header, zip(*rows, strict=True), strict=True)), checksummed
 
 
 def _entries(columns: Record, state: StateMap) -> Record:

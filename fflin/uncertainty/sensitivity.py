@@ -13,7 +13,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.record import Record, write_record
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array, FrozenArrays, as_double, numbers, whole
+from fflin.base.validation import Array, FrozenArrays, as_double, instance, numbers, whole
 from fflin.base.writing import as_path
 from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel
@@ -264,7 +264,7 @@ class Sensitivity:
         FileError
             If the file has another ending or cannot be written.
         """
-        write_record(as_path(path), sensitivity_record(self), sealed=self.lin.verified)
+        write_record(as_path(path), sensitivity_record(self), checksummed=self.lin.verified)
 
 
 def sensitivity_record(found: Sensitivity) -> Record:
@@ -310,11 +310,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     >>> S["base.mass"].dB.shape, bool(S["base.mass"].dA.any())
     ((18, 9), False)
     """
-    if not isinstance(lin, LinearModel):
-        raise InputError(
-            f"lin is a {type(lin).__name__}, expected a LinearModel; fflin.linearize returns one"
-        )
-    robot = lin._robot
+    robot = instance("lin", lin, LinearModel, "a fflin.LinearModel")._robot
     if robot is None:
         raise InputError(
             "the model was loaded from a file, which contains no robot; linearise the robot again"

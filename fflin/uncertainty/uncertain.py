@@ -11,7 +11,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.tables import grid
-from fflin.base.validation import Array, number, numbers, untied, vector, whole
+from fflin.base.validation import Array, instance, number, numbers, untied, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import linearize, prepare
@@ -268,9 +268,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     >>> len(of.samples(5, seed=1))
     5
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
-    robot.require_unchanged()
+    instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     given: dict[str, Any] = {}
     for key, value in mapping("ranges", ranges, "parameter").items():
         if isinstance(value, Mapping) and "range" not in value:
