@@ -188,8 +188,9 @@ def start_of(
 
 def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, LinearModel | None]:
     """Return the policy, its feedback, and the model that predicts every row."""
+    from fflin.control.authority import thrusters_give_every_wrench
     from fflin.control.linear_controller import LinearController
-    from fflin.control.policies import Allocation, StateFeedback, thrusters_give_every_wrench
+    from fflin.control.policies import Allocation, StateFeedback
 
     gain: Any = None
     if arguments.mpc:

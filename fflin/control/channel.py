@@ -125,12 +125,12 @@ def warn_beyond(
     """Warn of inputs that are asked, in any of the rows (N, nu), for more than their limits."""
     bounds = np.where(asked > 0.0, high, low)
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
-    worst = share.argmax(axis=0)
+        ratio = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
+    worst = ratio.argmax(axis=0)
     beyond = [
         f"{name} requires {asked[row, k]:.3g} {unit}, its limit is {bounds[row, k]:g}"
         for k, (name, unit, row) in enumerate(zip(names, units, worst, strict=True))
-        if share[row, k] > 1.0 + 1e-6
+        if ratio[row, k] > 1.0 + 1e-6
     ]
     if beyond:
         said = f"the input limits are too small for '{robot}' {where}: {listed(beyond)}"

@@ -6,7 +6,7 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, as_double, instance
@@ -268,29 +268,3 @@ def fed_back(policy: Any) -> tuple[str, ...]:
         return ()
     used = np.ones(len(of.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
     return tuple(name for name, size in zip(of.state_names, used, strict=True) if size)
-
-
-def gives_every_wrench(W: Array, pushing: NDArray[np.bool_]) -> bool:
-    """Whether columns W (6, k), of which some only push, together give every wrench."""
-    # They do where the rank is 6 and some thrusts, all of them positive, cancel one another.
-    from scipy.optimize import nnls
-
-    size = np.linalg.norm(W, axis=0)
-    W, pushing = W[:, size > 0.0] / size[size > 0.0], pushing[size > 0.0]
-    if np.linalg.matrix_rank(W, tol=1e-6) < len(W):
-        return False
-    if not pushing.any():
-        return True
-    both = np.hstack((W[:, pushing], W[:, ~pushing], -W[:, ~pushing]))
-    return bool(nnls(both, -both.sum(axis=1))[1] < 1e-9)
-
-
-def thrusters_give_every_wrench(robot: Robot) -> bool:
-    """Whether a robot has thrusters that, with what else acts on its base, push it every way."""
-    actuation = Actuation(StateMap(robot))
-    thrusters = actuation.groups.get("thrust")
-    if thrusters is None:
-        return False
-    W = actuation.columns(robot.create_data(), robot.neutral())[:6]
-    pushing = np.isin(np.arange(W.shape[1]), thrusters)
-    return gives_every_wrench(W, pushing)

@@ -284,7 +284,7 @@ def _unbalanced(
 
 _EPS = float(np.finfo(float).eps)
 
-# Largest share of what is to be balanced that may be left over.
+# Largest fraction of what is to be balanced that may be left over.
 TOLERANCE = 1e-9
 
 

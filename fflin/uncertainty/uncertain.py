@@ -318,12 +318,12 @@ def _range(one: Parameter, value: Any) -> Range:
     if isinstance(value, tuple | list):
         least, largest = vector(f"range of '{one.name}'", value, 2, "(least, largest)").tolist()
     else:
-        share = number(f"range of '{one.name}'", value)
+        relative = number(f"range of '{one.name}'", value)
         if not one.value:
             raise InputError(
                 f"'{one.name}' is 0, so a relative range is empty; give (least, largest)"
             )
-        least, largest = sorted((one.value * (1.0 - share), one.value * (1.0 + share)))
+        least, largest = sorted((one.value * (1.0 - relative), one.value * (1.0 + relative)))
     expected = "" if least < largest else "least < largest"
     if least < 0.0 and one.part in ("stiffness", "damping"):
         expected = "values of 0 or more"
@@ -350,10 +350,10 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
                 "range, such as 0.2 for 20 %"
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
-    share = abs(float(value))
+    relative = abs(float(value))
     # Of what is below 0 too, more is further from 0.
-    scaled = (each._replace(half=share * each.parameter.value) for each in ranges)
-    return Block(key, "1", 1.0, share, tuple(scaled))
+    scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
+    return Block(key, "1", 1.0, relative, tuple(scaled))
 
 
 def _lft(of: Uncertain, lin: Any) -> LFT:
