@@ -153,9 +153,7 @@ class Campaign(FrozenArrays):
     state_units: tuple[str, ...]
     input_names: tuple[str, ...]
     input_units: tuple[str, ...]
-    input_limits: tuple[
-        float, ...
-    ]  # largest magnitudes that act, infinite where there are none
+    input_limits: tuple[float, ...]  # largest magnitudes that act, infinite where there are none
     times: tuple[float, ...]
     judged: tuple[str, ...]  # the kinds that are steered
     robot: str
