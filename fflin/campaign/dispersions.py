@@ -31,6 +31,7 @@ from fflin.robot.equipment.appendage_bodies import first_impossible
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import Piece, varied, with_changed
 from fflin.robot.robot import Robot
+from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
 from fflin.uncertainty.parameters import bodies_named
@@ -68,11 +69,6 @@ class Bound(NamedTuple):
     """A policy that a function makes for a robot."""
 
     bind: Callable[[Robot], Policy]
-
-
-def noise_generator(seed: float) -> np.random.Generator:
-    """Return the generator of the noise of a run."""
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
 
 
 class Dispersions:

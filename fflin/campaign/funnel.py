@@ -54,12 +54,17 @@ _EDGE, _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 176.0, 170.0, np.pi,
 
 
 def ellipsoid_axes(P: Array) -> Array:
-    """Return W (nx, r) whose W W' is the pseudoinverse of P, each error in its own scale."""
+    """Return W (nx, nx) whose W W' is the pseudoinverse of P, each error in its own scale.
+
+    W is the symmetric root in these scales. Eigenvectors alone are not unique, so errors drawn by
+    them would depend on the rounding of the processor.
+    """
     scale = np.sqrt(P.diagonal().clip(min=0.0))
     unit = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
     values, axes = np.linalg.eigh(unit[:, None] * P * unit)
     kept = values > _ROUNDING * values.max()
-    found: Array = unit[:, None] * axes[:, kept] / np.sqrt(values[kept])
+    root = axes[:, kept] / np.sqrt(values[kept]) @ axes[:, kept].T
+    found: Array = unit[:, None] * root
     return found
 
 
@@ -202,7 +207,7 @@ class Funnel(Design):
         return P
 
     def root(self, t: float, *, smooth: bool = False) -> Array:
-        """Return W (nx, r): the ellipsoid at time t is the set of all W z with norm(z) <= 1.
+        """Return W (nx, nx): the ellipsoid at time t is the set of all W z with norm(z) <= 1.
 
         With `smooth`, the level is interpolated between knots, as figures show it.
         """
@@ -259,7 +264,7 @@ class Funnel(Design):
 
 
 def _half_axes(W: Array) -> Array:
-    """Return the half-axes (3,) of the ellipsoid that W (3, r) makes of the unit sphere."""
+    """Return the half-axes (3,) of the ellipsoid that W (3, nx) makes of the unit sphere."""
     return np.linalg.svd(np.hstack((W, np.zeros((3, 3)))))[1]
 
 
@@ -375,14 +380,19 @@ def funnel(
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
-            axes = ellipsoid_axes(by.P[first])
+            P, axes = by.P[first], ellipsoid_axes(by.P[first])
 
             def simulate(
-                roots: Array, job: CampaignJob = job, axes: Array = axes, rng: Any = rng
+                roots: Array,
+                job: CampaignJob = job,
+                P: Array = P,
+                axes: Array = axes,
+                rng: np.random.Generator = rng,
             ) -> Array:
                 """Return the outcomes of runs from random errors at roots (N,) of the levels."""
-                z = rng.normal(size=(len(roots), axes.shape[1]))
-                e = (roots / np.linalg.norm(z, axis=1))[:, None] * z @ axes.T
+                e = rng.normal(size=(len(roots), len(P))) @ axes.T
+                # Directions in which P is zero do not count.
+                e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
                 x = moved_by("local", np.tile(job.x0, (len(e), 1)), e)
                 starts = Draws(x - job.x0, np.arange(len(e), dtype=float))
                 return _judged(job, completed(job, starts.part, len(e), **how), final, limits, by)

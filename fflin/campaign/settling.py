@@ -197,10 +197,11 @@ class Settling:
 
     # Index into OUTCOMES, and largest relative prediction error.
     FIELDS: ClassVar[tuple[str, ...]] = ("outcome", "error")
+    every = 1
     span = 128  # steps between checks of `over`
 
     def __init__(self, loop: Loop, every: int, step: Array | None) -> None:
-        self._loop, self.every, self._step = loop, every, step
+        self._loop, self.checked_every, self._step = loop, every, step
         self.reset()
 
     def reset(self) -> None:
@@ -216,7 +217,7 @@ class Settling:
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Add the rows (steps, count, ..) from step `first` on."""
         begin, self._next = max(first, self._next), first + len(rows[0])
-        checked = slice(begin - first + -begin % self.every, None, self.every)
+        checked = slice(begin - first + -begin % self.checked_every, None, self.checked_every)
         loop, (q, nu) = self._loop, (each[checked] for each in rows[:2])
         if not (shape := q.shape[:2])[0]:
             return

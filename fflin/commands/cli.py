@@ -27,8 +27,8 @@ TASKS = {
         **{"uncertain": "analysis", "validity": "regions", "funnel": "regions"},
     },
     "design and simulate": {
-        **{"lqr": "regulator", "tvlqr": "tracking", "plan": "planning", "simulate": "simulation"},
-        "export": "export",
+        **{"lqr": "regulator", "tvlqr": "tracking", "plan": "simulation", "simulate": "simulation"},
+        "export": "regulator",
     },
     "many models or simulations": {"sweep": "sweeps", "montecarlo": "montecarlo"},
 }

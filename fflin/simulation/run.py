@@ -20,6 +20,8 @@ from fflin.simulation.times import LARGEST_TURN
 # Take one step from (t, q, v) under u as it begins; return q and v at its end.
 Advance: TypeAlias = Callable[[float, Array, Array, Array], tuple[Array, Array]]
 
+STOPS = ("", "diverged", "left the chart", "stopped")
+
 _LOOK = 16  # steps between looks at the clock
 _LARGEST_SAID = 1e3  # [rad] per step, beyond which the number says no more
 
@@ -168,3 +170,9 @@ def _event(plan: Plan, t: float, q: Array, v: Array) -> str:
         if margin <= 0.0:
             return f"{getattr(event, '__name__', 'event')} at t = {t:g} s"
     return ""
+
+
+def stop_of(message: str) -> int:
+    """Return the index into STOPS of the message with which a run ended."""
+    found = (at for at, word in enumerate(STOPS) if word and message.startswith(word))
+    return next(found, len(STOPS) - 1) if message else 0
