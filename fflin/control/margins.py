@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from fflin.base.validation import Array, Values
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from fflin.control.gain import Gain
 
 ACCURACY = 1e-5
 
@@ -114,7 +113,7 @@ class Loop(NamedTuple):
         return low, min((each for each in factors if each > 1.0), default=math.inf)
 
 
-def input_loops(gain: Gain) -> tuple[Array, Values, list[Loop]]:
+def input_loops(gain: Any) -> tuple[Array, Values, list[Loop]]:
     """Return frequencies (k,) [rad/s], responses (k, nu) of a Gain's loops, and what each bears."""
     # With T = K (s E - A + B K)^-1 B the loop of input i is T_ii / (1 - T_ii), of a sampled model
     # at s = e^(j w h).

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fflin.base.validation import Array
-    from fflin.linear.model import LinearModel
 
 # Of what the rows and columns of each matrix are, and the entries of each vector.
 _MATRICES = {
@@ -52,7 +51,7 @@ T = TypeVar("T")
 FORMATS = (*record.FORMATS, ".csv")
 
 
-def record_of(lin: LinearModel) -> Record:
+def record_of(lin: Any) -> Record:
     """Return what a file holds of a `LinearModel`."""
     entries: Record = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS, "q", "v")}
     entries["reference"] = lin.placement
