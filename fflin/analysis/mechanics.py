@@ -61,9 +61,9 @@ def warn_of_stiffness(lin: LinearModel) -> None:
     fastest = float((np.abs(rate_matrix(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
     if 0.0 < lin.mean_motion < _SLOWEST * fastest:
         warnings.warn(
-            f"orbital effects on '{lin.robot}' at {lin.mean_motion:.3g} rad/s are within the "
-            f"rounding error of joint vibrations at {fastest:.3g} rad/s, and the result may miss "
-            "them; lock these joints",
+            f"orbital effects on '{lin.robot}' at {lin.mean_motion:.3g} rad/s are smaller than the "
+            f"rounding error of joint vibrations at {fastest:.3g} rad/s, so that the result may "
+            "miss the orbital effects; lock these joints",
             FflinWarning,
             stacklevel=4,
         )

@@ -40,12 +40,12 @@ class Mode(FrozenArrays):
     margin : float
         Real part of the pole as a multiple of its rounding error; infinite if that error is zero.
     strain : mapping of str to float
-        Fraction of the mode's elastic energy in the spring of each joint, the largest first. Empty
-        if there are no springs, or for a model loaded from a file.
+        Fraction of the mode's elastic energy in the spring of each joint, the largest first. The
+        mapping is empty without springs, or if the model was loaded from a file.
     energy : mapping of str to float
         Fraction of the mode's kinetic energy in each body, the largest first. The fractions are
         nonnegative and sum to 1. A body is named after the joint that carries it; the root body is
-        "base". Empty for a model loaded from a file, which lacks the bodies.
+        "base". The mapping is empty if the model was loaded from a file.
 
     Notes
     -----
@@ -251,16 +251,16 @@ class Modes:
 def modes(lin: LinearModel) -> Modes:
     r"""Compute the natural modes of a linear model.
 
-    At rest, if a symmetric stiffness is the only force, these are the modes of the free-floating
-    structure:
+    At rest, with a symmetric stiffness as the only force, the result contains the modes of the
+    free-floating structure:
 
     .. math::
-        K \phi = \omega^2 M^* \phi, \qquad M^* = ((M^{-1})_{EE})^{-1},
+        K \phi = \omega^2 M^* \phi, \qquad M^* = ((M^{-1})_{EE})^{-1}.
 
-    over the coordinates E on which the stiffness K acts. M* is a Schur complement of M: the
-    effective inertia of the coordinates E if all other coordinates are free to move. In all other
-    cases the modes are the eigenvectors of A. The zero eigenvalues form Jordan blocks of size two
-    or more. They are separated exactly from the other eigenvalues.
+    E are the coordinates on which the stiffness K acts. M* is a Schur complement of M: the
+    effective inertia of the coordinates E if all other coordinates are free to move. With other
+    forces or motion, the modes are the eigenvectors of A. The zero eigenvalues form Jordan blocks
+    of size two or more, and are separated exactly from the other eigenvalues.
 
     Parameters
     ----------

@@ -98,7 +98,7 @@ def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
     """Say where rounding decides whether the slowest motion decays."""
     return tuple(
         f"undecided: whether {shape(lin, at)} decays by itself; its decay rate "
-        f"is {ratio:.1g} times its rounding error; the model is {what} or not {what}"
+        f"is {ratio:.1g} times its rounding error; the model may or may not be {what}"
         for ratio, at, _ in settling.doubts
     )
 

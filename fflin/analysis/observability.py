@@ -76,7 +76,8 @@ def observability(lin: LinearModel) -> Observability:
     space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. All poles p = 0 are tested
     together. At nonzero velocity, observability is tested as the controllability of the dual pair
     :math:`(A^T, C^T)`, with states scaled to units of energy, as in `controllability`. The
-    unobservable subspace is the orthogonal complement of the controllable subspace of this pair.
+    unobservable subspace is the orthogonal complement of the controllable subspace of the dual
+    pair.
 
     Parameters
     ----------

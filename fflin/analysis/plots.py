@@ -35,7 +35,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     lin : LinearModel
         Model to draw.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
 
     Examples
     --------
@@ -113,7 +113,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     modes : Modes
         Result of `fflin.modes`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
 
     Examples
     --------
@@ -200,7 +200,7 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     check : Check
         Result of `fflin.check`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
 
     Examples
     --------

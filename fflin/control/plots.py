@@ -33,9 +33,9 @@ def plot_poles(
     Parameters
     ----------
     poles : array_like or Gain or LinearModel
-        Poles [1/s], or an object that has poles. Give several sets as {label: poles}.
+        Poles [1/s], an object with poles, or several sets {label: poles}.
     path : str or Path, optional
-        File to write, .png, .pdf or .svg. Errors are as in `plot_motion`.
+        File to write, .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
     dt : float
         Sampling time [s] of poles given as numbers. If not 0, the unit circle is drawn.
     title : str
@@ -64,13 +64,13 @@ def plot_poles(
 
 
 def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
-    """Plot the loop at each input, with the other loops closed: Bode plot, margins and poles.
+    """Plot the loop gain at each input with the other loops closed: Bode plot, margins and poles.
 
     Parameters
     ----------
     gain : Gain
     path : str or Path, optional
-        File to write, .png, .pdf or .svg. Errors are as in `plot_motion`.
+        File to write, .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
 
     Returns
     -------
@@ -174,7 +174,8 @@ def _poles_of(given: object) -> tuple[Values, float]:
     right = poles.dtype.kind in "fiuc" and poles.ndim == 1 and poles.size
     if not right or not np.isfinite(poles).all():
         raise InputError(
-            f"poles is a {type(given).__name__} of shape {poles.shape}, expected finite numbers "
+            f"poles has type {type(given).__name__} of shape {poles.shape}, expected finite "
+            "numbers "
             "(k,), a Gain, a LinearModel or {label: poles}"
         )
     return poles, 0.0

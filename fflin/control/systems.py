@@ -111,8 +111,9 @@ def _read(path: Path) -> System:
     if any(each is None for each in (A, B, C)):
         if D is None or A is not None:
             raise FileError(
-                f"{path}: it has {listed(sorted(found)) or 'no arrays'}, expected A, B, C, D, "
-                "and Ts if sampled, or D alone; in MATLAB, write it by [A, B, C, D] = ssdata(K); "
+                f"{path}: the file contains {listed(sorted(found)) or 'no arrays'}, expected A, B, "
+                "C, D (and Ts if sampled) or D alone; in MATLAB, save the controller K by [A, B, "
+                "C, D] = ssdata(K); "
                 "Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
             )
         A = B = C = ()

@@ -78,7 +78,8 @@ class Worst:
     def __str__(self) -> str:
         lines = [
             f"{self.unstable} of {self.tried} loops tried are unstable; "
-            f"{self.excluded} draws and corners excluded as not physically realisable"
+            f"{self.excluded} samples and corners were excluded, because they are not physically "
+            "realisable"
         ]
         for what, found in (
             ("least damping ratio", self.damping),
@@ -89,10 +90,13 @@ class Worst:
             lines.append(f"{what} {found.value:.4g} at {at}")
         if self.safe >= 1.0:
             lines.append(
-                f"guaranteed stable on the whole set, and on ranges {self.safe:.3g} times as wide"
+                f"guaranteed stable in all ranges, and in ranges that are {self.safe:.3g} times as "
+                "wide"
             )
         else:
-            lines.append(f"guaranteed stable on {100.0 * self.safe:.3g} % of each range")
+            lines.append(
+                f"guaranteed stable in the central {100.0 * self.safe:.3g} % of each range"
+            )
         return folded(lines)
 
 
