@@ -27,8 +27,8 @@ TASKS = {
         **{"uncertain": "analysis", "validity": "regions", "funnel": "regions"},
     },
     "design and simulate": {
-        **{"lqr": "regulator", "tvlqr": "tracking", "plan": "planning", "simulate": "simulation"},
-        "export": "export",
+        **{"lqr": "regulator", "tvlqr": "tracking", "plan": "simulation", "simulate": "simulation"},
+        "export": "regulator",
     },
     "many models or simulations": {"sweep": "sweeps", "montecarlo": "montecarlo"},
 }
@@ -138,8 +138,8 @@ def require_own_kind(arguments: argparse.Namespace) -> None:
     if found not in kinds and path.stat().st_size:
         there = f"holds a {found}" if found else "exists and is not a result of fflin"
         raise FileError(
-            f"{path} {there}; without --force this command replaces only files of kind "
-            f"{' or '.join(kinds)}. Name another file or add --force"
+            f"{path} {there}; without --force, this command replaces only files that contain a "
+            f"{' or '.join(kinds)}. Give another file name, or add --force"
         )
 
 

@@ -11,8 +11,8 @@ import fflin
 from fflin.control.authority import (
     least_reach,
     mass_properties,
-    point_report,
     point_properties,
+    point_report,
     thruster_properties,
     thruster_report,
     unreachable,
