@@ -17,7 +17,6 @@ from fflin.analysis.ranks import (
     FixedPoles,
     Margin,
     Noisy,
-    Values,
     decided,
     image,
     judged,
@@ -26,7 +25,7 @@ from fflin.analysis.ranks import (
     stacked,
     unit_columns,
 )
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 
 # A singular value above _SUSPICIOUS is not zero. Only eigenvectors whose product with inputs of
 # unit length is smaller, or whose eigenvalue has a neighbour this near, need a singular value.
@@ -65,7 +64,7 @@ def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
     """Scale Jacobians to units of energy, and of time so that A has a size of about 1."""
     # Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
     # likewise over the time unit. The tolerance is twenty times the rounding of M^-1, or that of
-    # the exponential which the slopes of a sampled model are a difference of.
+    # the exponential which the derivatives of a sampled model are a difference of.
     nv = len(M)
     p, v = slice(0, nv), slice(nv, None)
     L = np.linalg.cholesky(M)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
-from fflin.base.validation import Array
+from fflin.base.validation import Array, instance
 from fflin.control.gain_schedule import FilterSchedule, GainSchedule
 from fflin.control.kalman import kalman
 from fflin.control.linear_controller import Compensation, LinearController, Loop, Sample
@@ -40,9 +40,9 @@ class TrajectoryFeedback(Feedback):
     """Trajectory tracking ``u = u*(t) - K(t) e`` with the error e relative to a trajectory.
 
     The error is defined as in `linearize_trajectory`. Torques and forces on the base are in base
-    axes, and t is the time since the first knot. After the end, the target is the last
-    configuration at rest. The command is then the sum of the inputs that hold the robot there and
-    the feedback of the regulator with the same weights.
+    axes, and t is the time since the first knot. After the end of the trajectory, the target is
+    the last configuration at rest. The command is then the sum of the holding inputs at this
+    target and the feedback of a regulator with the same weights.
 
     Parameters
     ----------
@@ -51,8 +51,7 @@ class TrajectoryFeedback(Feedback):
         Result of `tvlqr`.
     held : bool
         Whether commands are held between samples; commands of a sampled schedule are always held.
-        With held commands, the command at the last knot already contains the inputs that hold the
-        robot there.
+        With held commands, the command at the last knot already contains the holding inputs.
 
     Examples
     --------
@@ -72,14 +71,9 @@ class TrajectoryFeedback(Feedback):
     frame: ClassVar[Frame] = "local"
 
     def __post_init__(self) -> None:
-        if not (
-            isinstance(self.trajectory, Trajectory) and isinstance(self.schedule, GainSchedule)
-        ):
-            raise InputError(
-                f"TrajectoryFeedback got a {type(self.trajectory).__name__} and a "
-                f"{type(self.schedule).__name__}, expected a LinearTrajectory and a GainSchedule, "
-                "as fflin.linearize_trajectory and fflin.tvlqr return them"
-            )
+        instance("trajectory", self.trajectory, Trajectory, "a fflin.Trajectory")
+        expected = "a GainSchedule, as fflin.tvlqr returns it"
+        instance("schedule", self.schedule, GainSchedule, expected)
 
     @property
     def duration(self) -> float:
@@ -126,7 +120,7 @@ class TrajectoryFeedback(Feedback):
 
     @property
     def ahead(self) -> float:
-        """Time [s] into a sample at which a changing input is closest to the sample mean."""
+        """Time [s] after a sample at which a changing input is closest to its mean."""
         return 0.5 * self.schedule.dt if self.trajectory.hold == "linear" else 0.0
 
     def commanded(self, t: float) -> tuple[Array, Array, Array]:
@@ -148,8 +142,8 @@ class TrajectoryFeedback(Feedback):
         Parameters
         ----------
         offset : mapping
-            {name, group or pattern of states: error, in the base axes at the start}. The angles
-            roll, pitch, yaw [deg] may be given instead of q_b.
+            {name, group or pattern of states: error, in the base axes at the start}. The names
+            ``roll``, ``pitch`` and ``yaw`` [deg] can replace q_b.
 
         Raises
         ------
@@ -245,13 +239,13 @@ def followed(policy: Any, robot: Robot, held: float = 0.0) -> Any:
     return policy
 
 
-def reference_of(policy: Any) -> Reference | None:
+def reference_of(policy: object) -> Reference | None:
     """Return the reference of a policy that follows a motion, else None."""
     found = getattr(decider(policy), "reference", None)
     return found if callable(found) else None
 
 
-def tracking_of(policy: Any) -> TrajectoryFeedback | None:
+def tracking_of(policy: object) -> TrajectoryFeedback | None:
     """Return the feedback along a trajectory that a policy is or allocates."""
     decides = decider(policy)
     return decides if isinstance(decides, TrajectoryFeedback) else None
@@ -274,10 +268,10 @@ def largest_rate(schedule: GainSchedule) -> float:
 class TrajectoryOutputFeedback(TrajectoryFeedback):
     r"""Feedback ``u = u*(t) - K(t) eh`` of the estimated error relative to a trajectory.
 
-    At each sample, u is applied. Then y is measured, and the filter advances the estimate eh to
+    At each sample, u is applied and y is measured. The filter then advances the estimate eh to
     the next sample, as in `OutputFeedback`. Positions and attitudes are measured relative to the
-    base pose of the trajectory. The policy that `bind` returns has an attribute ``estimate``
-    (nx,): the estimate for the next sample.
+    base pose of the trajectory. The policy returned by `bind` has an attribute ``estimate``
+    (nx,), the estimate of the error at the next sample.
 
     Parameters
     ----------
@@ -311,12 +305,9 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.filter, FilterSchedule):
-            raise InputError(
-                f"filter is a {type(self.filter).__name__}, expected a FilterSchedule, as "
-                "fflin.tvkalman returns it"
-            )
-        gains, seen = self.schedule, self.filter
+        expected = "a FilterSchedule, as fflin.tvkalman returns it"
+        seen = instance("filter", self.filter, FilterSchedule, expected)
+        gains = self.schedule
         if not (gains.dt and gains.dt == seen.dt and np.array_equal(gains.A, seen.A)):
             raise InputError(
                 f"the gains are sampled at dt = {gains.dt:g} s, the filter at {seen.dt:g} s, "

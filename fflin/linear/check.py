@@ -94,7 +94,7 @@ _EPS = float(np.finfo(float).eps)
 # Rounding of a difference of outputs: its weights add up to two ulp, each output brings a few.
 _ULPS = 8.0
 
-# And of accelerations at the ends of a step, of which slopes at a slow motion are the difference.
+# Rounding of the accelerations at the ends of a step, whose difference is the derivative.
 _STEP_ULPS = 64.0
 
 # Relative to its block an analytic route agrees to round-off times the conditioning of M, with
@@ -152,13 +152,13 @@ class Check:
         if failures := self.failures:
             names = [f"{row.block} ({row.test})" for row in failures[:6]]
             names += ["..."] * (len(failures) > 6)
-            said = f"{len(failures)} of {len(self.rows)} figures FAILED: {', '.join(names)}"
-            verdict = f"A and B do not hold: {said}"
+            said = f"{len(failures)} of {len(self.rows)} errors FAILED: {', '.join(names)}"
+            verdict = f"A and B are not verified: {said}"
         else:
             largest = max(self.rows, key=lambda row: row.error)
             said = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
-            verdict = f"A and B hold: largest error {said}"
-        title = f"{self.title}, {len(self.rows)} figures"
+            verdict = f"A and B are verified: largest error {said}"
+        title = f"{self.title}, {len(self.rows)} errors"
         blocks = [row for row in self.rows if row.test in _ROUTES]
         parts = [folded([verdict]), folded([title]), _block_table(blocks)]
         rest, exact = [["figure", "error", "allowed"]], list[str]()
@@ -181,17 +181,16 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 
     - Pinocchio's ABA derivatives, mapped into the chart (tolerance 1e-9, relative);
     - sixth-order central differences of the nonlinear model :math:`\dot x = f(x, u)` in the same
-      chart (tolerance 1e-8). The function f itself is verified against motions that are integrated
-      with it.
+      chart (tolerance 1e-8). The function f is itself verified by integrated motions.
 
-    Tolerances grow with the condition number of M, as round-off errors do.
+    Tolerances are proportional to round-off errors, which grow with the condition number of M.
 
     Parameters
     ----------
     robot : Robot
         Robot that the model should describe.
     lin : LinearModel
-        Model in continuous time: just linearised, loaded from a file, or made by another tool.
+        Model in continuous time, from `linearize`, a file or another tool.
     tolerance : float, optional
         Relative tolerance that replaces the tolerance of every error, such as 1e-5 if another tool
         computed A and B by finite differences.
@@ -257,8 +256,10 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     bends = np.zeros(nx + len(input_steps), dtype=bool)
     bends[state.groups.q_b] = bends[state.groups.q_m] = True
     point, every = np.concatenate((lin.x0, lin.u0)), np.concatenate((steps, input_steps))
-    slopes = jacobian(lambda rows: model.rates(rows[:, :nx], rows[:, nx:]), point, every, bends)
-    A, B, rounding = slopes[:, :nx], slopes[:, nx:], _STEP_ULPS * _EPS / difference
+    derivatives = jacobian(
+        lambda rows: model.rates(rows[:, :nx], rows[:, nx:]), point, every, bends
+    )
+    A, B, rounding = derivatives[:, :nx], derivatives[:, nx:], _STEP_ULPS * _EPS / difference
     rows += [
         Row("differences", *block, difference)
         for block in compare(state, actuation, lin, M, A, B, steps=steps, rounding=rounding)
@@ -338,7 +339,7 @@ def _output_rows(
     of_x, of_u = (np.ones(len(each), dtype=bool) for each in (step_x, step_u))
     C = jacobian(lambda rows: np.array([y(x, lin.u0) for x in rows]), lin.x0, step_x, of_x)
     D = jacobian(lambda rows: np.array([y(lin.x0, u) for u in rows]), lin.u0, step_u, of_u)
-    # A slope below the rounding of y divided by the step is noise, and not compared more closely.
+    # A derivative below the rounding of y divided by the step is noise.
     scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
     for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):

@@ -36,10 +36,10 @@ class Equilibrium(FrozenArrays):
     Attributes
     ----------
     q : ndarray (nq,)
-        Equilibrium configuration: the given one, except that passive joints sag on their springs.
-        Pass it to `linearize` as q.
+        Equilibrium configuration, the argument q of `linearize`. It differs from the given
+        configuration by the spring deflections of passive joints.
     u : ndarray (nu,)
-        Minimum-norm inputs. Pass them to `linearize` as u.
+        Minimum-norm inputs, the argument u of `linearize`.
     sag : ndarray (n,)
         Deflection of each joint from its given position [rad | m].
     residual : ndarray (6 + n,)
@@ -94,20 +94,22 @@ def equilibrium(
     r"""Compute the minimum-norm inputs that balance all forces on a robot, with spring deflections.
 
     The forces are the same as in `linearize`: springs, gravity, dampers, and the inertial forces of
-    a steady motion. In orbit they include the gravity gradient and the inertial forces of the
-    rotating orbit frame, in which the base rests. `relative_equilibria` finds attitudes that need
-    no torque on the base. With f the generalised forces without u, the inputs solve
+    a steady motion. In orbit, the forces include the gravity gradient and the inertial forces of
+    the rotating orbital frame, in which the base is at rest. `relative_equilibria` finds
+    attitudes in which no torque on the base is necessary. With f the generalised forces without
+    u, the inputs solve
 
     .. math::
         \min \|u\|_2 \quad \text{subject to} \quad B(q)\,u = -f(q, v), \qquad
         u_k \ge 0 \text{ for every thruster } k.
 
-    The norm is computed from the numbers in u, each in its own unit. The rows of the force balance,
-    in N m and N, are scaled by :math:`\sqrt{(M^{-1})_{ii}}` to make the rows
+    The norm of u is the norm of its numerical values in SI units. The rows of the force balance,
+    in N m and N, are scaled by :math:`\sqrt{(M^{-1})_{ii}}`, so that different units become
     comparable. The weighted residual must not exceed 1e-9 of the balanced forces.
 
-    A joint with a spring and without a `JointTorque` sags if no input holds it. Newton's method
-    then finds its position, with the Jacobian :math:`M\,\partial\dot\nu/\partial q_m`.
+    A joint with a spring and without a `JointTorque` deflects if no input holds the joint.
+    Newton's method finds the deflected position, with the Jacobian
+    :math:`M\,\partial\dot\nu/\partial q_m`.
 
     Parameters
     ----------
@@ -122,13 +124,13 @@ def equilibrium(
         Axes of the inputs on the base, as in `linearize`.
     reference : pin.SE3, optional
         Placement whose axes are the reference axes, as in `linearize`. The default is the base
-        placement; the inputs on the base are then in base axes, whichever `frame` is given. For a
-        robot in orbit, the default is the orbit's frame.
+        placement, with inputs on the base in base axes for any `frame`. For a robot in orbit, the
+        default is the orbital frame.
 
     Returns
     -------
     Equilibrium
-        Pass it on as ``linearize(robot, result.q, v, u=result.u)``, with the same frame and
+        Equilibrium for ``linearize(robot, result.q, v, u=result.u)`` with the same frame and
         reference.
 
     Raises
@@ -146,8 +148,9 @@ def equilibrium(
 
     Notes
     -----
-    With the bounds of thrusters, this is a least-distance problem. Non-negative least squares solve
-    it exactly (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    With the bounds of thrusters, the minimisation is a least-distance problem, which non-negative
+    least squares solve exactly (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974,
+    chapter 23).
 
     Examples
     --------
@@ -284,7 +287,7 @@ def _unbalanced(
 
 _EPS = float(np.finfo(float).eps)
 
-# Largest share of what is to be balanced that may be left over.
+# Largest fraction of what is to be balanced that may be left over.
 TOLERANCE = 1e-9
 
 
@@ -292,19 +295,16 @@ def least_norm(C: Array, d: Array, one_sided: Mask) -> tuple[Array, Array]:
     """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``."""
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
-        u = _least_distance(C, u, one_sided)
-        # Exactly the least on the face that was found: those that do not push stay out.
+        from fflin.kernel.allocation import nearest
+
+        least, most = np.where(one_sided, 0.0, -np.inf), np.full(len(u), np.inf)
+        u = nearest(C, d, least, most)
+        # The same without the rounding of the bounded problem: inputs at zero stay out.
         pushing = ~one_sided | (u > TOLERANCE * float(np.abs(u).max(initial=0.0)))
         polished: Array = np.zeros(len(u))
         polished[pushing] = _pseudo_solve(C[:, pushing], d)
-        left = C @ polished - d
-        most = TOLERANCE * np.linalg.norm(d)
-        if (polished[one_sided] < 0.0).any() or np.linalg.norm(left) > most:
-            from scipy.optimize import lsq_linear
-
-            bounds = np.where(one_sided, 0.0, -np.inf), np.inf
-            polished = lsq_linear(C, d, bounds, method="bvls").x
-        u = polished
+        if (polished[one_sided] >= 0.0).all():
+            u = polished
     return u, C @ u - d
 
 
@@ -315,23 +315,3 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
     # An input below the rounding of the largest one is noise: it counts as zero.
     u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
     return u
-
-
-def _least_distance(C: Array, start: Array, one_sided: Mask) -> Array:
-    """Return the least u = start + Z z with u[one_sided] >= 0, where C Z = 0."""
-    from scipy.linalg import null_space
-    from scipy.optimize import nnls
-
-    # min |z| subject to G z >= h is solved by the residual r = E y - e of min |E y - e|, y >= 0,
-    # with E = [G^T; h^T] and e = (0, ..., 0, 1): z = -r_z / r_e.
-    Z = null_space(C)
-    size = float(np.linalg.norm(start))
-    E = np.vstack((Z[one_sided].T, -start[one_sided] / size))
-    e = np.zeros(len(E))
-    e[-1] = 1.0
-    y = nnls(E, e, maxiter=100 * max(E.shape))[0]
-    r = E @ y - e
-    # r_e = -|r|^2, and zero where the inequalities contradict each other.
-    z = -r[:-1] / r[-1] if r[-1] < -TOLERANCE else np.zeros(Z.shape[1])
-    u: Array = start + Z @ (size * z)
-    return np.where(one_sided, np.maximum(u, 0.0), u)

@@ -9,13 +9,18 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from fflin.base import record
 from fflin.base.record import Record, figure, figures, text, texts
-from fflin.base.writing import check_ending, csv_table, read_file, write_whole
+from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from fflin.base.validation import Array
 
 # Of what the rows and columns of each matrix are, and the entries of each vector.
 _MATRICES = {
@@ -61,17 +66,17 @@ def record_of(lin: Any) -> Record:
     return entries
 
 
-def write_model(path: Path, entries: Record, *, sealed: bool) -> None:
-    """Write the record of a model, with its digest if `sealed`; see `LinearModel.save`."""
+def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
+    """Write the record of a model, with its digest if `checksummed`; see `LinearModel.save`."""
     check_ending(path, FORMATS)
     if path.suffix != ".csv":
-        record.write_record(path, entries, sealed=sealed)
+        record.write_record(path, entries, checksummed=checksummed)
         return
     record.require_finite(entries)
     contents = {key: csv_table(rows) for key, rows in _tables(entries).items()}
-    if sealed:
-        contents["info"] += f"{record.SEAL},{record.content_digest(contents)}\n".encode()
-    write_whole({_csv_path(path, key): content for key, content in contents.items()})
+    if checksummed:
+        contents["info"] += f"{record.CHECKSUM},{record.content_digest(contents)}\n".encode()
+    write_atomically({_csv_path(path, key): content for key, content in contents.items()})
 
 
 def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, Any], T]:
@@ -124,7 +129,7 @@ def _weights(written: str) -> dict[str, Any]:
     return found
 
 
-def _numbers(key: str, raw: Any) -> Any:
+def _numbers(key: str, raw: ArrayLike) -> Array:
     array = np.array(raw, dtype=float)
     if not np.isfinite(array).all():
         raise ValueError(f"{key} has entries that are not finite")
@@ -174,10 +179,10 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
     if not _csv_path(path, "info").exists() and path.exists():
         raise ValueError("give the name NAME.csv without the matrix, not NAME.A.csv")
     contents = {key: read_file(_csv_path(path, key), ".csv") for key in _TABLES}
-    body, mark, seal = contents["info"].rpartition(f"\n{record.SEAL},".encode())
+    body, mark, checksum = contents["info"].rpartition(f"\n{record.CHECKSUM},".encode())
     if mark:
         contents["info"] = body + b"\n"
-        if seal != f"{record.content_digest(contents)}\n".encode():
+        if checksum != f"{record.content_digest(contents)}\n".encode():
             raise ValueError(
                 f"{record.DAMAGED}; to read it as it is, delete that line of the info table"
             )

@@ -54,7 +54,7 @@ def checked_inputs(
 ) -> tuple[Input, ...]:
     """Return the inputs as a robot holds them."""
     if isinstance(value, str) or not isinstance(value, Sequence):
-        raise InputError(f"inputs is a {type(value).__name__}, expected a sequence of inputs")
+        raise InputError(f"inputs has type {type(value).__name__}, expected a sequence of inputs")
     if not value:
         raise InputError("inputs is empty; give at least one input")
     for item in value:
@@ -73,7 +73,7 @@ def checked_inputs(
     told += [replace(item, min=None, max=None) for item in value if item not in named]
     for each in told:
         if told.count(each) > 1:
-            raise InputError(f"input {each} is given twice; remove one")
+            raise InputError(f"input {each} is given twice; remove one of the two")
     return tuple(value)
 
 
@@ -83,7 +83,10 @@ def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[st
         return [item]
     found = by_joint({str(item.joint): None}, joints, find)
     if item.joint in found and item.joint in passive:
-        raise InputError(f"joint '{item.joint}' is passive but has a joint torque; remove one")
+        raise InputError(
+            f"joint '{item.joint}' is passive, but a joint torque acts on it; remove the joint "
+            "from passive, or the torque from the inputs"
+        )
     return [replace(item, joint=name) for name in found if name not in passive]
 
 
@@ -127,7 +130,7 @@ def _outputs(value: Any, _: Scope) -> tuple[Output, ...]:
 
 def _rest(value: Any, scope: Scope) -> dict[str, float]:
     if not isinstance(value, Mapping):
-        raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
+        raise InputError(f"rest is {value!r}, expected {{joint: rest position}}")
     return by_joint(numbers("rest", value, "joint", "rest of joint"), scope.own, scope.find)
 
 
@@ -146,7 +149,7 @@ def _damping(value: Any, scope: Scope) -> dict[str, float]:
     if not isinstance(value, str):
         return _stiffness(value, scope, "damping")
     if value != "urdf":
-        raise InputError(f"damping is '{value}', expected 'urdf', a number or a mapping")
+        raise InputError(f"damping is '{value}', expected 'urdf', a number or {{joint: damping}}")
     return dict(scope.urdf_damping)
 
 
@@ -159,7 +162,8 @@ def range_of(name: str, value: Any) -> Range:
         least = -largest
     if least > largest:
         raise InputError(
-            f"limit of '{name}' is {value}, expected a magnitude of 0 or more, or (least, largest)"
+            f"limit of '{name}' is {value}, expected a largest magnitude of at least 0, or bounds "
+            "(least, largest)"
         )
     return least, largest
 
@@ -216,7 +220,9 @@ def _weights(value: Any, scope: Scope) -> dict[str, Any]:
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
     for key in weights["bryson"]:
         if key in weights["q"] or key in weights["r"]:
-            raise InputError(f"'{key}' has both a weight and a largest value; give only one")
+            raise InputError(
+                f"'{key}' has both a weight and a largest value; give only one of the two"
+            )
     return {part: value for part, value in weights.items() if value}
 
 
@@ -229,14 +235,17 @@ def checked_passive(
         raise InputError(f"passive is {value!r}, expected names of joints")
     for key in keys:
         if any(each.rpartition("=")[0] == key for each in locked):
-            raise InputError(f"joint '{key}' is both locked and passive; remove one")
+            raise InputError(
+                f"joint '{key}' is both locked and passive; remove the joint from one of the two "
+                "lists"
+            )
     found = by_joint(dict.fromkeys(keys), joints, find)
     return tuple(name for name in joints if name in found)
 
 
 def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
     if not isinstance(value, Mapping):
-        raise InputError(f"{what} is {value!r}, expected a mapping of {', '.join(known)}")
+        raise InputError(f"{what} is {value!r}, expected a table with the keys {', '.join(known)}")
     for name in value:
         if name not in known:
             raise unknown(f"part of {what}", name, known)
@@ -244,108 +253,49 @@ def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
 
 
 class Field(NamedTuple):
-    """Key of a robot file: what its values are, what they mean, and the check of a field."""
+    """Key of a robot file: what its values are, and the check of a field."""
 
-    meaning: str  # for the guide
     check: Callable[[Any, Scope], Any] = lambda value, _: value
     kind: Kind = NUMBER  # of a value, and of the entries of a list
     table: Kind | None = NUMBER  # of the entries of a table; None if it must not be a table
     parts: bool = False  # whether it is a table of named parts, some of which are tables
     word: str | None = None  # the part that may be a word; empty for the value itself
     merged: bool = False  # whether the entries of a call are added to the entries of a file
-    heading: str = ""  # as a file writes it, if that is not the name alone
+
+
+def _number(expected: str) -> Kind:
+    return NUMBER._replace(expected=expected)
 
 
 # In the order in which a file applies them: the names of inputs are known after the inputs.
 FIELDS = {
-    "passive": Field(
-        "joints without a motor. They have no torque input by default, and "
-        '`joint = "*"` omits them',
-        kind=NAME,
-        table=None,
-    ),
-    "inputs": Field(
-        'the inputs in the order of u; `joint = "*"` means every joint with a motor. Default: '
-        "torque and force on the base and a torque on every joint with a motor",
-        heading="[[input]]",
-    ),
-    "appendages": Field(
-        "flexible appendages and slosh, as `[[flexible]]` and `[[slosh]]`",
-        heading="[[flexible]]",
-    ),
-    "outputs": Field(
-        "the outputs, written as for `--output`; the state by default",
-        _outputs,
-        kind=NAME,
-        table=None,
-    ),
+    "passive": Field(kind=NAME, table=None),
+    "inputs": Field(),
+    "appendages": Field(),
+    "outputs": Field(_outputs, kind=NAME, table=None),
     "stiffness": Field(
-        "joint stiffness [N m/rad]; one number applies to all joints",
-        _stiffness,
-        merged=True,
-        heading="[stiffness]",
+        _stiffness, _number("a finite number [N m/rad|N/m], or a table [stiffness]"), merged=True
     ),
     "damping": Field(
-        'joint damping [N m s/rad]; one number applies to all joints; `damping = "urdf"` takes '
-        "the URDF's damping",
         _damping,
+        _number("a finite number [N m s/rad|N s/m], or a table [damping]"),
         word="",
         merged=True,
-        heading="[damping]",
     ),
-    "rest": Field(
-        "joint positions at which the springs are relaxed [rad, m]",
-        _rest,
-        merged=True,
-        heading="[rest]",
-    ),
+    "rest": Field(_rest, _number("a table [rest] of joint positions [rad|m]"), merged=True),
     "gravity": Field(
-        "uniform gravity in world axes [m/s²]",
-        lambda value, _: three_numbers("gravity", value),
+        lambda value, _: three_numbers("gravity", value), _number("three finite numbers [m/s^2]")
     ),
     "orbit": Field(
-        "altitude of a circular orbit above the earth [m]; or a table `[orbit]` with `altitude` "
-        'or `mean_motion` [rad/s], and `body`, such as "mars", or `mu` and `body_radius`. `orbit` '
-        "replaces `gravity`",
         lambda value, _: checked_orbit(value),
+        _number("an altitude [m] as a finite number, or a table [orbit]"),
         word="body",
     ),
     "limits": Field(
-        "limits of inputs and states: largest magnitude, or `[least, largest]`. They override "
-        "limits of the URDF and of the inputs",
-        lambda value, scope: given_limits(scope.inputs, scope.joints, value),
-        merged=True,
-        heading="[limits]",
+        lambda value, scope: given_limits(scope.inputs, scope.joints, value), merged=True
     ),
-    "weights": Field(
-        'weights that `lqr` uses by default. `rule` ("urdf" or "identity") sets all weights that '
-        "the other keys do not set; `[weights.q]` and `[weights.r]` set weights of states and "
-        "inputs; `[weights.bryson]` sets largest acceptable values of states or inputs",
-        _weights,
-        parts=True,
-        word="rule",
-        heading="[weights]",
-    ),
-    "point": Field(
-        "`rpy` [deg], `position` [m], `joints`, `velocity`: operating point of the commands "
-        "`linearize`, `check`, `lqr`, `modes` and others. Omitted parts are neutral and at rest. "
-        "Functions in Python take their operating point from their arguments alone",
-        partial(_state, "point"),
-        parts=True,
-        heading="[point]",
-    ),
-    "target": Field(
-        "keys as in `[point]`: state to which the commands `simulate` and `montecarlo` bring the "
-        "robot. Omitted parts are as in `[point]`",
-        partial(_state, "target"),
-        parts=True,
-        heading="[target]",
-    ),
-    "start": Field(
-        "keys as in `[point]`: initial state of `simulate`, `montecarlo`, `plan` and `view`. "
-        "Omitted parts are as in `[point]`",
-        partial(_state, "start"),
-        parts=True,
-        heading="[start]",
-    ),
+    "weights": Field(_weights, parts=True, word="rule"),
+    "point": Field(partial(_state, "point"), parts=True),
+    "target": Field(partial(_state, "target"), parts=True),
+    "start": Field(partial(_state, "start"), parts=True),
 }

@@ -145,7 +145,7 @@ def is_late(settled: Array | NDArray[np.intp] | int, count: int) -> Any:
     return settled > (1.0 - DWELL) * count
 
 
-class Course(NamedTuple):
+class ErrorHistory(NamedTuple):
     """History (N,) of the size of one kind of error, and whether the policy feeds it back."""
 
     title: str
@@ -284,7 +284,7 @@ def _phases(motion: Any) -> list[list[str]]:
     return table
 
 
-def courses(motion: Any) -> list[Course]:
+def courses(motion: Any) -> list[ErrorHistory]:
     """Return the errors of each kind, none without a target; wheels and modes are no joints."""
     if motion.error is None or motion.attitude_error is None:
         return []
@@ -301,11 +301,11 @@ def courses(motion: Any) -> list[Course]:
         if group != "q_b" and not (group == "q_m" and entry in motion.wheels):
             columns.setdefault((title, unit), []).append(i)
     attitude = any(name.startswith("q_b.") for name in steered)
-    found = [Course("attitude", "deg", motion.attitude_error, attitude)]
+    found = [ErrorHistory("attitude", "deg", motion.attitude_error, attitude)]
     for of, at in columns.items():
         fed_back = any(motion.state_names[i] in steered for i in at)
         fed_back &= of[0] != "position" or pushed(motion)
-        found.append(Course(*of, sizes[:, at].max(axis=1), fed_back))
+        found.append(ErrorHistory(*of, sizes[:, at].max(axis=1), fed_back))
     return found
 
 
@@ -314,7 +314,7 @@ def pushed(of: Any) -> bool:
     return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
 
-def verdict(motion: Any, kinds: list[Course]) -> str:
+def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
     """Return one line: whether a motion settled at its target, and what prevented it."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
@@ -324,9 +324,9 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
     ]
     moved = [kind for kind in judged if kind.size.max() > THERE]
     if motion.tracked and not motion.phases:
-        said = f"tracking error at the end: {_and([kind.last for kind in judged])}"
+        said = f"tracking errors at the end: {_and([kind.last for kind in judged])}"
     elif failed := [kind.last for kind in moved if kind.late]:
-        said = f"not settled: {_and(failed)} at the end"
+        said = f"not settled: the errors at the end are {_and(failed)}"
     elif moved:
         when = motion.t[max(kind.settled for kind in moved)]
         said = f"settled after {when:.3g}\u00a0s to within {100.0 * SETTLED:g}\u00a0%"
@@ -335,7 +335,7 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
     aside = {k.title: k.last for k in places if k.late and not k.steered}
     loose = not pushed(motion) and aside.pop("position", "")
     if aside:
-        said += f"; not controlled: {_and([*aside.values()])}"
+        said += f"; errors that are not controlled: {_and([*aside.values()])}"
     if loose:
         said += "; position is not controlled"
     return f"{said}; saturated inputs: {_full(motion)}"
@@ -372,8 +372,8 @@ def _largest_modes(motion: Any) -> str:
     if not far:
         return table
     said = (
-        "warning: the model is linear in modal amplitudes, which here stand for more than "
-        f"{_LINEAR:g} deg: {_and(far)}; the motion is not accurate"
+        "warning: the motion is not accurate: the model is linear in the modal amplitudes, and "
+        f"some of these bend the structure by more than {_LINEAR:g} deg: {_and(far)}"
     )
     return f"{table}\n{folded([said])}"
 

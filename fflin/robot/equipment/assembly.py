@@ -36,8 +36,8 @@ def with_appendages(robot: Any, appendages: Any) -> Any:
             joint = find_frame(bare.model, item.frame).joint
             if joint in taken:
                 raise InputError(
-                    f"flexible appendage '{item.title}' is the second of its body with rigid=True; "
-                    "the inertia of a body can be taken from one file only"
+                    f"flexible appendage '{item.title}' is the second appendage with rigid=True on "
+                    "its body; use rigid=True for one appendage of each body"
                 )
             taken.add(joint)
             bare = _with_rigid(bare, item)
@@ -104,6 +104,11 @@ def _equipped(robot: Any, inputs: Any, appendages: Sequence[Appendage]) -> Any:
         **{"model": model, "joints": joints, "followers": followers, "inputs": checked},
         appendages=tuple(appendages),
         _unequipped=bare if parts else None,
+        _removed=tuple(
+            dict.fromkeys(
+                name for name in (*robot._removed, *robot.joint_names) if name not in names
+            )
+        ),
         **by_joint,
     )
 

@@ -1,0 +1,276 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from typing import Any
+
+from fflin.base.errors import FflinWarning
+from fflin.commands.parser import (
+    FIGURE,
+    OUTPUT,
+    POINT,
+    ROBOT,
+    Command,
+    Group,
+    OutputFile,
+    assignment,
+    input_name,
+    joint_or_all,
+    lock,
+    number,
+    orbit,
+)
+
+
+class _FormerName(argparse.Action):
+    """Option under its former name, which warns of the new one."""
+
+    def __call__(self, _: Any, given: argparse.Namespace, value: Any, option: Any = None) -> None:
+        new = f"--{self.dest.replace('_', '-')}"
+        warnings.warn(
+            f"{option} has the new name {new}; write {new} {value}", FflinWarning, stacklevel=2
+        )
+        setattr(given, self.dest, value)
+
+
+def add_former_name(group: Group, name: str, new: str) -> None:
+    """Add the former name of an option for a time in seconds."""
+    text = f"former name of --{new}"
+    group.add_argument(name, dest=new, type=number, metavar="H", action=_FormerName, help=text)
+
+
+def add_robot(command: Command) -> None:
+    """Add ROBOT and --lock."""
+    what = "robot name listed by `fflin robots`, or path of a URDF or robot.toml"
+    command.add_argument("robot", metavar="ROBOT", type=input_name, help=what)
+    command.group(ROBOT).add(
+        "--lock",
+        "lock a joint at VALUE [rad|m]; by default at its neutral position. In all options, NAME "
+        "may be a pattern such as 'hinge_*'",
+        lock,
+        repeatable=True,
+    )
+
+
+def add_point(command: Command) -> None:
+    """Add the robot and the options of its operating point."""
+    point = command.group(POINT)
+    add_robot(command)
+    add_pose(point)
+    add_inputs_there(point)
+    add_system(command)
+    add_frame(point)
+    add_reference(point)
+
+
+def add_pose(group: Group) -> None:
+    """Add the options for the configuration and velocity of the robot."""
+    group.add(
+        "--joint",
+        "position of a joint [rad|m]. The default is the position in robot.toml, or the neutral "
+        "position",
+        assignment,
+        repeatable=True,
+    )
+    rpy = "base attitude: roll, pitch, yaw [deg] about fixed axes"
+    group.add("--rpy", rpy, float, ("R", "P", "Y"))
+    group.add("--position", "base position [m]", float, ("X", "Y", "Z"))
+    group.add(
+        "--velocity",
+        "velocity of a joint or wheel [rad/s|m/s], or a component omega_b.x ... v_b.z of the base "
+        "velocity in base axes",
+        assignment,
+        repeatable=True,
+    )
+
+
+def add_target(group: Group) -> None:
+    """Add the options for the configuration and velocity of the target."""
+    group.add(
+        "--target-joint",
+        "target position of a joint [rad|m]. The default is the value in [target] of robot.toml, "
+        "then in [point], then the neutral position",
+        assignment,
+        repeatable=True,
+    )
+    rpy = "target attitude of the base: roll, pitch, yaw [deg] about fixed axes"
+    group.add("--target-rpy", rpy, float, ("R", "P", "Y"))
+    group.add("--target-position", "target position of the base [m]", float, ("X", "Y", "Z"))
+    group.add(
+        "--target-velocity",
+        "target velocity, such as the speed of a wheel. In a simulation, the target velocity is "
+        "also the initial velocity unless --velocity is given",
+        assignment,
+        repeatable=True,
+    )
+
+
+def add_limits(group: Group) -> None:
+    """Add --limits and --limit."""
+    group.add(
+        "--limits",
+        "limits of the inputs. `urdf` (default) uses the limits of the robot and of --limit; "
+        "`none` uses only --limit. The limits of the robot are the efforts in the URDF, max and "
+        "min of the inputs, and the speeds of the wheels",
+        choices=("urdf", "none"),
+        default="urdf",
+    )
+    group.add(
+        "--limit",
+        "largest magnitude of an input, or of all inputs in a group or pattern such as tau_m. This "
+        "limit replaces the limit of the robot",
+        assignment,
+        repeatable=True,
+    )
+
+
+def add_step(group: Group) -> None:
+    """Add --dt, and --step as it was called."""
+    group.add("--dt", "integration step [s]; chosen automatically by default", float, "H")
+    group.add("--step", "former name of --dt", float, "H")
+
+
+def settle_step(arguments: argparse.Namespace) -> None:
+    """Set --dt and --sample from their former names, --step and --dt, with a warning."""
+    said = ""
+    if arguments.step is not None:
+        said = "the integration step --step has the new name --dt"
+        if arguments.dt is not None:
+            said += ", and the sample time --dt has the new name --sample"
+            arguments.sample = arguments.dt
+        arguments.dt = arguments.step
+    elif arguments.dt is not None and arguments.sample is None:
+        said = "--dt is the integration step; give the sample time of the controller by --sample"
+    if said:
+        warnings.warn(said, FflinWarning, stacklevel=2)
+
+
+def add_inputs_there(group: Group) -> None:
+    """Add the options for the inputs at the operating point."""
+    group.add(
+        "--effort",
+        "value of an input at the operating point. NAME is the name of the input in u, such as "
+        "tau_m.joint_1",
+        assignment,
+        repeatable=True,
+    )
+    group.switch(
+        "--equilibrium",
+        "apply the minimum-norm inputs that make the operating point an equilibrium under springs "
+        "and gravity, or a steady motion. Passive joints deflect their springs to balance the "
+        "load. If no inputs hold the point, the command reports an error",
+    )
+    group.add(
+        "--relative-equilibrium",
+        "for a robot in orbit: use the N-th of the 24 attitudes without gravity-gradient torque (1 "
+        "by default), and the inputs that --equilibrium computes. Attitude and position in the "
+        "state are relative to the pose of this equilibrium",
+        int,
+        "N",
+        nargs="?",
+        const=1,
+        choices=range(1, 25),
+    )
+
+
+def add_reference(group: Group) -> None:
+    """Add the option for the reference of attitude and position."""
+    group.add(
+        "--reference",
+        "reference pose of attitude and position in the state: the base pose at the operating "
+        "point (base, default), or the world frame (world)",
+        choices=("base", "world"),
+        default="base",
+    )
+
+
+def add_frame(group: Group) -> None:
+    """Add the option for the axes of velocities and wrenches."""
+    group.add(
+        "--frame",
+        "axes of base velocities and wrenches. `hybrid` (default) uses base axes for angular parts "
+        "and reference axes for linear parts. `local` uses base axes for all parts, and `world` "
+        "uses reference axes for all parts. A robot in orbit has the axes of `hybrid`, and an "
+        "orbital frame is its world. In `lvlh` (default in orbit), x is along the orbit, y "
+        "opposite to the orbit normal and z towards the central body. In `hill`, x is away from "
+        "the central body, y along the orbit and z along the orbit normal",
+        choices=("hybrid", "local", "world", "lvlh", "hill"),
+    )
+
+
+def add_orbit(group: Group) -> None:
+    """Add --orbit."""
+    group.add(
+        "--orbit",
+        "circular orbit at an altitude [m] above a central body: earth (default), moon, mars ... "
+        "The world is then the orbital frame",
+        orbit,
+    )
+
+
+def add_system(command: Command) -> None:
+    """Add the options for forces, inputs and outputs, which robot.toml may set too."""
+    group = command.group(ROBOT)
+    add_orbit(group)
+    group.add(
+        "--stiffness",
+        "stiffness of a joint [N m/rad|N/m], or one value for all joints",
+        joint_or_all,
+        repeatable=True,
+    )
+    group.add(
+        "--damping",
+        "damping of a joint [N m s/rad|N s/m], or one value for all joints. The value `urdf` means "
+        "the damping in the URDF",
+        joint_or_all,
+        repeatable=True,
+    )
+    gravity = "uniform gravity in world axes [m/s^2]; zero by default"
+    group.add("--gravity", gravity, float, ("X", "Y", "Z"))
+    group.add(
+        "--passive",
+        "joint without a motor: the default inputs do not include a torque at this joint",
+        metavar="NAME",
+        repeatable=True,
+    )
+    group.add(
+        "--inputs",
+        "inputs of the robot: a TOML file of inputs, a bundled name such as cubesat, `joints` "
+        "(joint torques only) or `base` (base torque and force only). The default is the inputs in "
+        "robot.toml, or base torque, base force and all joint torques",
+        input_name,
+    )
+    group.add(
+        "--output",
+        "outputs of the model: state (default), base, joints, rates, joints:NAME, rates:NAME (a "
+        "joint or a pattern), com, momentum, frame:NAME (pose and velocity), pose:NAME, "
+        "velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (frame NAME relative "
+        "to frame TO)",
+        metavar="SPEC",
+        repeatable=True,
+    )
+
+
+def add_output_file(
+    group: Group, what: str, endings: OutputFile, *kinds: str, force: str = ""
+) -> None:
+    """Add -o FILE.
+
+    With the `kinds` of results that are written there, add --force too; see `require_own_kind`.
+    """
+    what = f"save {what} to FILE: {endings}"
+    group.add_argument("-o", "--output-file", metavar="FILE", type=endings, help=what)
+    if kinds:
+        force = (
+            "let -o replace a file of any content; by default -o replaces only results of the same "
+            "kind"
+        )
+        group.set_defaults(kinds=kinds)
+    group.switch("--force", force)
+
+
+def add_figure(command: Command, what: str) -> None:
+    """Add --plot FILE."""
+    command.group(OUTPUT).add("--plot", f"plot {what} to FILE: {FIGURE}", FIGURE)
