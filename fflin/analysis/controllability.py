@@ -20,14 +20,13 @@ from fflin.analysis.ranks import (
     FixedPoles,
     Margin,
     Noisy,
-    Values,
     echelon,
     image,
     null_space,
     unit_columns,
 )
 from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays
+from fflin.base.validation import Array, FrozenArrays, Values
 from fflin.linear.model import LinearModel
 
 _LOOPS = (

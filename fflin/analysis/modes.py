@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -14,7 +14,7 @@ from fflin.analysis.eigenpairs import natural_modes
 from fflin.analysis.reduction import ReducedModel
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, grid, width
-from fflin.base.validation import Array, FrozenArrays, instance
+from fflin.base.validation import Array, Complex, FrozenArrays, instance
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
@@ -22,8 +22,6 @@ from fflin.robot.equipment.appendage_bodies import effective_shares
 from fflin.robot.joints import ROOT
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from fflin.robot.robot import Robot
 
 
@@ -73,7 +71,7 @@ class Mode(FrozenArrays):
     """
 
     pole: complex
-    shape: NDArray[np.complexfloating[Any]]
+    shape: Complex
     unstable: bool
     margin: float
     energy: Mapping[str, float]
@@ -178,7 +176,7 @@ class Modes:
         return (*undecided, "a model from a file lacks the kinetic energies of the bodies")
 
     @property
-    def poles(self) -> NDArray[np.complexfloating[Any]]:
+    def poles(self) -> Complex:
         """All nx eigenvalues of A [rad/s], including zeros and conjugates."""
         listed = [0j] * self.zero_eigenvalues
         for mode in self.modes:
@@ -342,7 +340,7 @@ def _percents(energy: Mapping[str, float], room: int) -> str:
 
 
 def energy_by_body(
-    robot: Robot | None, lin: LinearModel, shapes: Sequence[Any]
+    robot: Robot | None, lin: LinearModel, shapes: Sequence[Complex]
 ) -> list[Mapping[str, float]]:
     """Return {body: fraction of the kinetic energy} of shapes (nx,), see `Mode`.
 
@@ -370,7 +368,7 @@ def energy_by_body(
 
 
 def strain_by_joint(
-    robot: Robot | None, lin: LinearModel, shapes: Sequence[Any]
+    robot: Robot | None, lin: LinearModel, shapes: Sequence[Complex]
 ) -> list[Mapping[str, float]]:
     """Return {joint: fraction of the elastic energy} of shapes (nx,), see `Mode`."""
     if robot is None:
@@ -387,7 +385,7 @@ def strain_by_joint(
     return found
 
 
-def displacement(lin: LinearModel, chart: Chart, shape: Any) -> Any:
+def displacement(lin: LinearModel, chart: Chart, shape: Complex) -> Complex:
     """Return the displacements (6 + n,) of a shape: rotation and translation in base axes."""
     moved = shape[: len(shape) // 2]
     if isinstance(lin, ReducedModel):

@@ -5,8 +5,8 @@ import re
 import numpy as np
 
 from fflin.analysis.mechanics import ConservedMomenta
-from fflin.analysis.ranks import Margin, Values
-from fflin.base.validation import Array
+from fflin.analysis.ranks import Margin
+from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
 # Of each group of velocities: its momenta, and the coordinates that these drive.

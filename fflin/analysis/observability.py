@@ -7,9 +7,9 @@ import numpy as np
 from fflin.analysis import mechanics
 from fflin.analysis.hautus import split_by_poles, unobservable
 from fflin.analysis.names import combination, undecided, unsettled, with_rates
-from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, Values, echelon, without_rounding
+from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, echelon, without_rounding
 from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays
+from fflin.base.validation import Array, FrozenArrays, Values
 from fflin.linear.model import LinearModel
 
 

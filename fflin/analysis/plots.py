@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fflin.analysis.modes import Mode, Modes
-from fflin.analysis.ranks import Values
 from fflin.base.figures import COLORS, drawing, letters_of
 from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted, rounding
-from fflin.base.validation import instance
+from fflin.base.validation import Values, instance
 from fflin.linear.check import Check, Row
 from fflin.linear.model import LinearModel
 
@@ -81,7 +80,14 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def _name(axes: Axes, side: str, names: Sequence[str], keys: Any, units: Any, size: float) -> None:
+def _name(
+    axes: Axes,
+    side: str,
+    names: Sequence[str],
+    keys: Sequence[str],
+    units: Sequence[str],
+    size: float,
+) -> None:
     """Name rows ("y") or columns ("x") on one side and their groups on the other, with lines."""
     across = side == "x"
     axis = axes.xaxis if across else axes.yaxis

@@ -196,7 +196,7 @@ def generalized_inertia(lin: LinearModel) -> Array:
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
     if len(lin.A) != 12 + 2 * joints:
         raise InputError("the model lacks the states of the base; give the unreduced model")
-    inertia = floating_inertia(lin.M, range(6, 6 + joints), range(6))
+    inertia = floating_inertia(lin.M, np.arange(6, 6 + joints), np.arange(6))
     return (inertia + inertia.T) / 2.0
 
 

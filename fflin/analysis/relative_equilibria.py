@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, SingularInertiaError
 from fflin.base.tables import grid
-from fflin.base.validation import Array, FrozenArrays, instance
+from fflin.base.validation import Array, Complex, FrozenArrays, instance
 from fflin.dynamics.names import frame_of
 from fflin.dynamics.orbital import field_of, mean_motion
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from fflin.dynamics.state import Frame
 
 # Of the principal moments, relative to the largest: what eigenvalues and sums over bodies lose.
@@ -56,7 +54,7 @@ class RelativeEquilibrium(FrozenArrays):
 
     q: Array
     moments: Array
-    poles: NDArray[np.complexfloating[Any]]
+    poles: Complex
     stable: bool | None
     margin: float
 
@@ -172,7 +170,7 @@ def relative_equilibria(
     return RelativeEquilibria(sorted(found, key=lambda one: (-one.margin, *one.moments)))
 
 
-def _libration(moments: Array, n: float) -> tuple[NDArray[np.complexfloating[Any]], float]:
+def _libration(moments: Array, n: float) -> tuple[Complex, float]:
     """Return the poles (6,) of a body's attitude, and the least of what stability asks for."""
     radial, along, normal = moments.tolist()
     pitch = 3.0 * (along - radial) / normal

@@ -11,7 +11,7 @@ from fflin.analysis.controllability import controllability
 from fflin.analysis.mechanics import conserved
 from fflin.analysis.names import grouped, with_rates
 from fflin.analysis.observability import observability
-from fflin.analysis.ranks import Margin, Values, judged
+from fflin.analysis.ranks import Margin, judged
 from fflin.analysis.reduction import damped_wheels
 from fflin.base.errors import (
     DetectabilityError,
@@ -21,7 +21,7 @@ from fflin.base.errors import (
     StabilizabilityError,
     listed,
 )
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
 # A relative singular value of the equilibrated Popov-Belevitch-Hautus matrix below this counts as

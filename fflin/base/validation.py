@@ -17,8 +17,10 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     Array = NDArray[np.floating[Any]]
+    Complex = NDArray[np.complexfloating[Any]]
+    Values = NDArray[np.inexact[Any]]  # real or complex
 else:
-    Array = np.ndarray  # numpy.typing takes a tenth of the command line's start
+    Array = Complex = Values = np.ndarray  # numpy.typing takes a tenth of the command line's start
 
 # A quaternion or a (cos, sin) pair whose squared length misses 1 by up to this has only been
 # rounded and is renormalised; one that misses it by more is taken for a mistake.

@@ -19,7 +19,7 @@ from fflin.analysis.reduction import (
 )
 from fflin.base.errors import FflinWarning, InputError, listed, unknown
 from fflin.base.names import input_keys
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Complex, Values
 from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.control.weights import GivenWeight, sampled_cost, weights_of
@@ -119,7 +119,7 @@ def _damping(lin: LinearModel) -> Array:
     # Coupling by motion moves energy between coordinates, and an orbit rotates them: no damping.
     size = np.sqrt(lin.M.diagonal())
     whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
-    damped: Any = rates.sum() > 1e-9 * whole
+    damped = bool(rates.sum() > 1e-9 * whole)
     forces = lin.M @ modes
     return (forces * rates.clip(0.0)) @ forces.T * damped
 
@@ -315,8 +315,8 @@ class _Trial(NamedTuple):
     left: float  # factor on the bandwidth that the efforts allow, as far as it is below 1
     effort: str  # the input that allows the least
     K: Array
-    rates: Any  # of the modes (nx,) [1/s]
-    modes: Any
+    rates: Values  # of the modes (nx,) [1/s]
+    modes: Complex
     required: Array  # largest inputs (nu,)
 
 
@@ -402,7 +402,7 @@ def _vibrations(lin: LinearModel, trial: _Trial, slow: list[int]) -> dict[int, s
     return found
 
 
-def _moving_most(lin: LinearModel, modes: Any) -> list[str]:
+def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
     """Return the coordinates that modes (nx, k) move most, weighed by inertia."""
     m = len(lin.M)
     large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]

@@ -15,7 +15,7 @@ from fflin.base.errors import InputError, listed
 from fflin.base.names import group_of, input_keys
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import cut, grid, matrix, width
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 from fflin.control.margins import Margins, input_margins
 from fflin.control.optimal.riccati import rates_of
 from fflin.linear.model import LinearModel, state_space
@@ -88,7 +88,7 @@ class Gain(Design):
 
     K: Array
     P: Array
-    poles: Any
+    poles: Values
     residual: float
     margin: float
     method: str
@@ -308,7 +308,7 @@ def _blocks(gain: Gain) -> str:
 
 
 def _poles(gain: Gain) -> str:
-    poles: Any = gain.poles[gain.poles.imag >= 0.0]
+    poles = gain.poles[gain.poles.imag >= 0.0]
     if gain.dt:
         order, heads = np.argsort(-np.abs(poles)), ["pole", "modulus", "frequency [rad/s]"]
         rates = rates_of(poles, gain.dt)

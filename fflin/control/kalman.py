@@ -13,7 +13,7 @@ from fflin.analysis.stabilizability import require_detectable, require_disturbed
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
-from fflin.base.validation import Array, dimension, instance
+from fflin.base.validation import Array, Values, dimension, instance
 from fflin.control.gain import Gain, titled
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal.riccati import solve
@@ -73,7 +73,7 @@ class Estimator(Design):
     L: Array
     L_update: Array
     P: Array
-    poles: Any
+    poles: Values
     residual: float
     margin: float
     A: Array
@@ -144,7 +144,7 @@ class Compensator(Design):
     A: Array
     B: Array
     C: Array
-    poles: Any
+    poles: Values
     y0: Array
     u0: Array
     dt: float

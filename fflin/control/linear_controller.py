@@ -301,11 +301,12 @@ class LinearController(Feedback):
         return replace(self, system=by._replace(A=A, B=B, dt=dt))
 
 
-def growing(policy: Any) -> tuple[str, ...]:
+def growing(policy: object) -> tuple[str, ...]:
     """Return warnings on unstable poles of a linear controller and of its linear loop."""
-    said, by = [], decider(policy)
-    of = ("linear loop", "controller by itself") if isinstance(by, LinearController) else ()
-    for what in of:
+    said, by = list[str](), decider(policy)
+    if not isinstance(by, LinearController):
+        return ()
+    for what in ("linear loop", "controller by itself"):
         poles = np.linalg.eigvals(by.loop if what == "linear loop" else by.system.A)
         growth = np.abs(poles) - 1.0 if by.dt else poles.real
         if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
@@ -321,7 +322,7 @@ def growing(policy: Any) -> tuple[str, ...]:
     return tuple(said)
 
 
-def closed_loop(policy: Any) -> tuple[Array, float, tuple[str, ...]] | None:
+def closed_loop(policy: object) -> tuple[Array, float, tuple[str, ...]] | None:
     """Return the closed-loop matrix, dt [s] and state names of a policy with a linear loop."""
     (lin, K), by = feedback_of(policy), decider(policy)
     if isinstance(by, LinearController):

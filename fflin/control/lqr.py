@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +12,7 @@ from fflin.analysis.mechanics import rate_matrix
 from fflin.analysis.reduction import regulated_part, selection
 from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
-from fflin.base.validation import Array, dimension, instance
+from fflin.base.validation import Array, Values, dimension, instance
 from fflin.control.default_weights import rule_weights
 from fflin.control.gain import Gain, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve
@@ -316,13 +315,13 @@ def _difference(a: Array, b: Array, c: Array) -> Array:
     return np.where(np.abs(difference) > rounding, difference, 0.0)
 
 
-def _near_boundary(poles: Any, dt: float) -> bool:
+def _near_boundary(poles: Values, dt: float) -> bool:
     """Whether a pole of a stable loop is close to the boundary of stability."""
     decay = 1.0 - np.abs(poles) if dt else -poles.real
     return decay.min() < _NEAR_BOUNDARY * np.abs(poles - 1.0 if dt else poles).max()
 
 
-def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
+def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
     structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
     if structured is not None and not _near_boundary(structured.poles, lin.dt):
         return structured

@@ -28,6 +28,7 @@ from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import range_of
 from fflin.robot.limits import chosen_limits
+from fflin.robot.robot import Robot
 
 # Most entries of the matrices that map inputs to states and limits: 160 MB.
 _MOST = 20_000_000
@@ -180,7 +181,7 @@ class Mpc(_Shown, Feedback):
         """Return the quadratic program at the deviation e = x - x0 (nx,), by default zero."""
         return self.horizon.matrices(e, 0.0)
 
-    def bind(self, robot: Any) -> Policy:
+    def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot with the model's states and inputs."""
         lin, state = self.lin, self.state_map(robot)
         fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
@@ -210,7 +211,7 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
         plans = Receding(self.horizon)
         return lambda t, e: self.commanded(t)[2] + plans.step(t, e)
 
-    def bind(self, robot: Any) -> Policy:
+    def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot with the trajectory's states and inputs."""
         return Receding(self.horizon, self.deviation(robot))
 

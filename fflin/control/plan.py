@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, input_keys
@@ -224,7 +224,9 @@ def _least(search: Search, guess: tuple[Array, Array, Array], size: Array) -> _M
     return best
 
 
-def _require_within(state: StateMap, bounds: Array, what: str, point: Point, which: Any) -> None:
+def _require_within(
+    state: StateMap, bounds: Array, what: str, point: Point, which: slice | NDArray[np.bool_]
+) -> None:
     """Raise `InputError` if a point is outside the limits of some states."""
     values = limited_values(state, *point)
     asked = np.zeros(state.nx, dtype=bool)

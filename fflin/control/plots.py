@@ -11,7 +11,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing, letters_of, logarithmic
-from fflin.base.validation import Array, instance, number, refuse_masked
+from fflin.base.validation import Array, Values, instance, number, refuse_masked
 from fflin.control.gain import Gain
 from fflin.control.margins import Loop, input_loops
 from fflin.linear.model import LinearModel
@@ -24,7 +24,7 @@ _LINE = "#888888"
 
 
 def plot_poles(
-    poles: Any, path: str | Path | None = None, *, dt: float = 0.0, title: str = "poles"
+    poles: object, path: str | Path | None = None, *, dt: float = 0.0, title: str = "poles"
 ) -> Figure:
     """Plot a pole map.
 
@@ -113,7 +113,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def _bode(sizes: Axes, phases: Axes, w: Array, response: Any, loops: Sequence[Loop]) -> None:
+def _bode(sizes: Axes, phases: Axes, w: Array, response: Values, loops: Sequence[Loop]) -> None:
     colors = cycle(len(loops))
     sizes.set_prop_cycle(color=colors)
     sizes.loglog(w, np.abs(response), lw=1.0)
@@ -138,7 +138,7 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Any, loops: Sequence[Lo
         axes.set(xlabel="frequency [rad/s]", xlim=(w[0], w[-1]))
 
 
-def _pole_map(axes: Axes, sets: dict[str, Any], dt: float) -> None:
+def _pole_map(axes: Axes, sets: dict[str, Values], dt: float) -> None:
     for place, (label, values) in enumerate(sets.items()):
         axes.plot(
             values.real,
@@ -161,7 +161,7 @@ def _pole_map(axes: Axes, sets: dict[str, Any], dt: float) -> None:
     axes.set(xlabel=f"real part{of}", ylabel=f"imaginary part{of}")
 
 
-def _poles_of(given: Any) -> tuple[Any, float]:
+def _poles_of(given: object) -> tuple[Values, float]:
     if isinstance(given, LinearModel):
         return np.linalg.eigvals(given.A), given.dt
     if hasattr(given, "poles"):

@@ -227,12 +227,12 @@ class Clock:
         self._last = t
 
 
-def decider(policy: Any) -> Any:
+def decider(policy: object) -> object:
     """Return the policy that computes the commands: for an allocation, its inner policy."""
     return policy.policy if isinstance(policy, Allocation) else policy
 
 
-def axes_of(policy: Any) -> tuple[Frame | None, pin.SE3 | None]:
+def axes_of(policy: object) -> tuple[Frame | None, pin.SE3 | None]:
     """Return the frame and reference that a policy's state and inputs are in, if they are known."""
     lin, _ = feedback_of(policy)
     if lin is not None:
@@ -241,7 +241,7 @@ def axes_of(policy: Any) -> tuple[Frame | None, pin.SE3 | None]:
     return getattr(by, "frame", None), getattr(by, "origin", None)
 
 
-def bound(policy: Any, robot: Robot) -> Policy:
+def bound(policy: object, robot: Robot) -> Policy:
     """Return a policy for a robot, or raise `InputError` if the object is not a policy."""
     result = policy.bind(robot) if hasattr(policy, "bind") else policy
     if not callable(result):
@@ -252,13 +252,13 @@ def bound(policy: Any, robot: Robot) -> Policy:
     return result
 
 
-def feedback_of(policy: Any) -> tuple[LinearModel | None, Array | None]:
+def feedback_of(policy: object) -> tuple[LinearModel | None, Array | None]:
     """Return the model that a policy was made for, and its K, where it has them."""
     lin = getattr(policy, "lin", None)
     return (lin if isinstance(lin, LinearModel) else None), getattr(decider(policy), "K", None)
 
 
-def fed_back(policy: Any) -> tuple[str, ...]:
+def fed_back(policy: object) -> tuple[str, ...]:
     """Return the names of the states that a policy feeds back, as far as that is known."""
     (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
     if schedule is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -132,7 +133,9 @@ def fitted(system: System, lin: LinearModel) -> System:
     return System(system.A, B, C, D, system.dt, lin.output_names, lin.input_names)
 
 
-def _indices(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -> list[int]:
+def _indices(
+    kind: str, names: tuple[str, ...], size: int, of: str, known: Sequence[str]
+) -> list[int]:
     """Return the indices of a controller's signals among the signals of a model."""
     named = not all(map(_NUMBERED.fullmatch, names))
     if size != len(names if named else known):

@@ -239,13 +239,13 @@ def followed(policy: Any, robot: Robot, held: float = 0.0) -> Any:
     return policy
 
 
-def reference_of(policy: Any) -> Reference | None:
+def reference_of(policy: object) -> Reference | None:
     """Return the reference of a policy that follows a motion, else None."""
     found = getattr(decider(policy), "reference", None)
     return found if callable(found) else None
 
 
-def tracking_of(policy: Any) -> TrajectoryFeedback | None:
+def tracking_of(policy: object) -> TrajectoryFeedback | None:
     """Return the feedback along a trajectory that a policy is or allocates."""
     decides = decider(policy)
     return decides if isinstance(decides, TrajectoryFeedback) else None

@@ -81,7 +81,7 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     return _diagonal("largest", values, names, complete=of_inputs)
 
 
-def is_input(kind: str, key: str, lin: Any) -> bool:
+def is_input(kind: str, key: str, lin: LinearModel | LinearTrajectory) -> bool:
     """Whether a name, group or pattern is of inputs and not of states."""
     found = matching(kind, key, (*lin.state_names, *input_keys(lin)))
     sides = {index >= len(lin.state_names) for index in found}
@@ -154,7 +154,7 @@ def cost_weights(
     return Q, R, cross
 
 
-def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool) -> Array:
+def _checked_matrix(what: str, value: ArrayLike, names: Sequence[str], definite: bool) -> Array:
     size = len(names)
     matrix = cross_weight(what, value, size, size)
     skew = np.abs(matrix - matrix.T)

@@ -15,6 +15,7 @@ from fflin.base.validation import Array, instance, number, numbers, untied, vect
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import linearize, prepare
+from fflin.linear.model import LinearModel
 from fflin.robot.mass_properties import Piece
 from fflin.robot.robot import Robot
 from fflin.uncertainty.derivatives import WEIGH
@@ -358,7 +359,7 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
     return Block(key, "1", 1.0, relative, tuple(scaled))
 
 
-def _lft(of: Uncertain, lin: Any) -> LFT:
+def _lft(of: Uncertain, lin: LinearModel) -> LFT:
     ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
     if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in of.robot.outputs):
         feels = "an output depends on accelerations or masses, which the LFT cannot represent"

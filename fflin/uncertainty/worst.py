@@ -9,6 +9,7 @@ from operator import itemgetter
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
@@ -32,7 +33,7 @@ class Figures(NamedTuple):
 
     quick: Figure
     exact: Figure
-    above: Callable[[Array, float], Any]
+    above: Callable[[Array, float], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,7 @@ class Loops:
             peaks.append(min(w, 1e300))  # where others like it have theirs
             return np.array((value,))
 
-        def above(rows: Array, bound: float) -> Any:
+        def above(rows: Array, bound: float) -> NDArray[np.bool_]:
             F, B = self.matrices(rows)
             unstable = np.linalg.eigvals(F).real.max(axis=-1) >= 0.0
             limit = bound * (1.0 + ACCURACY)
