@@ -28,8 +28,8 @@ def configuration(
     ----------
     robot : Robot
     joints : mapping, optional
-        {joint: value [rad|m]} of independent joints; all others are at neutral. A name may be
-        a pattern, ``hinge_*``.
+        {joint: value [rad|m]} of independent joints; all other joints are at their neutral
+        positions. A name may be a pattern, ``hinge_*``.
     base : pin.SE3, optional
         Placement of the base in the world; the identity by default.
 
@@ -42,7 +42,7 @@ def configuration(
     UnknownNameError
         If there is no such joint.
     InputError
-        If a value is not a finite number, or a named joint mimics another.
+        If a value is not a finite number, or a named joint is a mimic joint.
 
     Examples
     --------
@@ -109,8 +109,8 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     robot : Robot
     values : mapping
         {name: rate}, with joint names [rad/s|m/s], and omega_b.x, .y, .z [rad/s] and v_b.x, .y, .z
-        [m/s] of the base in base axes. All others are zero. A name may be a pattern, ``hinge_*``,
-        or a group, ``qdot_m``.
+        [m/s] of the base in base axes. All other rates are zero. A name may be a pattern,
+        ``hinge_*``, or a group, ``qdot_m``.
 
     Returns
     -------
@@ -145,7 +145,7 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     ----------
     robot : Robot
     values : mapping
-        {name of an input, group or pattern, such as ``tau_m``: value}; all others are zero.
+        {name of an input, group or pattern, such as ``tau_m``: value}; all other inputs are zero.
 
     Returns
     -------

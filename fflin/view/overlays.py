@@ -33,8 +33,8 @@ def drawn_robot(robot: Robot, cloud: Any, motion: Any) -> Robot:
     instance("cloud", cloud, Campaign, "a Campaign, as fflin.monte_carlo returns it")
     if cloud.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
-            f"cloud is a campaign of '{cloud.robot}', which differs from the robot '{robot.name}'; "
-            "give the robot of the campaign"
+            f"cloud is a campaign of '{cloud.robot}', expected a campaign of the given robot "
+            f"'{robot.name}'"
         )
     drawn: Robot = getattr(motion, "_robot", None) or robot
     same = list(drawn.model.names) == list(robot.model.names) and drawn.name == robot.name
