@@ -174,8 +174,8 @@ class StateMap:
         return chart
 
     def charts(self, q: Array) -> Chart:
-        """Return the charts at rows of valid configurations (N, nq), for any base attitude."""
-        return Chart.of(q[:, 3:7] @ turning.product_matrix(self.origin_quaternion).T)
+        """Return the charts at valid configurations (.., nq), for any base attitude."""
+        return Chart.of(q[..., 3:7] @ turning.product_matrix(self.origin_quaternion).T)
 
     def rotation(self, q: Array) -> Array:
         """Return the rotation matrix (3, 3) of refMb at a valid configuration, for any attitude."""

@@ -106,7 +106,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
     resistances = {"damping": ("damping", damping), "Coulomb friction": ("friction", friction)}
     advice = [
-        Advice(key, tuple(values), f"{path.stem}: {what} not modelled: {enumerated(list(values))}")
+        Advice(key, tuple(values), f"{path.stem}: {what} unused: {enumerated(list(values))}")
         for what, (key, values) in resistances.items()
         if values
     ]
@@ -117,7 +117,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     for zero, of in unlimited.items():
         if zero:
             joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
-            text = f"{path.stem}: {', '.join(of)} 0 of {joints} taken as unlimited (or passive)"
+            text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
             advice.append(Advice("passive", zero, text))
     weights = {name: link for name, link in urdf.links.items() if link.mass}
     of_links, said = (weights, tuple(urdf.joints)), (tuple(notes), tuple(advice))
