@@ -159,7 +159,7 @@ def settling_runs(
         raise InputError(
             f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
             f"1/s: a run would take {horizon / dt:.3g} steps, expected at most "
-            f"{_MOST_STEPS:,}; give a gain whose poles are closer together, or add damping"
+            f"{_MOST_STEPS:,}; give a gain with poles of more similar speed, or add damping"
         )
     if not lin.dt:
         every = max(1, int(horizon / dt / _CHECKS)) if predicts else 4
@@ -277,7 +277,7 @@ def settle(
 def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     """Return the loop of a gain, or raise `InputError` where it cannot settle at the point."""
     if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
-        given = f"robot is a {type(robot).__name__}, lin is a {type(lin).__name__}"
+        given = f"robot has type {type(robot).__name__}, lin has type {type(lin).__name__}"
         raise InputError(f"{given}; expected a fflin.Robot and its fflin.LinearModel")
     K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
     kept = getattr(gain, "regulated", ())

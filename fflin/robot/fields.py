@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
-from fflin.base.errors import InputError, ModelError, unknown
+from fflin.base.errors import InputError, ModelError, require_known
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
 from fflin.base.toml_file import NAME, NUMBER, Kind
 from fflin.base.validation import dimension, number, numbers
@@ -43,9 +43,7 @@ def checked_fields(fields: Mapping[str, Any], scope: Scope) -> dict[str, Any]:
             "dry friction is not differentiable at rest, so a linear model cannot contain it; use "
             "damping, or add the friction in a simulation"
         )
-    for name in fields:
-        if name not in FIELDS:
-            raise unknown("field of a robot", name, FIELDS)
+    require_known("field of a robot", fields, FIELDS)
     return {name: FIELDS[name].check(value, scope) for name, value in fields.items()}
 
 
@@ -54,7 +52,7 @@ def checked_inputs(
 ) -> tuple[Input, ...]:
     """Return the inputs as a robot holds them."""
     if isinstance(value, str) or not isinstance(value, Sequence):
-        raise InputError(f"inputs is a {type(value).__name__}, expected a sequence of inputs")
+        raise InputError(f"inputs has type {type(value).__name__}, expected a sequence of inputs")
     if not value:
         raise InputError("inputs is empty; give at least one input")
     for item in value:
@@ -64,16 +62,16 @@ def checked_inputs(
     value = [one for item in value for one in _spread(item, find, joints, passive)]
     if not value:
         raise InputError("all inputs are torques of passive joints; add another input")
-    # What has a name is told by that, all else by what it is but for its limits.
-    named = [item for item in value if isinstance(item, kinds.WrenchInput)]
-    told: list[Any] = [
-        item.name for item in named if isinstance(item, kinds.Thruster) and item.name
-    ]
-    told += [name for name, _ in named_wheels(value)]
-    told += [replace(item, min=None, max=None) for item in value if item not in named]
-    for each in told:
-        if told.count(each) > 1:
-            raise InputError(f"input {each} is given twice; remove one")
+    # Thrusters and wheels differ by their names, other inputs by what they are but for limits.
+    identities: list[str | Input] = [name for name, _ in named_wheels(value)]
+    for item in value:
+        if isinstance(item, kinds.Thruster):
+            identities += [item.name] if item.name else []
+        elif not isinstance(item, kinds.WrenchInput):
+            identities.append(replace(item, min=None, max=None))
+    for each in identities:
+        if identities.count(each) > 1:
+            raise InputError(f"input {each} is given twice; remove one of the two")
     return tuple(value)
 
 
@@ -83,7 +81,10 @@ def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[st
         return [item]
     found = by_joint({str(item.joint): None}, joints, find)
     if item.joint in found and item.joint in passive:
-        raise InputError(f"joint '{item.joint}' is passive but has a joint torque; remove one")
+        raise InputError(
+            f"joint '{item.joint}' is passive, but a joint torque acts on it; remove the joint "
+            "from passive, or the torque from the inputs"
+        )
     return [replace(item, joint=name) for name in found if name not in passive]
 
 
@@ -127,7 +128,7 @@ def _outputs(value: Any, _: Scope) -> tuple[Output, ...]:
 
 def _rest(value: Any, scope: Scope) -> dict[str, float]:
     if not isinstance(value, Mapping):
-        raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
+        raise InputError(f"rest is {value!r}, expected {{joint: rest position}}")
     return by_joint(numbers("rest", value, "joint", "rest of joint"), scope.own, scope.find)
 
 
@@ -146,7 +147,7 @@ def _damping(value: Any, scope: Scope) -> dict[str, float]:
     if not isinstance(value, str):
         return _stiffness(value, scope, "damping")
     if value != "urdf":
-        raise InputError(f"damping is '{value}', expected 'urdf', a number or a mapping")
+        raise InputError(f"damping is '{value}', expected 'urdf', a number or {{joint: damping}}")
     return dict(scope.urdf_damping)
 
 
@@ -159,7 +160,8 @@ def range_of(name: str, value: Any) -> Range:
         least = -largest
     if least > largest:
         raise InputError(
-            f"limit of '{name}' is {value}, expected a magnitude of 0 or more, or (least, largest)"
+            f"limit of '{name}' is {value}, expected a largest magnitude of at least 0, or bounds "
+            "(least, largest)"
         )
     return least, largest
 
@@ -199,8 +201,7 @@ def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, An
 def _weights(value: Any, scope: Scope) -> dict[str, Any]:
     """Return the weights of a robot's regulator, by names of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)
-    if str(weights.get("rule", RULES[0])) not in RULES:
-        raise unknown("rule of weights", weights["rule"], RULES)
+    require_known("rule of weights", [str(weights.get("rule", RULES[0]))], RULES)
     states, keys = state_keys(scope.joints), _input_keys(scope.inputs)
     parts = {
         "q": ("state", states),
@@ -216,7 +217,9 @@ def _weights(value: Any, scope: Scope) -> dict[str, Any]:
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
     for key in weights["bryson"]:
         if key in weights["q"] or key in weights["r"]:
-            raise InputError(f"'{key}' has both a weight and a largest value; give only one")
+            raise InputError(
+                f"'{key}' has both a weight and a largest value; give only one of the two"
+            )
     return {part: value for part, value in weights.items() if value}
 
 
@@ -229,17 +232,18 @@ def checked_passive(
         raise InputError(f"passive is {value!r}, expected names of joints")
     for key in keys:
         if any(each.rpartition("=")[0] == key for each in locked):
-            raise InputError(f"joint '{key}' is both locked and passive; remove one")
+            raise InputError(
+                f"joint '{key}' is both locked and passive; remove the joint from one of the two "
+                "lists"
+            )
     found = by_joint(dict.fromkeys(keys), joints, find)
     return tuple(name for name in joints if name in found)
 
 
 def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
     if not isinstance(value, Mapping):
-        raise InputError(f"{what} is {value!r}, expected a mapping of {', '.join(known)}")
-    for name in value:
-        if name not in known:
-            raise unknown(f"part of {what}", name, known)
+        raise InputError(f"{what} is {value!r}, expected a table with the keys {', '.join(known)}")
+    require_known(f"part of {what}", value, known)
     return dict(value)
 
 
@@ -254,17 +258,34 @@ class Field(NamedTuple):
     merged: bool = False  # whether the entries of a call are added to the entries of a file
 
 
+def _number(expected: str) -> Kind:
+    return NUMBER._replace(expected=expected)
+
+
 # In the order in which a file applies them: the names of inputs are known after the inputs.
 FIELDS = {
     "passive": Field(kind=NAME, table=None),
     "inputs": Field(),
     "appendages": Field(),
     "outputs": Field(_outputs, kind=NAME, table=None),
-    "stiffness": Field(_stiffness, merged=True),
-    "damping": Field(_damping, word="", merged=True),
-    "rest": Field(_rest, merged=True),
-    "gravity": Field(lambda value, _: three_numbers("gravity", value)),
-    "orbit": Field(lambda value, _: checked_orbit(value), word="body"),
+    "stiffness": Field(
+        _stiffness, _number("a finite number [N m/rad|N/m], or a table [stiffness]"), merged=True
+    ),
+    "damping": Field(
+        _damping,
+        _number("a finite number [N m s/rad|N s/m], or a table [damping]"),
+        word="",
+        merged=True,
+    ),
+    "rest": Field(_rest, _number("a table [rest] of joint positions [rad|m]"), merged=True),
+    "gravity": Field(
+        lambda value, _: three_numbers("gravity", value), _number("three finite numbers [m/s^2]")
+    ),
+    "orbit": Field(
+        lambda value, _: checked_orbit(value),
+        _number("an altitude [m] as a finite number, or a table [orbit]"),
+        word="body",
+    ),
     "limits": Field(
         lambda value, scope: given_limits(scope.inputs, scope.joints, value), merged=True
     ),

@@ -40,7 +40,9 @@ def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> s
     reason = _reason(plan, plant)
     if engine == "compiled":
         if reason:
-            raise InputError(f"engine='compiled' cannot run this: {reason}; leave engine out")
+            raise InputError(
+                f"engine='compiled' is not possible, because {reason}; leave engine out"
+            )
         return "compiled"
     wanted = many or (plan.times.steps > LONG and is_kept("loop", "advance"))
     return "compiled" if wanted and not reason else "python"

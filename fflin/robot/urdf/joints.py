@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable
 from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple, TypeVar
 
-from fflin.base.errors import unknown
+from fflin.base.errors import require_known, unknown
 from fflin.robot.urdf.links import (
     Link,
     Pose,
@@ -308,8 +308,8 @@ def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[s
         earlier = parts.setdefault(part.name, part)
         if earlier is not part:
             raise element.error(
-                f"this is the second {element.tag} named {quoted(part.name)}, the first is in line "
-                f"{earlier.element.line}; rename one of them"
+                f"a second {element.tag} has the name {quoted(part.name)}, which is already used "
+                f"in line {earlier.element.line}; rename one of them"
             )
     return parts
 
@@ -385,9 +385,7 @@ def _hanging_on(
     prune: Collection[str], links: Iterable[str], joints: dict[str, JointElement]
 ) -> set[str]:
     """Return what hangs on joints, of links of which each comes after its parent."""
-    for name in prune:
-        if name not in joints:
-            raise unknown("joint to prune", name, joints)
+    require_known("joint to prune", prune, joints)
     dropped = {joints[name].child for name in prune}
     parents = {joint.child: joint.parent for joint in joints.values()}
     for name in links:

@@ -23,7 +23,7 @@ from fflin.robot.urdf.joints import (
     resolve_mimics,
 )
 from fflin.robot.urdf.links import INERTIA, Link, Pose, inertia_notes
-from fflin.robot.urdf.xml import Element, enumerated, named, parse, told
+from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
 _SIZE_LIMIT = 64 * 2**20
 
@@ -96,7 +96,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     urdf = read_description(root, prune)
     mimics = resolve_mimics(urdf.joints)
     model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
-    notes += told(root)
+    notes += notes_of(root)
     notes += inertia_notes(urdf.links.values(), model, path.stem)
 
     named_meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
@@ -134,7 +134,7 @@ def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> p
     if nv > _LARGEST_NV:
         raise root.error(
             f"the joints have {nv - 6} degrees of freedom, expected at most {_LARGEST_NV - 6}, "
-            "which take 1 GiB in Pinocchio's Data; make fixed the joints that do not matter"
+            "for which Pinocchio's Data takes 1 GiB; change the type of unimportant joints to fixed"
         )
     root_joint = "root_joint"
     while root_joint in urdf.joints or root_joint in urdf.links:
