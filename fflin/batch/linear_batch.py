@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import numpy as np
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError, require_known
 from fflin.base.record import NOT_VERIFIED, reading
 from fflin.base.validation import Array, FrozenArrays, frozen, number, refuse_masked
 from fflin.base.writing import as_path
@@ -339,9 +339,7 @@ class LinearBatch(FrozenArrays):
     def _named(self, joints: Mapping[str, Any]) -> dict[int, Any]:
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
-        for name in joints:
-            if name not in self.joint_names:
-                raise unknown("joint", name, self.joint_names)
+        require_known("joint", joints, self.joint_names)
         return {self.joint_names.index(name): value for name, value in joints.items()}
 
 

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from fflin.base import rotation as turning
 from fflin.base.errors import ChartError, InputError
-from fflin.base.validation import Array, placement, vector
+from fflin.base.validation import Array, instance, placement, vector
 from fflin.dynamics import names
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
 from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR, Frame
@@ -88,11 +88,7 @@ class StateMap:
     def __init__(
         self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame | None = None
     ) -> None:
-        if not isinstance(robot, Robot):
-            raise InputError(
-                f"robot has type {type(robot).__name__}, expected a fflin.Robot; fflin.load makes "
-                "one"
-            )
+        instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
         robot.require_unchanged()
         n, self.robot = robot.n, robot
         self.frame = names.frame_of(robot, frame)

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, ModelError
+from fflin.base.validation import instance
 from fflin.base.writing import as_path, remember
 from fflin.robot.catalog import RobotFile, find_mesh, find_robot
 from fflin.robot.fields import FIELDS
@@ -195,8 +196,7 @@ def from_model(
     """
     if not isinstance(model, pin.Model):
         raise ModelError(f"the model has type {type(model).__name__}, expected a pin.Model")
-    if name is not None and not isinstance(name, str):
-        raise InputError(f"name has type {type(name).__name__}, expected a string")
+    instance("name", name, str | None, "a string")
     copy = model.copy()
     copy.gravity.setZero()
     name = name or model.name or "model"

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import KW_ONLY, asdict, dataclass
 from typing import Any
 
-from fflin.base.errors import FflinWarning, InputError, unknown
+from fflin.base.errors import FflinWarning, InputError, require_known
 from fflin.base.validation import number, positive
 
 # Gravitational parameter [m^3/s^2] and equatorial radius [m]: JPL DE440, IAU 2015.
@@ -102,8 +102,8 @@ class CircularOrbit:
             raise InputError(
                 "only one of mu and body_radius is given; give both values, or leave both out"
             )
-        if self.mu is None and self.body not in BODIES:
-            raise unknown("central body", self.body, BODIES)
+        if self.mu is None:
+            require_known("central body", [self.body], BODIES)
         given = [value for value in (self.altitude, self.mean_motion) if value is not None]
         if len(given) != 1:
             said = "both are" if given else "neither is"
@@ -180,7 +180,5 @@ def checked_orbit(value: Any) -> CircularOrbit | None:
         return value
     if not isinstance(value, Mapping):
         return CircularOrbit(number("orbit", value))
-    for name in value:
-        if name not in CircularOrbit.__dataclass_fields__:
-            raise unknown("part of orbit", name, CircularOrbit.__dataclass_fields__)
+    require_known("part of orbit", value, CircularOrbit.__dataclass_fields__)
     return CircularOrbit(**value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,6 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
 from fflin.control.policies import Policy, StateFeedback
 from fflin.dynamics.state import Frame, state_history
 from fflin.linear.model import LinearModel
@@ -18,7 +17,7 @@ from fflin.robot.robot import Robot
 from fflin.simulation.compiled import carried_out, engine_of
 from fflin.simulation.conservation import conserved_by
 from fflin.simulation.motion import Motion
-from fflin.simulation.plan import Event, Plan, planned
+from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions, planned
 from fflin.simulation.plant import Disturbance, Plant
 from fflin.simulation.prediction import predict
 from fflin.simulation.run import Recording
@@ -47,10 +46,10 @@ def simulate(
     project: bool = True,
     sample: float | None = None,
     delay: float = 0.0,
-    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = None,
+    limits: Limits | None = None,
     disturbance: Disturbance | None = None,
     events: Sequence[Event] = (),
-    callback: Callable[[float, Array, Array, Array], None] | None = None,
+    callback: Callback | None = None,
     linear: LinearModel | bool | None = None,
     target: LinearModel | ArrayLike | None = None,
     frame: Frame | None = None,
@@ -187,33 +186,28 @@ def simulate(
     >>> motion.u.shape[1], float(motion.t[-1])
     (9, 5.0)
     """
-
-    def prepared(dt: float | None, every: int | None) -> tuple[Plan, Plant]:
-        return planned(
-            robot,
-            policy,
-            x0=x0,
-            q0=q0,
-            v0=v0,
-            duration=duration,
-            dt=dt,
-            method=method,
-            project=project,
-            sample=sample,
-            delay=delay,
-            limits=limits,
-            disturbance=disturbance,
-            events=events,
-            callback=callback,
-            linear=linear,
-            target=target,
-            frame=frame,
-            reference=reference,
-            every=every,
-            progress=progress,
-        )
-
-    plan, plant = prepared(dt, every)
+    options = SimulationOptions(
+        x0=x0,
+        q0=q0,
+        v0=v0,
+        duration=duration,
+        dt=dt,
+        method=method,
+        project=project,
+        sample=sample,
+        delay=delay,
+        limits=limits,
+        disturbance=disturbance,
+        events=events,
+        callback=callback,
+        linear=linear,
+        target=target,
+        frame=frame,
+        reference=reference,
+        every=every,
+        progress=progress,
+    )
+    plan, plant = planned(robot, policy, options)
     # A function of the caller's may remember what it was called with.
     again = dt is None and plan.repeatable and disturbance is None
     most, spent, coarse = _MOST_SPENT * plan.times.steps, 0, list[str]()
@@ -227,7 +221,8 @@ def simulate(
             if not again or last or not run.stopped.startswith("diverged"):
                 break
             coarse.append(f"{plan.times.dt:g}")
-            plan, plant = prepared(plan.times.dt / _FINER, plan.times.every * _FINER)
+            finer, every = plan.times.dt / _FINER, plan.times.every * _FINER
+            plan, plant = planned(robot, policy, replace(options, dt=finer, every=every))
         motion = motion_of(plan, plant, run.engine, run)
     except MemoryError:
         raise InputError(

@@ -23,7 +23,7 @@ from fflin.robot.urdf.joints import (
     resolve_mimics,
 )
 from fflin.robot.urdf.links import INERTIA, Link, Pose, inertia_notes
-from fflin.robot.urdf.xml import Element, enumerated, named, parse, told
+from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
 _SIZE_LIMIT = 64 * 2**20
 
@@ -96,7 +96,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     urdf = read_description(root, prune)
     mimics = resolve_mimics(urdf.joints)
     model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
-    notes += told(root)
+    notes += notes_of(root)
     notes += inertia_notes(urdf.links.values(), model, path.stem)
 
     named_meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
