@@ -69,8 +69,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     Raises
     ------
     InputError
-        If `duration` is not positive or not a multiple of dt, or if it is missing and the model is
-        not asymptotically stable.
+        If `duration` is not positive or not a multiple of dt, or if the model is not
+        asymptotically stable and `duration` is missing.
 
     References
     ----------

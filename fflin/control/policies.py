@@ -121,8 +121,7 @@ class Allocation:
     The policy commands the inputs of the robot `design`, such as torque and force on the base.
     The thrusters and motors of the simulated robot produce the generalised force that is closest
     to the commanded force. The distance between two forces is the sum of squared differences
-    between the accelerations that they cause. No thrust is negative, and no input exceeds its
-    limit.
+    between the resulting accelerations. No thrust is negative, and no input exceeds its limit.
 
     Parameters
     ----------
