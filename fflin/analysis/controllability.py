@@ -148,9 +148,9 @@ def controllability(lin: LinearModel) -> Controllability:
     Notes
     -----
     All inputs, including thrusters, are assumed to act in both directions. At a nonzero angular
-    velocity, the result applies to the model with A and B frozen at the point. Such a result does
-    not prove that the motion is controllable. At nonzero velocity, poles with a modulus below
-    about 1e-8 times the largest modulus are treated as zero.
+    velocity, the result applies to the model with A and B frozen at the point. Controllability of
+    the frozen model does not prove that the motion is controllable. At nonzero velocity, poles
+    with a modulus below about 1e-8 times the largest modulus are treated as zero.
 
     References
     ----------
