@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError, MissingPackageError
-from fflin.base.validation import Array, FrozenArrays, frozen, number
+from fflin.base.validation import Array, FrozenArrays, frozen, number, positive
 from fflin.linear.sampling import held_exponential
 
 if TYPE_CHECKING:
@@ -324,9 +324,7 @@ class LinearModel(StateSpace):
             If the robot's model was changed after the robot was made.
         """
         self.require_unchanged()
-        dt = number("dt", dt)
-        if dt <= 0.0:
-            raise InputError(f"dt is {dt:g} s, expected a positive sampling time")
+        dt = positive("dt", dt, "s")
         if self.dt:
             raise InputError(
                 f"the model is already sampled, at dt = {self.dt:g} s; discretize the "
