@@ -22,7 +22,7 @@ def run() -> Table:
         found = fflin.sensitivity(lin)
         if max(found.check(["base.mass", "link_2.com.y"]).values()) > 1e-7:
             raise WrongResultError(f"fflin on {name}: the derivatives do not pass their check")
-        slopes, parameters = found._slopes, list(found.parameters.values())
+        slopes, parameters = found._derivatives, list(found.parameters.values())
         times = interleaved(
             {
                 "inverse": lambda: pin.computeMinverse(model, data, q),  # noqa: B023

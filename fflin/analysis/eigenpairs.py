@@ -1,14 +1,13 @@
-"""Eigenpairs of a linear model: from its stiffness at rest, or from A without its zeros."""
+"""Eigenpairs of a linear model: those of A without its zeros."""
 
 from __future__ import annotations
 
-import math
 from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 
-from fflin.analysis.mechanics import floating_inertia, warn_of_stiffness
+from fflin.analysis.mechanics import warn_of_stiffness
 from fflin.analysis.ranks import EPS, Values
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
@@ -32,7 +31,7 @@ class NaturalModes(NamedTuple):
     pairs: list[Eigenpair]
     rigid_body: int
     zeros: int
-    residual: float = 0.0
+    residual: float
 
 
 def natural_modes(lin: LinearModel) -> NaturalModes:
@@ -48,72 +47,18 @@ def natural_modes(lin: LinearModel) -> NaturalModes:
     turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
     fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
     weight = np.concatenate((fastest * inertia, inertia))
-    found = _free_free(A, lin.M, inertia) or _general(A, weight, fastest)
-    residual = 0.0
-    for pole, shape, _ in found.pairs:
+    found, nullity = nonzero_eigenpairs(weight[:, None] * A / weight / fastest, _NO_STIFFNESS)
+    pairs, residual = list[Eigenpair](), 0.0
+    for scaled_pole, vector, error in found:
+        if scaled_pole.imag < 0.0:
+            continue
+        oscillates = abs(scaled_pole.real) <= error and scaled_pole.imag
+        pole = complex(0.0 if oscillates else scaled_pole.real, scaled_pole.imag) * fastest
+        shape = vector / weight
+        pairs.append(Eigenpair(pole, shape, scaled_pole.real / error))
         left = weight * (A @ shape - pole * shape) / fastest
         residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
-    return found._replace(residual=residual)
-
-
-def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
-    """Return the modes of a body at rest with symmetric stiffness; None for any other model."""
-    nv = len(M)
-    N, slope = A[:nv, nv:], A[nv:, :nv] @ A[:nv, nv:]
-    if A[:nv, :nv].any() or A[nv:, nv:].any():
-        return None
-    # In quasi-coordinates s, with p = N s and ds/dt = nu, scaled to a unit diagonal of M.
-    unit = M / np.outer(inertia, inertia)
-    by_s = slope * inertia[:, None] / inertia
-    K = -unit @ by_s
-    size = float(np.abs(K).max(initial=0.0))
-    rounding = 1e2 * EPS * float(np.linalg.cond(unit))
-    if not np.abs(K - K.T).max(initial=0.0) <= rounding * size:
-        return None
-    felt = np.flatnonzero(by_s.any(axis=0))
-    if not felt.size:
-        return NaturalModes([], nv, 2 * nv)
-    M_star = floating_inertia(unit, felt, np.setdiff1d(np.arange(nv), felt))
-    K = -M_star @ by_s[np.ix_(felt, felt)]
-    # Of the pencil K - omega^2 M*, by M* = L L^T.
-    inverse = np.linalg.inv(np.linalg.cholesky((M_star + M_star.T) / 2.0))
-    squares, vectors = np.linalg.eigh(inverse @ (K + K.T) / 2.0 @ inverse.T)
-    vectors = inverse.T @ vectors
-    # The Schur complement rounds by the condition of M, while A is exact to the last digits: one
-    # Newton step to the eigenpairs of A itself. Vectors of equal frequencies are not mixed, since
-    # any combination of them is a mode.
-    defect = -np.linalg.solve(vectors, by_s[np.ix_(felt, felt)] @ vectors) - np.diag(squares)
-    gaps = squares - squares[:, None]
-    apart = np.abs(defect) < 1e-3 * np.abs(gaps)
-    mixed = np.divide(defect, gaps, out=np.zeros_like(defect), where=apart)
-    squares, vectors = squares + defect.diagonal(), vectors + vectors @ mixed
-    found: list[Eigenpair] = []
-    for square, vector in zip(squares.tolist(), vectors.T, strict=True):
-        if abs(square) <= _NO_STIFFNESS * len(felt) * float(np.abs(squares).max()):
-            continue
-        # The coordinates without stiffness follow from -omega^2 s = (d nudot/ds) s.
-        s = by_s[:, felt] @ vector / inertia
-        root = abs(square) ** 0.5
-        for pole in [1j * root] if square > 0.0 else [complex(root), complex(-root)]:
-            shape = np.concatenate((N @ s, pole * s))
-            margin = math.copysign(math.inf, pole.real) if pole.real else 0.0
-            found.append(Eigenpair(pole, shape, margin))
-    counted = sum(2 if pair.pole.imag else 1 for pair in found)
-    return NaturalModes(found, nv - counted // 2, 2 * nv - counted)
-
-
-def _general(A: Array, weight: Array, fastest: float) -> NaturalModes:
-    """Return the modes of any model, by the eigenvalues of A."""
-    scaled = weight[:, None] * A / weight / fastest
-    found, nullity = nonzero_eigenpairs(scaled, _NO_STIFFNESS)
-    pairs: list[Eigenpair] = []
-    for pole, vector, error in found:
-        if pole.imag < 0.0:
-            continue
-        real = 0.0 if abs(pole.real) <= error and pole.imag else pole.real
-        value = complex(real, pole.imag) * fastest
-        pairs.append(Eigenpair(value, vector / weight, pole.real / error))
-    return NaturalModes(pairs, nullity, len(weight) - len(found))
+    return NaturalModes(pairs, nullity, 2 * nv - len(found), residual)
 
 
 def nonzero_eigenpairs(

@@ -65,7 +65,7 @@ def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
     """Scale Jacobians to units of energy, and of time so that A has a size of about 1."""
     # Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
     # likewise over the time unit. The tolerance is twenty times the rounding of M^-1, or that of
-    # the exponential which the slopes of a sampled model are a difference of.
+    # the exponential which the derivatives of a sampled model are a difference of.
     nv = len(M)
     p, v = slice(0, nv), slice(nv, None)
     L = np.linalg.cholesky(M)

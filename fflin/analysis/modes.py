@@ -234,11 +234,11 @@ class Modes:
         for mode in self.vibrations:
             name = next(iter(mode.strain), "")
             if name in clamped:
-                shares = _percents(mode.strain, 60)
-                rows.append([f"{mode.frequency:.6g}", f"{clamped[name]:.6g}", name, shares])
+                percents = _percents(mode.strain, 60)
+                rows.append([f"{mode.frequency:.6g}", f"{clamped[name]:.6g}", name, percents])
         of_masses = [["mode", "clamped", *"xyz", "xx", "yy", "zz"]]
         for name, parts in effective_shares(robot._bare.model, robot.appendages).items():
-            cells = [f"{100.0 * share:.1f}" if share > 1e-12 else "." for share in parts]
+            cells = [f"{100.0 * part:.1f}" if part > 1e-12 else "." for part in parts]
             of_masses.append([name, f"{clamped[name]:.6g}" if name in clamped else ".", *cells])
         title = (
             "effective masses and moments of inertia in % of the body that carries the appendage, "

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from fflin.base.errors import MissingPackageError
-from fflin.base.writing import as_path, check_ending, write_whole
+from fflin.base.writing import as_path, check_ending, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,7 +82,7 @@ def drawing(path: str | Path | None, width: float, height: float, **options: Any
         if target is not None:
             content = io.BytesIO()
             figure.savefig(content, format=target.suffix[1:])
-            write_whole({target: content.getvalue()})
+            write_atomically({target: content.getvalue()})
 
 
 def require_matplotlib() -> None:

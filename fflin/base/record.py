@@ -32,32 +32,34 @@ import numpy as np
 
 from fflin.base.errors import FileError, InputError
 from fflin.base.validation import FrozenArrays
-from fflin.base.writing import as_path, check_ending, read_file, reason, shown, write_whole
+from fflin.base.writing import as_path, check_ending, read_file, reason, shown, write_atomically
 
-SEAL = "sha256"
+CHECKSUM = "sha256"
 
 Record = dict[str, Any]
 Kind = TypeVar("Kind", bound="Design")
 
-DAMAGED = f"its content does not match its {SEAL}: the file was damaged or edited"
-NOT_VERIFIED = f"not verified: the file has no {SEAL}, so that damage cannot be detected"
+DAMAGED = f"its content does not match its {CHECKSUM}: the file was damaged or edited"
+NOT_VERIFIED = f"not verified: the file has no {CHECKSUM}, so that damage cannot be detected"
 
 _BLOCK = 2**22
 _LARGEST = 1e300
-_JSON_SEAL = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
-_MAT_TEXT, _MAT_SEAL = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
-_MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)  # a header that was sealed
+_JSON_CHECKSUM = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
+_MAT_TEXT, _MAT_CHECKSUM = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
+_MAT_NEARLY = re.compile(
+    rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE
+)  # a header that was checksummed
 
 
 class NoRoomError(FileError):
     """Error for a file whose content does not fit into memory."""
 
 
-def write_record(path: Path, record: Mapping[str, Any], *, sealed: bool) -> None:
-    """Write a record in the format of the ending, with its digest if `sealed`."""
+def write_record(path: Path, record: Mapping[str, Any], *, checksummed: bool) -> None:
+    """Write a record in the format of the ending, with its digest if `checksummed`."""
     check_ending(path, FORMATS)
     require_finite(record)
-    write_whole({path: _CODECS[path.suffix][0](record, sealed)})
+    write_atomically({path: _CODECS[path.suffix][0](record, checksummed)})
 
 
 def read_record(path: Path) -> tuple[Record, bool]:
@@ -141,12 +143,12 @@ def content_digest(entries: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def _to_npz(record: Mapping[str, Any], sealed: bool) -> bytes:
+def _to_npz(record: Mapping[str, Any], checksummed: bool) -> bytes:
     buffer = io.BytesIO()
     groups = {k: json.dumps(group) for k, group in record.items() if isinstance(group, dict)}
     plain: dict[str, Any] = {key: np.asarray(value) for key, value in {**record, **groups}.items()}
-    if sealed:
-        plain[SEAL] = content_digest(plain)
+    if checksummed:
+        plain[CHECKSUM] = content_digest(plain)
     np.savez(buffer, **plain)
     return buffer.getvalue()
 
@@ -158,18 +160,18 @@ def _from_npz(content: bytes) -> tuple[Record, bool]:
     end = content[-22:]
     if end[:4] == b"PK\5\6" and int.from_bytes(end[10:12], "little") != len(record):
         raise ValueError(DAMAGED)
-    return record, check_seal(record)
+    return record, verify_checksum(record)
 
 
-def check_seal(record: Record) -> bool:
+def verify_checksum(record: Record) -> bool:
     """Take the digest out of the entries of .npz; return whether there is one, and it holds."""
-    seal = record.pop(SEAL, None)
-    if seal is not None and text(seal) != content_digest(record):
+    checksum = record.pop(CHECKSUM, None)
+    if checksum is not None and text(checksum) != content_digest(record):
         raise ValueError(DAMAGED)
-    return seal is not None
+    return checksum is not None
 
 
-def _to_mat(record: Mapping[str, Any], sealed: bool) -> bytes:
+def _to_mat(record: Mapping[str, Any], checksummed: bool) -> bytes:
     from scipy.io import savemat
 
     buffer = io.BytesIO()
@@ -177,18 +179,18 @@ def _to_mat(record: Mapping[str, Any], sealed: bool) -> bytes:
     savemat(buffer, {**record, **cells}, oned_as="column")
     body = buffer.getvalue()[_MAT_TEXT:]
     head = b"MATLAB 5.0 MAT-file"
-    if sealed:
-        head = _MAT_SEAL + hashlib.sha256(body).hexdigest().encode()
+    if checksummed:
+        head = _MAT_CHECKSUM + hashlib.sha256(body).hexdigest().encode()
     return head.ljust(_MAT_TEXT) + body
 
 
 def _from_mat(content: bytes) -> tuple[Record, bool]:
     from scipy.io import loadmat
 
-    sealed = content.startswith(_MAT_SEAL)
-    if sealed:
-        seal = content[len(_MAT_SEAL) : _MAT_TEXT].rstrip().decode()
-        if seal != hashlib.sha256(content[_MAT_TEXT:]).hexdigest():
+    checksummed = content.startswith(_MAT_CHECKSUM)
+    if checksummed:
+        checksum = content[len(_MAT_CHECKSUM) : _MAT_TEXT].rstrip().decode()
+        if checksum != hashlib.sha256(content[_MAT_TEXT:]).hexdigest():
             raise ValueError(DAMAGED)
     elif _MAT_NEARLY.search(content[:_MAT_TEXT]):
         raise ValueError("its header was damaged or edited")
@@ -196,7 +198,7 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
         hint = ", but of version 7.3; write it with save -v7" * (content[124:128] == b"\0\2IM")
         raise ValueError(f"not a MATLAB file of level 5{hint}")
     record = {key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()}
-    return {key: value for key, value in record.items() if key[:2] != "__"}, sealed
+    return {key: value for key, value in record.items() if key[:2] != "__"}, checksummed
 
 
 def _of_mat(value: Any) -> Any:
@@ -211,7 +213,7 @@ def _of_mat(value: Any) -> Any:
     return [_of_mat(cell) for cell in value.ravel(order="F")] if value.dtype.kind == "O" else value
 
 
-def _to_json(record: Mapping[str, Any], sealed: bool) -> bytes:
+def _to_json(record: Mapping[str, Any], checksummed: bool) -> bytes:
     def plain(value: Any) -> Any:
         if isinstance(value, np.ndarray) and value.dtype.kind == "c":
             return {"real": value.real.tolist(), "imag": value.imag.tolist()}
@@ -219,19 +221,19 @@ def _to_json(record: Mapping[str, Any], sealed: bool) -> bytes:
 
     lines = (f"{json.dumps(k)}: {json.dumps(plain(v), allow_nan=False)}" for k, v in record.items())
     body = ("{\n" + ",\n".join(lines)).encode()
-    seal = f',\n"{SEAL}": "{hashlib.sha256(body).hexdigest()}"' if sealed else ""
-    return body + f"{seal}\n}}\n".encode()
+    checksum = f',\n"{CHECKSUM}": "{hashlib.sha256(body).hexdigest()}"' if checksummed else ""
+    return body + f"{checksum}\n}}\n".encode()
 
 
 def _from_json(content: bytes) -> tuple[Record, bool]:
-    found = _JSON_SEAL.search(content[-100:])
+    found = _JSON_CHECKSUM.search(content[-100:])
     if found:
         body = content[: len(content) - len(found.group())]
         if hashlib.sha256(body).hexdigest().encode() != found.group(1):
-            raise ValueError(f"{DAMAGED}; to read it as it is, delete the line {SEAL}")
+            raise ValueError(f"{DAMAGED}; to read it as it is, delete the line {CHECKSUM}")
     record: Record = json.loads(content)
-    if record.pop(SEAL, None) is not None and not found:
-        raise ValueError(f"its line {SEAL} is not in the form that fflin writes; delete it")
+    if record.pop(CHECKSUM, None) is not None and not found:
+        raise ValueError(f"its line {CHECKSUM} is not in the form that fflin writes; delete it")
     return record, bool(found)
 
 
@@ -274,7 +276,7 @@ class Design(FrozenArrays):
         InputError
             If a value is not finite.
         """
-        write_record(as_path(path), record_of(self), sealed=self.verified)
+        write_record(as_path(path), record_of(self), checksummed=self.verified)
 
     @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:

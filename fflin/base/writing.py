@@ -113,7 +113,7 @@ def csv_table(rows: Iterable[Iterable[Any]]) -> bytes:
     return text.getvalue().encode()
 
 
-def write_whole(contents: Mapping[Path, bytes]) -> None:
+def write_atomically(contents: Mapping[Path, bytes]) -> None:
     """Write files atomically: each is complete or, if anything fails, unchanged."""
     with replacing(*contents) as files:
         for file, content in zip(files, contents.values(), strict=True):
@@ -127,7 +127,7 @@ def replacing(*targets: Path) -> Iterator[list[Path]]:
     target = Path()
     try:
         for target in targets:
-            temporary = place(target).parent / f".fflin-{os.urandom(8).hex()}"
+            temporary = followed_path(target).parent / f".fflin-{os.urandom(8).hex()}"
             temporary.touch(exist_ok=False)  # with the mode that the umask leaves
             written[temporary] = target
         yield list(written)
@@ -145,7 +145,7 @@ def replacing(*targets: Path) -> Iterator[list[Path]]:
 
 def install(temporary: Path, target: Path) -> None:
     """Let a file that is whole take the place of its target."""
-    real = place(target)
+    real = followed_path(target)
     if real.exists():
         os.chmod(temporary, real.stat().st_mode & 0o777)
     os.replace(temporary, real)
@@ -153,7 +153,7 @@ def install(temporary: Path, target: Path) -> None:
         files.outputs.discard(target)  # what the command made, it may read
 
 
-def place(target: Path) -> Path:
+def followed_path(target: Path) -> Path:
     """Return the target file with links followed; raise `FileError` if it may not be written."""
     real = Path(os.path.realpath(target))
     try:
@@ -173,14 +173,14 @@ def place(target: Path) -> Path:
     return real
 
 
-def check_place(target: Path, endings: tuple[str, ...] = ()) -> None:
+def check_output_path(target: Path, endings: tuple[str, ...] = ()) -> None:
     """Raise `FileError` if no file can be written there, before any work is done."""
     from tempfile import TemporaryFile
 
     if endings:
         check_ending(target, endings)
     try:
-        with TemporaryFile(prefix=".fflin-", dir=place(target).parent):
+        with TemporaryFile(prefix=".fflin-", dir=followed_path(target).parent):
             pass
     except FileError:
         raise

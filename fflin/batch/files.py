@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fflin.base.errors import MissingPackageError
-from fflin.base.record import DAMAGED, SEAL, check_seal, content_digest
+from fflin.base.record import CHECKSUM, DAMAGED, content_digest, verify_checksum
 from fflin.base.validation import Array
 from fflin.base.writing import check_ending, replacing
 
@@ -27,7 +27,7 @@ FORMATS = (".npz", ".h5")
 # can crash the process.
 CHECKED = ("v108", "v108")
 
-CHUNK_CHECKSUMS = f"chunk_{SEAL}"
+CHUNK_CHECKSUMS = f"chunk_{CHECKSUM}"
 _CHUNK_BYTES = 2**22
 
 
@@ -55,9 +55,9 @@ def is_constant(array: Array) -> bool:
 
 
 def write_rows(
-    path: Path, arrays: Mapping[str, Array], texts: Mapping[str, str], *, sealed: bool
+    path: Path, arrays: Mapping[str, Array], texts: Mapping[str, str], *, checksummed: bool
 ) -> None:
-    """Write arrays of equally many rows, and texts; with their digests where `sealed`."""
+    """Write arrays of equally many rows, and texts; with their digests where `checksummed`."""
     check_format(path)
     constants = {key: value[0] for key, value in arrays.items() if is_constant(value)}
     varying = {key: value for key, value in arrays.items() if key not in constants}
@@ -65,8 +65,8 @@ def write_rows(
     with replacing(path) as (new,):
         if path.suffix == ".npz":
             plain: dict[str, Any] = {**varying, **constants, **texts}
-            if sealed:
-                plain[SEAL] = content_digest(plain)
+            if checksummed:
+                plain[CHECKSUM] = content_digest(plain)
             with new.open("wb") as file:
                 np.savez(file, **plain)
             return
@@ -74,13 +74,15 @@ def write_rows(
             for key, value in {**varying, **constants}.items():
                 file.create_dataset(key, data=value)
             file.attrs.update(texts)
-            if sealed:
+            if checksummed:
                 count = len(next(iter(arrays.values())))
                 row = sum(value.nbytes // count for value in varying.values())
                 chunk = max(1, _CHUNK_BYTES // row)
                 checksums = _chunk_checksums(varying, count, chunk)
                 file.create_dataset(CHUNK_CHECKSUMS, data=checksums)
-                file.create_dataset(SEAL, data=file_checksum(texts, chunk, checksums, constants))
+                file.create_dataset(
+                    CHECKSUM, data=file_checksum(texts, chunk, checksums, constants)
+                )
                 file.attrs["chunk"] = chunk
 
 
@@ -92,12 +94,12 @@ def chunk_checksum(arrays: Mapping[str, Array]) -> bytes:
 def _chunk_checksums(varying: Mapping[str, Array], count: int, chunk: int) -> NDArray[np.uint8]:
     """Return the SHA-256 (chunks, 32) of the rows of each chunk."""
 
-    def seal(start: int) -> bytes:
+    def checksum(start: int) -> bytes:
         return chunk_checksum({key: value[start : start + chunk] for key, value in varying.items()})
 
     # hashlib releases the interpreter's lock, so that threads hash at the same time.
     with ThreadPoolExecutor() as pool:
-        checksums = b"".join(pool.map(seal, range(0, count, chunk)))
+        checksums = b"".join(pool.map(checksum, range(0, count, chunk)))
     return np.frombuffer(checksums, np.uint8).reshape(-1, 32)
 
 
@@ -125,8 +127,8 @@ def _from_npz(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str
     # Opened here, since NumPy does not close a file that it finds damaged.
     with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
         entries = {key: file[key] for key in file.files}
-    verified = verify and check_seal(entries)
-    entries.pop(SEAL, None)
+    verified = verify and verify_checksum(entries)
+    entries.pop(CHECKSUM, None)
     texts = {key: str(entries.pop(key)) for key in list(entries) if entries[key].dtype.kind == "U"}
     return entries, texts, verified
 
@@ -136,13 +138,13 @@ def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, st
         texts = {key: str(value) for key, value in file.attrs.items() if isinstance(value, str)}
         arrays = {key: _mapped(path, file[key]) for key in file}
         chunk = int(file.attrs.get("chunk", 0))
-    seal, checksums = arrays.pop(SEAL, None), arrays.pop(CHUNK_CHECKSUMS, None)
-    if seal is None or checksums is None or not verify:
+    checksum, checksums = arrays.pop(CHECKSUM, None), arrays.pop(CHUNK_CHECKSUMS, None)
+    if checksum is None or checksums is None or not verify:
         return arrays, texts, False
     constants = {key: arrays[key] for key in json.loads(texts["constant"])}
     varying = {key: value for key, value in arrays.items() if key not in constants}
-    sealed = {key: value for key, value in texts.items() if key != "request"}
-    whole = chunk > 0 and np.array_equal(seal, file_checksum(sealed, chunk, checksums, constants))
+    own = {key: value for key, value in texts.items() if key != "request"}
+    whole = chunk > 0 and np.array_equal(checksum, file_checksum(own, chunk, checksums, constants))
     count = len(next(iter(varying.values())))
     if not whole or not np.array_equal(checksums, _chunk_checksums(varying, count, chunk)):
         raise ValueError(DAMAGED)

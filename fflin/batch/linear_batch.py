@@ -249,7 +249,7 @@ class LinearBatch(FrozenArrays):
         """
         if not len(self):
             raise InputError("the batch has no points; there is nothing to save")
-        write_rows(as_path(path), self._arrays(), self.header(len(self)), sealed=self.verified)
+        write_rows(as_path(path), self._arrays(), self.header(len(self)), checksummed=self.verified)
 
     @staticmethod
     def load(path: str | Path, robot: Robot | None = None, *, verify: bool = True) -> LinearBatch:

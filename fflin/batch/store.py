@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from fflin.base.errors import FileError, InputError
-from fflin.base.record import SEAL
+from fflin.base.record import CHECKSUM
 from fflin.base.validation import Array
-from fflin.base.writing import as_path, check_place, install, reason, reserve
+from fflin.base.writing import as_path, check_output_path, install, reason, reserve
 from fflin.batch.files import (
     CHECKED,
     CHUNK_CHECKSUMS,
@@ -107,7 +107,7 @@ class FileStore:
             for key, value in self._constants.items():
                 self._file.create_dataset(key, data=value)
             self._file[CHUNK_CHECKSUMS] = np.zeros((-(-self.count // self.chunk), 32), np.uint8)
-            self._file[SEAL] = np.zeros(32, np.uint8)
+            self._file[CHECKSUM] = np.zeros(32, np.uint8)
             self._file.attrs.update({**self._texts, "chunk": self.chunk, "request": request})
             self._file.flush()
             reserve(self.part)
@@ -125,7 +125,7 @@ class FileStore:
                     raise ValueError(f"{key} differs")
             if any(self._file.attrs[key] != value for key, value in self._texts.items()):
                 raise ValueError("its names differ")
-            if self._file[SEAL].shape != (32,):
+            if self._file[CHECKSUM].shape != (32,):
                 raise ValueError("it has no checksum")
 
     @contextmanager
@@ -169,15 +169,17 @@ class FileStore:
             for key in self.names:
                 self._file[key][start:stop] = arrays[key]
             self._file.flush()
-            seal = chunk_checksum({key: arrays[key] for key in self.names})
-            self._file[CHUNK_CHECKSUMS][start // self.chunk] = np.frombuffer(seal, np.uint8)
+            checksum = chunk_checksum({key: arrays[key] for key in self.names})
+            self._file[CHUNK_CHECKSUMS][start // self.chunk] = np.frombuffer(checksum, np.uint8)
             self._file.flush()
 
     def complete(self) -> None:
         """Add the hash of all and, where the target is HDF5 too, take its place."""
         with self._writable():
             checksums = self._file[CHUNK_CHECKSUMS][:]
-            self._file[SEAL][:] = file_checksum(self._texts, self.chunk, checksums, self._constants)
+            self._file[CHECKSUM][:] = file_checksum(
+                self._texts, self.chunk, checksums, self._constants
+            )
             self._file.close()
             if self.path.suffix == ".h5":
                 install(self.part, self.path)
@@ -207,8 +209,8 @@ def output_path(out: str | Path) -> Path:
     """Return where a batch can be written, or raise `FileError` or `MissingPackageError`."""
     path = as_path(out)
     check_format(path)
-    check_place(path)
-    check_place(part_of(path))
+    check_output_path(path)
+    check_output_path(part_of(path))
     return path
 
 

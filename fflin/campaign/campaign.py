@@ -18,7 +18,7 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import reading
 from fflin.base.validation import Array, FrozenArrays, share, whole
-from fflin.base.writing import as_path, write_whole
+from fflin.base.writing import as_path, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
 from fflin.campaign.spreads import SEED
@@ -369,14 +369,14 @@ class Campaign(FrozenArrays):
 
         content = io.BytesIO()
         savemat(content, {"columns": np.array(columns, dtype=object), "runs": rows})
-        write_whole({path: content.getvalue()})
+        write_atomically({path: content.getvalue()})
 
     def _save(self, path: Path, **texts: str) -> None:
         """Write it with more texts, such as the request that `monte_carlo` knows its call by."""
         arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in _ARRAYS}
         rest = {key: getattr(self, key) for key in _HEADER}
         texts["header"] = json.dumps({"kind": "Campaign", **rest})
-        write_rows(path, arrays, texts, sealed=True)
+        write_rows(path, arrays, texts, checksummed=True)
 
     @classmethod
     def load(cls, path: str | Path) -> Campaign:

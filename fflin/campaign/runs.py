@@ -19,7 +19,7 @@ from fflin.batch.store import MemoryStore
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.spreads import placed
 from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, outcome_of, stop_of
-from fflin.control.saturation import Saturation
+from fflin.control.channel import Saturation
 from fflin.dynamics.state import states_of
 from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES, batch_tree

@@ -11,24 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.tables import counted, signals
-from fflin.commands.arguments import (
-    OUTPUT,
-    PAGE,
-    POINT,
-    RECORD,
-    Commands,
-    add,
-    add_figure,
-    add_output_file,
-    add_point,
-    add_robot,
-    add_system,
-    assignment,
-    command,
-    count_of,
-    group_of,
-    number,
-)
+from fflin.commands import options, parser
 from fflin.commands.points import (
     attitude,
     linear_model,
@@ -43,9 +26,9 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add analyze, modes, sensitivity and uncertain."""
-    analyze = command(
+    analyze = parser.command(
         commands,
         "analyze",
         _analyze,
@@ -54,9 +37,9 @@ def add_commands(commands: Commands) -> None:
         common="joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
         "frame plot",
     )
-    add_point(analyze)
-    add_figure(analyze, "the modes")
-    modes = command(
+    options.add_point(analyze)
+    options.add_figure(analyze, "the modes")
+    modes = parser.command(
         commands,
         "modes",
         _modes,
@@ -65,11 +48,11 @@ def add_commands(commands: Commands) -> None:
         common="joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
         "frame plot html",
     )
-    add_point(modes)
-    add_figure(modes, "frequencies, damping and shapes")
-    pages = group_of(modes, OUTPUT)
-    add(pages, "--html", "write a page that plays the mode shapes", PAGE)
-    held = command(
+    options.add_point(modes)
+    options.add_figure(modes, "frequencies, damping and shapes")
+    pages = modes.group(parser.OUTPUT)
+    pages.add("--html", "write a page that plays the mode shapes", parser.PAGE)
+    held = parser.command(
         commands,
         "equilibrium",
         _equilibrium,
@@ -78,15 +61,15 @@ def add_commands(commands: Commands) -> None:
         common="joint rpy velocity relative-equilibrium orbit stiffness gravity passive inputs "
         "frame output-file",
     )
-    add_point(held)
+    options.add_point(held)
     what = "q, u, the deflections and the poles"
-    add_output_file(group_of(held, OUTPUT), what, RECORD, "Equilibrium")
+    options.add_output_file(held.group(parser.OUTPUT), what, parser.RECORD, "Equilibrium")
     _add_sensitivity(commands)
     _add_uncertain(commands)
 
 
-def _add_sensitivity(commands: Commands) -> None:
-    sensitivity = command(
+def _add_sensitivity(commands: parser.Commands) -> None:
+    sensitivity = parser.command(
         commands,
         "sensitivity",
         _sensitivity,
@@ -94,23 +77,22 @@ def _add_sensitivity(commands: Commands) -> None:
         example="fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
         common="joint rpy velocity equilibrium inputs frame dt top only output-file",
     )
-    add_point(sensitivity)
-    model = group_of(sensitivity, "derivatives")
-    add(model, "--dt", "differentiate the sampled model, with inputs held for H [s]", number, "H")
+    options.add_point(sensitivity)
+    model = sensitivity.group("derivatives")
+    model.add("--dt", "differentiate the sampled model, with inputs held for H [s]", float, "H")
     top = "show the N parameters with the largest effect"
-    add(model, "--top", top, count_of, default=15)
-    add(
-        model,
+    model.add("--top", top, int, default=15)
+    model.add(
         "--only",
         "show only the parameters of this kind, link or pattern, such as mass, link_3, *.density",
         metavar="NAME",
     )
     what = "dA, dB, df0 for each parameter"
-    add_output_file(group_of(sensitivity, OUTPUT), what, RECORD, "Sensitivity")
+    options.add_output_file(sensitivity.group(parser.OUTPUT), what, parser.RECORD, "Sensitivity")
 
 
-def _add_uncertain(commands: Commands) -> None:
-    uncertain = command(
+def _add_uncertain(commands: parser.Commands) -> None:
+    uncertain = parser.command(
         commands,
         "uncertain",
         _uncertain,
@@ -118,13 +100,12 @@ def _add_uncertain(commands: Commands) -> None:
         example="fflin uncertain servicer_7dof --vary base.mass=0.2 "
         "--vary panel_left.stiffness=80:120 -o uncertain.mat",
     )
-    point = group_of(uncertain, POINT)
+    point = uncertain.group(parser.POINT)
     neutral = "position of a joint [rad|m]; by default as in robot.toml, else neutral"
-    add(point, "--joint", neutral, assignment, repeatable=True)
-    add_robot(uncertain)
-    add_system(uncertain)
-    add(
-        group_of(uncertain, "parameters"),
+    point.add("--joint", neutral, parser.assignment, repeatable=True)
+    options.add_robot(uncertain)
+    options.add_system(uncertain)
+    uncertain.group("parameters").add(
         "--vary",
         "range of a parameter named by `fflin sensitivity`, or of all parameters that match a "
         "pattern: a fraction of the nominal value, such as 0.2, or LEAST:LARGEST. With RANGE,tied "
@@ -135,7 +116,7 @@ def _add_uncertain(commands: Commands) -> None:
         required=True,
     )
     what = "A, B1 .. D22 and the blocks"
-    add_output_file(group_of(uncertain, OUTPUT), what, RECORD, "LFT")
+    options.add_output_file(uncertain.group(parser.OUTPUT), what, parser.RECORD, "LFT")
 
 
 def _range(text: str) -> tuple[str, Any]:
@@ -146,7 +127,7 @@ def _range(text: str) -> tuple[str, Any]:
         raise argparse.ArgumentTypeError(
             f"'{text}' is not of the form NAME=FRACTION or NAME=LEAST:LARGEST"
         )
-    found = tuple(map(number, ends)) if ends[1:] else number(ends[0])
+    found = tuple(map(parser.number, ends)) if ends[1:] else parser.number(ends[0])
     return name, {"range": found, "tied": True} if tied else found
 
 
@@ -234,7 +215,7 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
         "poles": poles,
     }
     entries = {"kind": "Equilibrium", **vars(held), "poles": poles}
-    write = partial(write_record, record=entries, sealed=True)
+    write = partial(write_record, record=entries, checksummed=True)
     return Report(robot.name, result, "\n".join(lines), {arguments.output_file: write})
 
 

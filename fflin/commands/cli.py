@@ -5,19 +5,17 @@ from __future__ import annotations
 import argparse
 import io
 import os
-import re
 import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from fflin.base import __version__
-from fflin.base.errors import FflinError, FflinWarning, FileError, one_line
-from fflin.base.writing import check_ending, check_place, files_of_command, place
-from fflin.commands import BAD_INPUT, DONE
-from fflin.commands.arguments import FIGURE, files_of, outputs_of
+from fflin.base.errors import FflinError, FflinWarning, FileError
+from fflin.base.writing import check_ending, check_output_path, files_of_command, followed_path
+from fflin.commands import BAD_INPUT, DONE, parser
 from fflin.commands.results import finish
 
 # The commands by task, in the order of the help, each with its module.
@@ -29,8 +27,8 @@ TASKS = {
         **{"uncertain": "analysis", "validity": "regions", "funnel": "regions"},
     },
     "design and simulate": {
-        **{"lqr": "regulator", "tvlqr": "tracking", "plan": "planning", "simulate": "simulation"},
-        "export": "export",
+        **{"lqr": "regulator", "tvlqr": "tracking", "plan": "simulation", "simulate": "simulation"},
+        "export": "regulator",
     },
     "many models or simulations": {"sweep": "sweeps", "montecarlo": "montecarlo"},
 }
@@ -46,35 +44,18 @@ _ENTRIES = {
 }
 
 
-class _Parser(argparse.ArgumentParser):
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        # A negative number such as -1e-3 is a value, not an option.
-        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
-
-    def _print_message(self, message: str, file: Any = None) -> None:
-        # argparse ignores errors when it writes a help.
-        if file is not None:
-            file.write(message)
-            file.flush()
-
-    def error(self, message: str) -> NoReturn:
-        _tell(f"fflin: error: {message} (see {self.prog} --help)")
-        self.exit(BAD_INPUT)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return 0 done, 1 a check failed, 2 invalid input."""
     # Warnings of other packages are shown after success only: an error has its own reason.
     held: list[str] = []
-    told: set[str] = set()  # each once per command
+    reported: set[str] = set()  # each once per command
 
     def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
         text = str(message)
         if issubclass(category, FflinWarning):
-            if text not in told:
-                _tell(f"fflin: warning: {text}")
-            told.add(text)
+            if text not in reported:
+                parser.print_error(f"fflin: warning: {text}")
+            reported.add(text)
         else:
             held.append(f"fflin: {category.__name__}: {' '.join(text.split())}")
 
@@ -85,45 +66,37 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     try:
         arguments = _parser(argv[0] if argv else "").parse_args(argv)
-        with files_of_command(*files_of(arguments)):
+        with files_of_command(*parser.files_of(arguments)):
             check_outputs(arguments)
             code = finish(arguments.run(arguments), arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
         for line in held:
-            _tell(line)
+            parser.print_error(line)
         return code
     except (FflinError, FflinWarning) as error:  # a warning if Python raises warnings
-        _tell(f"fflin: error: {error}")
+        parser.print_error(f"fflin: error: {error}")
         return BAD_INPUT
     except BrokenPipeError:
         # The reader, such as head, closed the pipe; the interpreter must not report it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:
-        _tell(f"fflin: error: the output cannot be written: {error.strerror}")
+        parser.print_error(f"fflin: error: the output cannot be written: {error.strerror}")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BAD_INPUT
 
 
-def _tell(line: str) -> None:
-    """Write a line to stderr; if stderr is closed, the exit code is the only report."""
-    try:
-        print(one_line(line), file=sys.stderr, flush=True)
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
-
-
-def _parser(asked: str) -> argparse.ArgumentParser:
+def _parser(asked: str) -> parser.Command:
     """Return the parser of one command, or of all commands."""
-    parser = _Parser(
+    main = parser.Command(
         prog="fflin",
         usage="fflin [-h] [--version] COMMAND ...",
         description="Linear models of free-floating robots from URDF.",
         epilog="example: fflin linearize ets_vii -o ets_vii.mat",
     )
-    parser.add_argument("--version", action="version", version=f"fflin {__version__}")
-    commands = parser.add_subparsers(
+    main.add_argument("--version", action="version", version=f"fflin {__version__}")
+    commands = main.add_subparsers(
         prog="fflin", metavar="COMMAND", required=True, help=argparse.SUPPRESS
     )
     for name in [_MODULES[asked]] if asked in _MODULES else dict.fromkeys(_MODULES.values()):
@@ -132,17 +105,17 @@ def _parser(asked: str) -> argparse.ArgumentParser:
     left = {command.dest: command for command in commands._choices_actions}
     commands._choices_actions = []
     for task, names in TASKS.items():
-        group = parser.add_argument_group(task)._group_actions
+        group = main.add_argument_group(task)._group_actions
         group += [left[name] for name in names if name in left]
-    return parser
+    return main
 
 
 def check_outputs(arguments: argparse.Namespace) -> None:
     """Refuse output files that cannot be written, before any computation."""
-    for path, kind in outputs_of(arguments):
-        check_place(path)  # first, since it says that an output is an input
+    for path, kind in parser.outputs_of(arguments):
+        check_output_path(path)  # first, since it says that an output is an input
         check_ending(path, kind.endings)
-        if kind is FIGURE:
+        if kind is parser.FIGURE:
             from fflin.base.figures import require_matplotlib
 
             require_matplotlib()
@@ -158,7 +131,7 @@ def require_own_kind(arguments: argparse.Namespace) -> None:
         from fflin.linear.files import foreign_table
 
         path = foreign_table(path) or path
-        place(path)  # refuses a table that is an input file
+        followed_path(path)  # refuses a table that is an input file
     if not path.is_file():
         return
     found = kind_of(path)

@@ -4,31 +4,11 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fflin.base.errors import FflinWarning, InputError, listed
-from fflin.commands.arguments import (
-    CONTROLLER,
-    SIMULATION,
-    Container,
-    add,
-    add_frame,
-    add_inputs_there,
-    add_limits,
-    add_pose,
-    add_robot,
-    add_step,
-    add_system,
-    add_target,
-    assignment,
-    count_of,
-    group_of,
-    input_file,
-    number,
-    settle_step,
-    switch,
-    yes_or_no,
-)
+from fflin.commands import options, parser
 from fflin.commands.points import (
     attitude,
     configuration_of,
@@ -78,84 +58,76 @@ def refuse_law(arguments: argparse.Namespace) -> None:
     )
 
 
-def add_loop(command: argparse.ArgumentParser) -> None:
+def add_loop(command: parser.Command) -> None:
     """Add the options of the loop."""
-    add_robot(command)
-    start, goal = group_of(command, "start"), group_of(command, "target")
-    add_pose(start)
-    add(
-        start,
+    options.add_robot(command)
+    start, goal = command.group("start"), command.group("target")
+    options.add_pose(start)
+    start.add(
         "--offset",
         "initial error relative to the start of the trajectory, in base axes. NAME is a state, "
         "group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]",
-        assignment,
+        parser.assignment,
         repeatable=True,
     )
-    add_target(goal)
-    add_inputs_there(goal)
+    options.add_target(goal)
+    options.add_inputs_there(goal)
     add_trajectory(command)
     add_weights(command, integrated=True)
-    _add_controllers(group_of(command, CONTROLLER))
-    run = group_of(command, SIMULATION)
-    add(
-        run,
+    _add_controllers(command.group(parser.CONTROLLER))
+    run = command.group(parser.SIMULATION)
+    run.add(
         "--duration",
         "duration [s]; by default the duration of the trajectory, or the settling time of the "
         "linear loop, between 60 and 600 s",
-        number,
+        float,
         "T",
     )
-    add_step(run)
+    options.add_step(run)
     methods = "integrator: cf4 (default), rkmk4 or semi_implicit_euler"
-    add(run, "--method", methods, metavar="METHOD", default="cf4")
-    add_system(command)
-    add_frame(run)
+    run.add("--method", methods, metavar="METHOD", default="cf4")
+    options.add_system(command)
+    options.add_frame(run)
 
 
-def _add_controllers(group: Container) -> None:
-    add(
-        group,
+def _add_controllers(group: parser.Group) -> None:
+    group.add(
         "--schedule",
         "follow the trajectory with the gains that tvlqr saved; without this option, gains are "
         "designed along --trajectory",
-        input_file,
+        Path,
     )
-    add(
-        group,
+    group.add(
         "--gain",
         "use a gain that lqr saved, and regulate to the operating point for which this gain was "
         "designed",
-        input_file,
+        Path,
     )
-    add(
-        group,
+    group.add(
         "--controller",
         "use a linear controller K with positive feedback, u - u0 = K (y - y0) about the target: "
         ".mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled. y is set by --output",
-        input_file,
+        Path,
     )
-    switch(
-        group,
+    group.switch(
         "--negative-feedback",
         "the controller assumes negative feedback, u - u0 = -K (y - y0)",
     )
-    yes_or_no(
-        group,
+    group.yes_or_no(
         "--allocate",
         "design with torque and force on the base, and allocate the nearest wrench to the "
         "thrusters, which cannot pull. This is the default if the thrusters can push in every "
         "direction. With --no-allocate, negative thrust is set to zero",
     )
-    switch(
-        group,
+    group.switch(
         "--mpc",
         "use model predictive control with the limits of the robot; it needs --sample",
     )
-    add(group, "--horizon", "number of samples in the horizon of --mpc", count_of, default=20)
-    switch(group, "--free", "simulate without a regulator and without inputs")
-    add_limits(group)
+    group.add("--horizon", "number of samples in the horizon of --mpc", int, default=20)
+    group.switch("--free", "simulate without a regulator and without inputs")
+    options.add_limits(group)
     delay = "time [s] from a sample until its command acts"
-    add(group, "--delay", delay, number, "T", default=0.0)
+    group.add("--delay", delay, float, "T", default=0.0)
 
 
 def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
@@ -163,8 +135,8 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
     from fflin.control.policies import StateFeedback
     from fflin.simulation.times import SHORTEST, time_to_settle
 
-    settle_step(arguments)
-    options: dict[str, Any] = {
+    options.settle_step(arguments)
+    settings: dict[str, Any] = {
         "dt": arguments.dt,
         "method": arguments.method,
         "limits": limits_of_options(arguments),
@@ -175,22 +147,22 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         _refuse(arguments, ("negative_feedback",), "only a --controller has a feedback sign")
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
-        return Loop(policy, options | start)
+        return Loop(policy, settings | start)
     if arguments.offset or arguments.hold:
         raise InputError("--offset and --hold need a --trajectory; give one, or leave them out")
     if arguments.free:
         refuse_law(arguments)
-        options["q0"], options["v0"] = start_of(robot, arguments)
-        options["duration"] = SHORTEST if arguments.duration is None else arguments.duration
-        return Loop(None, options | {"frame": arguments.frame})
+        settings["q0"], settings["v0"] = start_of(robot, arguments)
+        settings["duration"] = SHORTEST if arguments.duration is None else arguments.duration
+        return Loop(None, settings | {"frame": arguments.frame})
     policy, feedback, lin = about_point(robot, arguments)
-    options["q0"], options["v0"] = q, v = start_of(robot, arguments, feedback.lin.reference)
+    settings["q0"], settings["v0"] = q, v = start_of(robot, arguments, feedback.lin.reference)
     require_held(robot, feedback, q)
     if arguments.duration is None:
         linear = StateFeedback(feedback.lin, feedback.gain.K) if arguments.mpc else feedback
-        options["duration"] = time_to_settle(robot, linear, q, v)
+        settings["duration"] = time_to_settle(robot, linear, q, v)
     alone = policy is feedback and not (arguments.controller or arguments.mpc)
-    return Loop(policy, options, *([feedback, lin] if alone else []))
+    return Loop(policy, settings, *([feedback, lin] if alone else []))
 
 
 def start_of(
@@ -216,8 +188,9 @@ def start_of(
 
 def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, LinearModel | None]:
     """Return the policy, its feedback, and the model that predicts every row."""
+    from fflin.control.authority import thrusters_give_every_wrench
     from fflin.control.linear_controller import LinearController
-    from fflin.control.policies import Allocation, StateFeedback, thrusters_give_every_wrench
+    from fflin.control.policies import Allocation, StateFeedback
 
     gain: Any = None
     if arguments.mpc:
@@ -263,13 +236,13 @@ def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Any:
 
     if arguments.sample is None:
         raise InputError("--mpc needs the sample time of the controller; add --sample H")
-    options: dict[str, Any] = {"weights": arguments.weights}
+    settings: dict[str, Any] = {"weights": arguments.weights}
     given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
     if any(given.values()):
         Q, R, _, _ = rule_weights(lin.discretize(arguments.sample), arguments.weights, given)
-        options = {"Q": Q, "R": R}
+        settings = {"Q": Q, "R": R}
     limits = limits_of_options(arguments)
-    return mpc(lin, horizon=arguments.horizon, dt=arguments.sample, limits=limits, **options)
+    return mpc(lin, horizon=arguments.horizon, dt=arguments.sample, limits=limits, **settings)
 
 
 def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
@@ -297,8 +270,8 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
             _refuse(arguments, ("hold",), "--schedule contains its trajectory")
             motion = schedule.trajectory(design)
         else:
-            options = {"hold": arguments.hold, "frame": arguments.frame}
-            motion = Trajectory.load(arguments.trajectory, design, **options)
+            settings = {"hold": arguments.hold, "frame": arguments.frame}
+            motion = Trajectory.load(arguments.trajectory, design, **settings)
             motion.require(strict=arguments.strict)
             _require_own(schedule, motion, arguments)
         policy = TrajectoryFeedback(motion, schedule)

@@ -3,55 +3,44 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
+import textwrap
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fflin.base.errors import FflinError, FflinWarning, FileError, InputError
+from fflin.base.names import runs
+from fflin.base.tables import cut, grid, matrix, signals, width
 from fflin.base.writing import check_ending
-from fflin.commands.arguments import (
-    OUTPUT,
-    POINT,
-    RECORD,
-    TABLE,
-    Commands,
-    OutputFile,
-    add,
-    add_figure,
-    add_output_file,
-    add_point,
-    add_pose,
-    add_robot,
-    add_system,
-    command,
-    group_of,
-    input_name,
-    number,
-)
+from fflin.commands import options, parser
 from fflin.commands.points import configuration_of, linear_model, load_robot, velocity_of
 from fflin.commands.results import Report, figure_of
 from fflin.commands.tracking import add_trajectory, check_along, checked, linearize_along
 
 if TYPE_CHECKING:
+    from fflin.base.validation import Array
+    from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add robots, info, init, linearize and check."""
     summary = "list the robots that can be loaded by name"
-    command(commands, "robots", _robots, summary, example="fflin robots")
-    info = command(
+    parser.command(commands, "robots", _robots, summary, example="fflin robots")
+    info = parser.command(
         commands,
         "info",
         _info,
         "show mass, inertia, wheels and thrusters at a point, and tree, limits and settings",
         example="fflin info servicer_7dof",
     )
-    add_robot(info)
-    add_pose(group_of(info, POINT))
-    add_system(info)
-    init = command(
+    options.add_robot(info)
+    options.add_pose(info.group(parser.POINT))
+    options.add_system(info)
+    init = parser.command(
         commands,
         "init",
         _init,
@@ -59,17 +48,20 @@ def add_commands(commands: Commands) -> None:
         example="fflin init my.urdf && fflin simulate my.toml",
     )
     urdf = "path of a URDF, or name of a robot in `fflin robots`"
-    init.add_argument("robot", metavar="URDF", type=input_name, help=urdf)
+    init.add_argument("robot", metavar="URDF", type=parser.input_name, help=urdf)
     what = "the robot file (by default the URDF's name with .toml, in the current folder)"
-    add_output_file(
-        group_of(init, OUTPUT), what, OutputFile((".toml",)), force="replace an existing file"
+    options.add_output_file(
+        init.group(parser.OUTPUT),
+        what,
+        parser.OutputFile((".toml",)),
+        force="replace an existing file",
     )
     _add_linearize(commands)
     _add_check(commands)
 
 
-def _add_linearize(commands: Commands) -> None:
-    linearize = command(
+def _add_linearize(commands: parser.Commands) -> None:
+    linearize = parser.command(
         commands,
         "linearize",
         _linearize,
@@ -78,11 +70,10 @@ def _add_linearize(commands: Commands) -> None:
         common="joint rpy position velocity effort equilibrium frame reference inputs dt tool "
         "trajectory output-file plot",
     )
-    add_point(linearize)
-    made = group_of(linearize, OUTPUT)
-    add(made, "--dt", "sample the model, with inputs held for H [s]", number, "H")
-    add(
-        made,
+    options.add_point(linearize)
+    made = linearize.group(parser.OUTPUT)
+    made.add("--dt", "sample the model, with inputs held for H [s]", float, "H")
+    made.add(
         "--for",
         "convert the model to the coordinates of this tool; needs -o FILE",
         choices=("drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"),
@@ -90,12 +81,14 @@ def _add_linearize(commands: Commands) -> None:
     )
     add_trajectory(linearize)
     what = "A, B, C, D (with .csv one file per matrix: NAME.A.csv, ...)"
-    add_output_file(made, what, TABLE, "LinearModel", "LinearTrajectory", "ToolModel")
-    add_figure(linearize, "the magnitudes of the entries of A and B")
+    options.add_output_file(
+        made, what, parser.TABLE, "LinearModel", "LinearTrajectory", "ToolModel"
+    )
+    options.add_figure(linearize, "the magnitudes of the entries of A and B")
 
 
-def _add_check(commands: Commands) -> None:
-    check = command(
+def _add_check(commands: parser.Commands) -> None:
+    check = parser.command(
         commands,
         "check",
         _check,
@@ -104,12 +97,12 @@ def _add_check(commands: Commands) -> None:
         common="joint rpy position velocity effort equilibrium frame reference inputs trajectory "
         "tolerance plot",
     )
-    add_point(check)
+    options.add_point(check)
     add_trajectory(check)
-    shown = group_of(check, OUTPUT)
+    shown = check.group(parser.OUTPUT)
     tolerance = "relative tolerance of all errors; by default each error has its own"
-    add(shown, "--tolerance", tolerance, number, "X")
-    add_figure(check, "the errors and their tolerances")
+    shown.add("--tolerance", tolerance, float, "X")
+    options.add_figure(check, "the errors and their tolerances")
 
 
 def _robots(_: argparse.Namespace) -> Report:
@@ -140,7 +133,6 @@ def _info(arguments: argparse.Namespace) -> Report:
 
     import numpy as np
 
-    from fflin.commands.model_text import inputs_report
     from fflin.control.authority import mass_properties, point_report
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
@@ -179,7 +171,7 @@ def _info(arguments: argparse.Namespace) -> Report:
 
 
 def _init(arguments: argparse.Namespace) -> Report:
-    from fflin.base.writing import check_place, write_whole
+    from fflin.base.writing import check_output_path, write_atomically
     from fflin.robot.catalog import find_robot
     from fflin.robot.loading import load
     from fflin.robot.summary import draft
@@ -188,7 +180,7 @@ def _init(arguments: argparse.Namespace) -> Report:
     if found.path.suffix.lower() == ".toml":
         raise InputError(f"{found.path} is already a robot file; give a URDF")
     target = arguments.output_file or Path(f"{found.name}.toml")
-    check_place(target)
+    check_output_path(target)
     if target.exists() and not arguments.force:
         raise FileError(f"{target} already exists; give another name with -o, or add --force")
     urdf = found.name
@@ -197,7 +189,7 @@ def _init(arguments: argparse.Namespace) -> Report:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         robot = load(arguments.robot)
-    write_whole({target: draft(robot, urdf).encode()})
+    write_atomically({target: draft(robot, urdf).encode()})
     load(target)  # warns of settings that the file leaves open
     text = f"robot file of '{robot.name}'; try: fflin simulate {target}"
     return Report(robot.name, {}, text, {target: None})
@@ -209,7 +201,7 @@ def _linearize(arguments: argparse.Namespace) -> Report:
             "--for saves a model at a point; give it with -o FILE and without --trajectory"
         )
     if arguments.output_file and (arguments.tool or arguments.trajectory):
-        check_ending(arguments.output_file, RECORD.endings)
+        check_ending(arguments.output_file, parser.RECORD.endings)
     if arguments.trajectory:
         return linearize_along(arguments)
     _, lin = linear_model(arguments)
@@ -220,8 +212,6 @@ def _linearize(arguments: argparse.Namespace) -> Report:
         nx, nu = model.B.shape
         text = f"{lin.robot}: {nx} states, {nu} inputs"
     else:
-        from fflin.commands.model_text import model_report
-
         text = model_report(lin)
     files = {arguments.output_file: model.save, arguments.plot: figure_of("plot_matrices", lin)}
     return Report(lin.robot, model, text, files)
@@ -235,3 +225,98 @@ def _check(arguments: argparse.Namespace) -> Report:
     robot, lin = linear_model(arguments)
     found = check(robot, lin, tolerance=arguments.tolerance)
     return checked(robot, found, str(found), {arguments.plot: figure_of("plot_check", found)})
+
+
+# Rates [SI] below this value count as zero.
+_MOVES = 1e-9
+
+
+def model_report(lin: LinearModel) -> str:
+    """Show a linear model: its point, A, B, C, D and its certificate."""
+    import numpy as np
+
+    nx, nu = lin.B.shape
+    stays, f0 = lin.is_equilibrium(), np.where(np.abs(lin.f0) > _MOVES, lin.f0, 0.0)
+    point = "a fixed point" if stays else "not a fixed point"
+    if stays and (lin.moving or f0.any()):
+        point = "a relative equilibrium"
+    head = f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}, {point}"
+    if lin.dt:
+        head += f", sampled every {lin.dt:g} s"
+    parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
+    rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
+    # In motion the poles of a frozen model do not show stability. If A A = 0, all are zero.
+    if stays and not lin.dt and (lin.A @ lin.A).any():
+        from fflin.analysis.modes import modes
+
+        if growing := modes(lin).unstable:
+            shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
+            shown = f"unstable: poles with a positive real part {shown}"
+            parts.append(textwrap.fill(shown, width()))
+    moved = [
+        signals(title, values, names, units)
+        for title, values, names, units in (
+            ("x0", lin.x0, lin.state_names, lin.state_units),
+            ("u0", lin.u0, lin.input_names, lin.input_units),
+            ("f0", f0, lin.state_names, rates),
+        )
+        if values.any()
+    ]
+    if moved:
+        parts.append("\n".join(moved))
+    parts.append(_named_matrix("A", lin.A, lin.state_names, lin.state_names))
+    parts.append(_named_matrix("B", lin.B, lin.state_names, lin.input_names))
+    if lin.output_names == lin.state_names and not lin.D.any():
+        parts.append("C = E, D = 0: the output is the state")
+    else:
+        parts.append(_named_matrix("C", lin.C, lin.output_names, lin.state_names))
+        parts.append(_named_matrix("D", lin.D, lin.output_names, lin.input_names))
+    c = lin.certificate
+    parts.append(
+        f"A and B against ABA derivatives: {c.route_A:.1e} and {c.route_B:.1e}; M M^-1 - E: "
+        f"{c.inertia_residual:.1e};\ncond(M), scaled: {c.condition:.1e}; |f0|: {c.f0:.1e}"
+    )
+    return "\n\n".join(parts)
+
+
+def inputs_report(robot: Robot) -> str:
+    """Show the inputs of a robot and their limits."""
+    from fflin.dynamics.actuation import Actuation
+    from fflin.dynamics.state import StateMap
+    from fflin.robot.limits import limits_of
+
+    acting, limits = Actuation(StateMap(robot)), limits_of(robot)
+    rows = [["input", "unit", "min", "max"]]
+    for name, unit in zip(acting.names, acting.units, strict=True):
+        ends = limits.get(name, (-math.inf, math.inf))
+        rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
+    return grid(cut(rows, "see linearize -o"), "ll")
+
+
+def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
+    size = f"{title} ({values.shape[0]} x {values.shape[1]})"
+    if not values.any():
+        return f"{size} is zero"
+    return f"{size}; rows and columns of zeros are not shown\n\n{matrix(values, rows, columns)}"
+
+
+def _units(lin: LinearModel) -> str:
+    """Return the units of states, inputs and outputs, once for each group."""
+    lines = [("x", lin.state_names, lin.state_units), ("u", lin.input_names, lin.input_units)]
+    if lin.output_names != lin.state_names:
+        lines.append(("y", lin.output_names, lin.output_units))
+    return "\n".join(
+        textwrap.fill(f"{title}: {_grouped(names, units)}", width(), subsequent_indent="   ")
+        for title, names, units in lines
+    )
+
+
+def _grouped(names: Sequence[str], units: Sequence[str]) -> str:
+    return ", ".join(
+        f"{group or ' ... '.join(dict.fromkeys((names[first], names[last])))} [{of}]"
+        for first, last, group, of in runs(names, units)
+    )
+
+
+def _rate(unit: str) -> str:
+    return "1/s" if unit == "1" else f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"

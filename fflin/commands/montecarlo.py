@@ -6,20 +6,7 @@ import argparse
 from functools import cache
 from typing import Any
 
-from fflin.commands.arguments import (
-    OUTPUT,
-    ROWS,
-    Commands,
-    add,
-    add_figure,
-    add_output_file,
-    command,
-    count_of,
-    group_of,
-    input_file,
-    number,
-    whole,
-)
+from fflin.commands import options, parser
 from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
 from fflin.commands.results import Report, figure_of
@@ -30,9 +17,9 @@ _ROWS = 240  # of errors and inputs for a figure
 _PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add montecarlo."""
-    montecarlo = command(
+    montecarlo = parser.command(
         commands,
         "montecarlo",
         _montecarlo,
@@ -46,42 +33,40 @@ def add_commands(commands: Commands) -> None:
     montecarlo.add_argument(
         "dispersions",
         metavar="DISPERSIONS",
-        type=input_file,
+        type=parser.input_file,
         help="TOML file with a table [dispersions] of the random parameters, for "
         "fflin.load_dispersions",
     )
-    runs = group_of(montecarlo, "runs")
-    add(runs, "--runs", "number of runs", count_of, required=True)
-    add(runs, "--seed", "random seed", whole, "S", default=0)
-    add(
-        runs,
+    runs = montecarlo.group("runs")
+    runs.add("--runs", "number of runs", int, required=True)
+    runs.add("--seed", "random seed", parser.whole, "S", default=0)
+    runs.add(
         "--until",
         "stop when the confidence interval of the success rate of a condition, such as 'attitude < "
         "1 deg', is at most --width wide",
         metavar="CONDITION",
     )
     width = "width of the confidence interval at which --until stops"
-    add(runs, "--width", width, number, "P", default=0.02)
-    add(runs, "--confidence", "confidence level of all intervals", number, "P", default=0.95)
-    add(runs, "--workers", "distribute the runs over N processes", count_of)
+    runs.add("--width", width, float, "P", default=0.02)
+    runs.add("--confidence", "confidence level of all intervals", float, "P", default=0.95)
+    runs.add("--workers", "distribute the runs over N processes", int)
     threads = "distribute the runs over N threads; by default one for each core"
-    add(runs, "--threads", threads, count_of)
+    runs.add("--threads", threads, int)
     dask = "distribute the runs over the workers of a dask scheduler"
-    add(runs, "--dask", dask, metavar="ADDRESS")
-    shown = group_of(montecarlo, OUTPUT)
-    add(
-        shown,
+    runs.add("--dask", dask, metavar="ADDRESS")
+    shown = montecarlo.group(parser.OUTPUT)
+    shown.add(
         "--goal",
         "report the fraction of runs that meet a condition, such as 'attitude < 1 deg and settle < "
         "60 s', and draw the bounds of the condition",
         metavar="CONDITION",
         repeatable=True,
     )
-    add(shown, "--worst", "list the K worst runs", whole, "K", default=3)
-    add_figure(montecarlo, "quantile bands over time, histograms and the worst runs")
+    shown.add("--worst", "list the K worst runs", parser.whole, "K", default=3)
+    options.add_figure(montecarlo, "quantile bands over time, histograms and the worst runs")
     what = "the runs, which are collected in FILE.part, from which the same command resumes,"
     force = "replace the file of -o even if another call wrote it"
-    add_output_file(shown, what, ROWS, force=force)
+    options.add_output_file(shown, what, parser.ROWS, force=force)
     add_pictures(montecarlo, "that plays the worst run, with the paths of other runs as thin lines")
 
 
@@ -95,12 +80,12 @@ def _montecarlo(arguments: argparse.Namespace) -> Report:
     robot = load_robot(arguments)
     check_pictures(robot, arguments)
     loop = loop_of(robot, arguments)
-    options: dict[str, Any] = {name: getattr(arguments, name) for name in _PASSED} | loop.options
-    options |= {"goals": arguments.goal, "histories": _ROWS if arguments.plot else 0}
+    settings: dict[str, Any] = {name: getattr(arguments, name) for name in _PASSED} | loop.options
+    settings |= {"goals": arguments.goal, "histories": _ROWS if arguments.plot else 0}
     with executor_of(arguments) as executor, going_on(path, "runs") as progress:
-        options |= {"executor": executor, "progress": progress, "out": path}
-        options["overwrite"] = arguments.force
-        campaign = monte_carlo(robot, loop.policy, dispersions, **options)
+        settings |= {"executor": executor, "progress": progress, "out": path}
+        settings["overwrite"] = arguments.force
+        campaign = monte_carlo(robot, loop.policy, dispersions, **settings)
     worst = cache(lambda: campaign.replay(campaign.worst(1)[0]))
     files = {
         path: None,

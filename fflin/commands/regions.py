@@ -7,31 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from fflin.base.errors import InputError
-from fflin.commands.arguments import (
-    CONTROLLER,
-    OUTPUT,
-    PAGE,
-    RECORD,
-    TRAJECTORY,
-    Commands,
-    add,
-    add_figure,
-    add_frame,
-    add_limits,
-    add_output_file,
-    add_point,
-    add_robot,
-    add_step,
-    add_system,
-    assignment,
-    command,
-    count_of,
-    group_of,
-    input_file,
-    number,
-    settle_step,
-    whole,
-)
+from fflin.commands import options, parser
 from fflin.commands.loops import along
 from fflin.commands.points import limits_of_options, linear_model, load_robot, once
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
@@ -47,14 +23,14 @@ _NONE += " equilibrium"
 _NONE += " joint rpy position velocity"
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add validity and funnel."""
     _add_validity(commands)
     _add_funnel(commands)
 
 
-def _add_validity(commands: Commands) -> None:
-    validity = command(
+def _add_validity(commands: parser.Commands) -> None:
+    validity = parser.command(
         commands,
         "validity",
         _validity,
@@ -63,35 +39,33 @@ def _add_validity(commands: Commands) -> None:
         common="joint inputs weights q r bryson sample reduce attitude offset spread samples seed "
         "jobs limits frames plot",
     )
-    add_point(validity)
+    options.add_point(validity)
     add_weights(validity)
-    runs = group_of(validity, "runs")
-    add(runs, "--attitude", "largest rotation of the base [deg]", number, "X", default=90.0)
-    add(runs, "--offset", "largest displacement of the base [m]", number, "X", default=0.5)
-    add(runs, "--spread", "largest displacement of a joint [rad|m]", number, "X", default=1.0)
-    add(runs, "--samples", "number of random runs", count_of, default=100)
-    add(runs, "--seed", "random seed of the runs", whole, "S", default=0)
-    add(runs, "--jobs", "number of processes, at most one for each core", count_of, default=1)
-    add(
-        runs,
+    runs = validity.group("runs")
+    runs.add("--attitude", "largest rotation of the base [deg]", float, "X", default=90.0)
+    runs.add("--offset", "largest displacement of the base [m]", float, "X", default=0.5)
+    runs.add("--spread", "largest displacement of a joint [rad|m]", float, "X", default=1.0)
+    runs.add("--samples", "number of random runs", int, default=100)
+    runs.add("--seed", "random seed of the runs", parser.whole, "S", default=0)
+    runs.add("--jobs", "number of processes, at most one for each core", int, default=1)
+    runs.add(
         "--limits",
         "saturate the inputs at the limits of the robot (urdf), or never (none, default)",
         choices=("urdf", "none"),
         default="none",
     )
-    add(
-        runs,
+    runs.add(
         "--frames",
         "also test the loop with base velocities and inputs in these axes",
         choices=("hybrid", "local", "world"),
         nargs="+",
         default=(),
     )
-    add_figure(validity, "the results")
+    options.add_figure(validity, "the results")
 
 
-def _add_funnel(commands: Commands) -> None:
-    funnel = command(
+def _add_funnel(commands: parser.Commands) -> None:
+    funnel = parser.command(
         commands,
         "funnel",
         _funnel,
@@ -101,33 +75,32 @@ def _add_funnel(commands: Commands) -> None:
         common="trajectory schedule goal within weights q r knots samples seed threads "
         "dt limits limit frame inputs output-file plot html",
     )
-    add_robot(funnel)
-    add_system(funnel)
-    add_frame(group_of(funnel, TRAJECTORY))
+    options.add_robot(funnel)
+    options.add_system(funnel)
+    options.add_frame(funnel.group(parser.TRAJECTORY))
     add_trajectory(funnel)
     add_weights(funnel, integrated=True)
-    runs, shown = group_of(funnel, "runs"), group_of(funnel, OUTPUT)
-    add(
-        group_of(funnel, CONTROLLER),
+    runs, shown = funnel.group("runs"), funnel.group(parser.OUTPUT)
+    funnel.group(parser.CONTROLLER).add(
         "--schedule",
         "use the gains that tvlqr saved; without this option, gains are designed along the "
         "trajectory",
-        input_file,
+        Path,
     )
     goal = f"largest error allowed at the end: {_ERRORS}"
-    add(runs, "--goal", goal, assignment, repeatable=True)
+    runs.add("--goal", goal, parser.assignment, repeatable=True)
     within = "largest error allowed at any time of a run; names as in --goal"
-    add(runs, "--within", within, assignment, repeatable=True)
-    add_limits(runs)
-    add(runs, "--knots", "number of knots to test", count_of, default=10)
-    add(runs, "--samples", "number of runs from each knot", count_of, default=100)
-    add(runs, "--seed", "random seed of the runs", whole, "S", default=0)
-    add(runs, "--confidence", "confidence level of the intervals", number, "P", default=0.95)
-    add(runs, "--threads", "number of threads; by default one for each core", count_of)
-    add_step(runs)
-    add(shown, "--html", "write a page that plays the motion with the funnel as a tube", PAGE)
-    add_figure(funnel, "the funnel")
-    add_output_file(shown, "the funnel", RECORD, "Funnel")
+    runs.add("--within", within, parser.assignment, repeatable=True)
+    options.add_limits(runs)
+    runs.add("--knots", "number of knots to test", int, default=10)
+    runs.add("--samples", "number of runs from each knot", int, default=100)
+    runs.add("--seed", "random seed of the runs", parser.whole, "S", default=0)
+    runs.add("--confidence", "confidence level of the intervals", float, "P", default=0.95)
+    runs.add("--threads", "number of threads; by default one for each core", int)
+    options.add_step(runs)
+    shown.add("--html", "write a page that plays the motion with the funnel as a tube", parser.PAGE)
+    options.add_figure(funnel, "the funnel")
+    options.add_output_file(shown, "the funnel", parser.RECORD, "Funnel")
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 
@@ -175,10 +148,10 @@ def _funnel(arguments: argparse.Namespace) -> Report:
     if arguments.trajectory is None and arguments.schedule is None:
         raise InputError("neither --trajectory nor --schedule is given; give one of them, or both")
     robot = load_robot(arguments)
-    settle_step(arguments)
+    options.settle_step(arguments)
     policy, _ = along(robot, arguments)
-    options = {"limits": limits_of_options(arguments), "dt": arguments.dt}
-    kept = {key: getattr(arguments, key) for key in _RUNS} | options
+    settings = {"limits": limits_of_options(arguments), "dt": arguments.dt}
+    kept = {key: getattr(arguments, key) for key in _RUNS} | settings
     kept["within"], bar = once("--within", arguments.within), Progress()
     try:
         goal = once("--goal", arguments.goal)
@@ -190,7 +163,7 @@ def _funnel(arguments: argparse.Namespace) -> Report:
         from fflin.simulation.simulate import simulate
         from fflin.view.visualize import visualize
 
-        visualize(robot, simulate(robot, policy, **options), html=path, funnel=found)
+        visualize(robot, simulate(robot, policy, **settings), html=path, funnel=found)
 
     files = {
         arguments.plot: figure_of("plot_funnel", found),

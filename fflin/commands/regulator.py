@@ -1,4 +1,4 @@
-"""The command `lqr`, and the design options that other commands share."""
+"""The commands `lqr` and `export`, and the design options that other commands share."""
 
 from __future__ import annotations
 
@@ -7,24 +7,8 @@ import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityError
-from fflin.commands.arguments import (
-    CONTROLLER,
-    OUTPUT,
-    RECORD,
-    Commands,
-    add,
-    add_figure,
-    add_former_name,
-    add_output_file,
-    add_point,
-    assignment,
-    command,
-    group_of,
-    number,
-    switch,
-    yes_or_no,
-)
+from fflin.base.errors import EquilibriumError, FflinWarning, FileError, StabilizabilityError
+from fflin.commands import options, parser
 from fflin.commands.points import linear_model, once
 from fflin.commands.results import Report, figure_of
 
@@ -33,9 +17,14 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
 
-def add_commands(commands: Commands) -> None:
-    """Add lqr."""
-    lqr = command(
+def add_commands(commands: parser.Commands) -> None:
+    """Add lqr and export."""
+    _add_lqr(commands)
+    _add_export(commands)
+
+
+def _add_lqr(commands: parser.Commands) -> None:
+    lqr = parser.command(
         commands,
         "lqr",
         _lqr,
@@ -44,67 +33,87 @@ def add_commands(commands: Commands) -> None:
         common="joint velocity equilibrium inputs frame weights q r bryson sample reduce "
         "wheel-speeds output-file plot",
     )
-    add_point(lqr)
+    options.add_point(lqr)
     add_weights(lqr)
-    add_output_file(group_of(lqr, OUTPUT), "the gain", RECORD, "Gain")
-    add_figure(lqr, "the poles, and the loop of each input with its margins,")
+    options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD, "Gain")
+    options.add_figure(lqr, "the poles, and the loop of each input with its margins,")
 
 
-def add_weights(command: argparse.ArgumentParser, *, integrated: bool = False) -> None:
+def _add_export(commands: parser.Commands) -> None:
+    export = parser.command(
+        commands,
+        "export",
+        _export,
+        "write C99 code of a gain, compensator or gain schedule, with a test program",
+        example="fflin export gain.npz --robot servicer_7dof --limits urdf -o flight",
+    )
+    what = "gain, compensator or gain schedule saved by fflin: .npz, .mat or .json"
+    export.add_argument("file", metavar="FILE", type=parser.input_file, help=what)
+    group = export.group(parser.OUTPUT)
+    folder = "folder of the code; it is made if necessary"
+    group.add_argument("-o", "--output-folder", metavar="FOLDER", required=True, help=folder)
+    group.add(
+        "--robot",
+        "robot that the design was made for: a name in `fflin robots`, a URDF or a robot.toml. By "
+        "default the robot that FILE names",
+        metavar="ROBOT",
+        type=parser.input_name,
+    )
+    limits = "limit the inputs as in simulate (urdf), or not (none, default)"
+    group.add("--limits", limits, choices=("urdf", "none"), default="none")
+    group.add("--name", "prefix of the names in C", metavar="NAME", default="controller")
+    real = "type of the numbers; double by default"
+    group.add("--real", real, choices=("double", "float"), default="double")
+
+
+def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
     """Add the options of the cost, the sample time and the regulated states.
 
     If a loop is `integrated`, --dt is its integration step; otherwise it is the former --sample.
     """
-    group = group_of(command, CONTROLLER)
-    add(
-        group,
+    group = command.group(parser.CONTROLLER)
+    group.add(
         "--weights",
         "rule that sets all weights not given by --q, --r or --bryson. `urdf` (default) keeps the "
         "inputs within the limits of the URDF for displacements of 30 deg of the base and 0.3 rad "
         "of the joints; `identity` sets every weight to 1",
         choices=("urdf", "identity"),
     )
-    add(
-        group,
+    group.add(
         "--q",
         "weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b, q_m.hinge_*",
-        assignment,
+        parser.assignment,
         "NAME=W",
         repeatable=True,
     )
-    add(
-        group,
+    group.add(
         "--r",
         "weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*",
-        assignment,
+        parser.assignment,
         "NAME=W",
         repeatable=True,
     )
-    add(
-        group,
+    group.add(
         "--bryson",
         "largest acceptable value of a state, an input or a group, which gets the weight "
         "1/VALUE^2. The other weights, from the rule, are scaled to match",
-        assignment,
+        parser.assignment,
         repeatable=True,
     )
-    add(
-        group,
+    group.add(
         "--sample",
         "sample time of the controller [s]: inputs are held for H; the continuous-time cost is "
         "still minimised",
-        number,
+        float,
         "H",
     )
     if not integrated:
-        add_former_name(group, "--dt", "sample")
-    switch(
-        group,
+        options.add_former_name(group, "--dt", "sample")
+    group.switch(
         "--reduce",
         "if momentum is conserved, regulate only the states that the inputs can control",
     )
-    yes_or_no(
-        group,
+    group.yes_or_no(
         "--wheel-speeds",
         "whether to return the speeds of reaction wheels to their values at the operating point. "
         "By default, they are returned if thrusters or a base torque can absorb the wheel torque. "
@@ -162,3 +171,33 @@ def _lqr(arguments: argparse.Namespace) -> Report:
         warnings.warn(pulling, FflinWarning, stacklevel=2)
     files = {arguments.output_file: gain.save, arguments.plot: figure_of("plot_loops", gain)}
     return Report(gain.robot, gain, str(gain), files)
+
+
+def _export(arguments: argparse.Namespace) -> Report:
+    from fflin.commands.cli import kind_of
+    from fflin.control.gain import Gain
+    from fflin.control.gain_schedule import GainSchedule
+    from fflin.control.kalman import Compensator
+    from fflin.export.writing import write_c
+    from fflin.robot.loading import load
+
+    kinds = {kind.__name__: kind for kind in (Gain, GainSchedule, Compensator)}
+    kind = kind_of(arguments.file)
+    if kind not in kinds and arguments.file.is_file():
+        raise FileError(
+            f"{arguments.file} holds {kind or 'no result of fflin'}, expected a Gain, a "
+            "GainSchedule or a Compensator"
+        )
+    law = kinds.get(kind, Gain).load(arguments.file)
+    folder = write_c(
+        law,
+        arguments.output_folder,
+        robot=load(arguments.robot) if arguments.robot else None,
+        limits=None if arguments.limits == "none" else arguments.limits,
+        name=arguments.name,
+        real=arguments.real,
+    )
+    name, real = arguments.name, arguments.real
+    test = f"cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm && ./{name}_test"
+    text = f"{law!r} in C99, with numbers of type {real}\nto test it in {folder}: {test}"
+    return Report(law.robot, {"name": name, "real": real, "folder": str(folder)}, text)

@@ -1,4 +1,4 @@
-"""The command `simulate`: the closed loop of a controller and the nonlinear robot."""
+"""The commands `plan` and `simulate`: a trajectory, and a motion of the nonlinear robot."""
 
 from __future__ import annotations
 
@@ -9,21 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import chosen, input_keys
-from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.arguments import (
-    OUTPUT,
-    SIMULATION,
-    TABLE,
-    Commands,
-    add,
-    add_figure,
-    add_output_file,
-    command,
-    count_of,
-    group_of,
-)
-from fflin.commands.loops import add_loop, loop_of
-from fflin.commands.points import load_robot
+from fflin.commands import DONE, FELL_SHORT, options, parser
+from fflin.commands.loops import add_loop, loop_of, target_of
+from fflin.commands.points import configuration_of, limits_of_options, load_robot, once, velocity_of
 from fflin.commands.results import Report
 from fflin.commands.visual import add_pictures, check_pictures, pictures
 
@@ -33,9 +21,45 @@ if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
 
-def add_commands(commands: Commands) -> None:
-    """Add simulate."""
-    simulate = command(
+def add_commands(commands: parser.Commands) -> None:
+    """Add plan and simulate."""
+    _add_plan(commands)
+    _add_simulate(commands)
+
+
+def _add_plan(commands: parser.Commands) -> None:
+    plan = parser.command(
+        commands,
+        "plan",
+        _plan,
+        "plan a low-effort trajectory between two states within limits",
+        example="fflin plan planar_detumble --target-joint joint_1=0.3 --duration 20 -o plan.npz",
+        common="joint rpy position velocity target-joint target-rpy target-position "
+        "target-velocity duration knots hold free-end r limits limit inputs output-file",
+    )
+    options.add_robot(plan)
+    options.add_system(plan)
+    options.add_pose(plan.group("start"))
+    options.add_target(plan.group("target"))
+    group = plan.group(parser.TRAJECTORY)
+    group.add("--duration", "duration of the motion [s]", float, "T", required=True)
+    group.add("--knots", "number of equally spaced knots", int, default=101)
+    hold = "inputs between knots: held (previous, default), or interpolated (linear)"
+    group.add("--hold", hold, choices=("previous", "linear"), default="previous")
+    free = "state whose final value is free: a name, group or pattern"
+    group.add("--free-end", free, metavar="NAME", repeatable=True)
+    weight = "weight on an input, a group or a pattern; by default 1/limit^2"
+    group.add("--r", weight, parser.assignment, "NAME=W", repeatable=True)
+    options.add_limits(group)
+    options.add_output_file(
+        plan.group(parser.OUTPUT), "the trajectory", parser.TABLE, "Trajectory", "Motion"
+    )
+    # Options of other commands, which the start and the target read.
+    plan.set_defaults(relative_equilibrium=None)
+
+
+def _add_simulate(commands: parser.Commands) -> None:
+    simulate = parser.command(
         commands,
         "simulate",
         _simulate,
@@ -46,22 +70,20 @@ def add_commands(commands: Commands) -> None:
         "free limits duration inputs output-file plot html",
     )
     add_loop(simulate)
-    add(
-        group_of(simulate, SIMULATION),
+    simulate.group(parser.SIMULATION).add(
         "--every",
         "number of steps between saved rows; chosen automatically for long runs",
-        count_of,
+        int,
     )
-    add_figure(simulate, "the nonlinear and the linear motion")
-    shown = group_of(simulate, OUTPUT)
-    add(
-        shown,
+    options.add_figure(simulate, "the nonlinear and the linear motion")
+    shown = simulate.group(parser.OUTPUT)
+    shown.add(
         "--show",
         "show only these curves in --plot: a state, input, group or pattern, as q_m or '*.hinge_*'",
         metavar="NAME",
         repeatable=True,
     )
-    add_output_file(shown, "the motion", TABLE, "Motion")
+    options.add_output_file(shown, "the motion", parser.TABLE, "Motion")
     add_pictures(simulate)
 
 
@@ -126,3 +148,24 @@ def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> 
             FflinWarning,
             stacklevel=2,
         )
+
+
+def _plan(arguments: argparse.Namespace) -> Report:
+    from fflin.control.plan import plan
+    from fflin.robot.fields import combined
+
+    robot = load_robot(arguments)
+    state = combined(robot.point, robot.start)
+    motion = plan(
+        robot,
+        target_of(robot, arguments),
+        arguments.duration,
+        q0=configuration_of(robot, arguments, state),
+        v0=velocity_of(robot, arguments, state, "velocity"),
+        knots=arguments.knots,
+        hold=arguments.hold,
+        limits=limits_of_options(arguments),
+        R=once("--r", arguments.r) or None,
+        free=arguments.free_end,
+    )
+    return Report(robot.name, motion, str(motion), {arguments.output_file: motion.save})

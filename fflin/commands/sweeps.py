@@ -11,27 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FileError, InputError, MissingPackageError
-from fflin.commands.arguments import (
-    OUTPUT,
-    POINT,
-    ROWS,
-    Commands,
-    add,
-    add_frame,
-    add_output_file,
-    add_pose,
-    add_reference,
-    add_robot,
-    add_system,
-    assignment,
-    command,
-    count_of,
-    group_of,
-    input_file,
-    number,
-    switch,
-    whole,
-)
+from fflin.commands import options, parser
 from fflin.commands.points import configuration_of, load_robot, once, velocity_of
 from fflin.commands.results import Report
 
@@ -48,9 +28,9 @@ _LARGE = 10e9
 _DASK_TIMEOUT = 10  # seconds
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add sweep."""
-    sweep = command(
+    sweep = parser.command(
         commands,
         "sweep",
         _sweep,
@@ -60,13 +40,12 @@ def add_commands(commands: Commands) -> None:
         common="grid random configurations seed range joint velocity inputs output frame engine "
         "workers yes output-file",
     )
-    points = sweep.add_argument_group(
+    points = sweep.group(
         "points",
         "give --grid, --random or --configurations; without --velocity, points are at rest, or "
         "move as [point] of robot.toml does",
     )
-    add(
-        points,
+    points.add(
         "--grid",
         "N values of a joint [rad|m] from LO to HI; for several joints, all combinations are used, "
         "and the last joint varies fastest",
@@ -75,52 +54,48 @@ def add_commands(commands: Commands) -> None:
         repeatable=True,
     )
     drawn = "N points, uniformly distributed within the joint limits"
-    add(points, "--random", drawn, count_of)
-    add(
-        points,
+    points.add("--random", drawn, int)
+    points.add(
         "--configurations",
         "q (N, nq) in Pinocchio's order, saved by numpy.savez, and optionally v (N, nv) and u (N, "
         "nu)",
-        input_file,
+        Path,
         "FILE.npz",
     )
-    add(points, "--seed", "random seed of --random", whole, "S", default=0)
-    add(
-        points,
+    points.add("--seed", "random seed of --random", parser.whole, "S", default=0)
+    points.add(
         "--range",
         "with --random: range of a joint, which replaces the joint limits",
         _range,
         "JOINT=LO:HI",
         repeatable=True,
     )
-    point = group_of(sweep, POINT)
-    add_pose(point)
-    add(
-        point,
+    point = sweep.group(parser.POINT)
+    options.add_pose(point)
+    point.add(
         "--effort",
         "input at all points, by its name in u, such as tau_m.joint_1",
-        assignment,
+        parser.assignment,
         repeatable=True,
     )
-    add_frame(point)
-    add_reference(point)
-    add_robot(sweep)
-    add_system(sweep)
-    work = group_of(sweep, "computation")
-    add(
-        work,
+    options.add_frame(point)
+    options.add_reference(point)
+    options.add_robot(sweep)
+    options.add_system(sweep)
+    work = sweep.group("computation")
+    work.add(
         "--engine",
         "compute the points in compiled code or in Python; by default compiled if numba is "
         "installed and the outputs are the state",
         choices=("compiled", "python"),
     )
     workers = "distribute the work over N processes, at most one for each core"
-    add(work, "--workers", workers, count_of)
+    work.add("--workers", workers, int)
     dask = "distribute the work over the workers of a dask scheduler"
-    add(work, "--dask", dask, metavar="ADDRESS")
-    switch(work, "--yes", "permit results of more than 10 GB")
+    work.add("--dask", dask, metavar="ADDRESS")
+    work.switch("--yes", "permit results of more than 10 GB")
     what = "the models, which are collected in FILE.part, from which the same command resumes,"
-    add_output_file(group_of(sweep, OUTPUT), what, ROWS, "LinearBatch")
+    options.add_output_file(sweep.group(parser.OUTPUT), what, parser.ROWS, "LinearBatch")
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
@@ -134,7 +109,11 @@ def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
 
 def _axis(text: str) -> tuple[str, tuple[float, float, int]]:
     name, parts = _parts(text, "JOINT=LO:HI:N", "joint_1=-1:1:21")
-    low, high, count = number(parts[0]), number(parts[1]), count_of(parts[2])
+    low, high, count = (
+        parser.number(parts[0]),
+        parser.number(parts[1]),
+        parser.count_of(parts[2]),
+    )
     if not (low < high or (count == 1 and low == high)):
         raise argparse.ArgumentTypeError(f"'{text}' is empty; LO must be less than HI")
     return name, (low, high, count)
@@ -142,7 +121,7 @@ def _axis(text: str) -> tuple[str, tuple[float, float, int]]:
 
 def _range(text: str) -> tuple[str, tuple[float, float]]:
     name, (low, high) = _parts(text, "JOINT=LO:HI", "joint_1=-1:1")
-    return name, (number(low), number(high))
+    return name, (parser.number(low), parser.number(high))
 
 
 def _sweep(arguments: argparse.Namespace) -> Report:
@@ -163,13 +142,13 @@ def _sweep(arguments: argparse.Namespace) -> Report:
     )
     u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
-    options: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
+    settings: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
     said = ""
 
     def announce(count: int, *, at_rest: bool) -> None:
         nonlocal said
         output_path(path)  # again, when the inputs are known
-        size = planned_bytes(robot, count, at_rest=at_rest, **options)
+        size = planned_bytes(robot, count, at_rest=at_rest, **settings)
         said = f"{count:,} points of '{robot.name}', {readable(size)}"
         if size > _LARGE and not arguments.yes:
             raise InputError(
@@ -185,7 +164,7 @@ def _sweep(arguments: argparse.Namespace) -> Report:
         with going_on(path, "points") as progress:
             work = {name: getattr(arguments, name) for name in ("engine", "workers")}
             work |= {"executor": executor, "progress": progress}
-            batch = sweep(robot, q, v, u, **options, **work, out=path)
+            batch = sweep(robot, q, v, u, **settings, **work, out=path)
     states, inputs = len(batch.state_names), len(batch.input_names)
     text = f"{robot.name}: {len(batch):,} points, {states} states, {inputs} inputs"
     names = ("state_names", "state_units", "input_names", "input_units", "frame")

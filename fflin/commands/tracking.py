@@ -3,28 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import InputError
-from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.arguments import (
-    CONTROLLER,
-    OUTPUT,
-    RECORD,
-    TRAJECTORY,
-    Commands,
-    add,
-    add_frame,
-    add_output_file,
-    add_robot,
-    add_system,
-    assignment,
-    command,
-    group_of,
-    input_file,
-    switch,
-)
+from fflin.commands import DONE, FELL_SHORT, options, parser
 from fflin.commands.points import load_robot, once
 from fflin.commands.regulator import add_weights
 from fflin.commands.results import Report
@@ -36,9 +20,9 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add tvlqr."""
-    tvlqr = command(
+    tvlqr = parser.command(
         commands,
         "tvlqr",
         _tvlqr,
@@ -47,42 +31,39 @@ def add_commands(commands: Commands) -> None:
         "-o gains.npz",
         common="trajectory hold strict weights q r bryson sample qf inputs frame output-file",
     )
-    add_robot(tvlqr)
-    add_system(tvlqr)
-    add_frame(group_of(tvlqr, TRAJECTORY))
+    options.add_robot(tvlqr)
+    options.add_system(tvlqr)
+    options.add_frame(tvlqr.group(parser.TRAJECTORY))
     add_trajectory(tvlqr, required=True)
     add_weights(tvlqr)
-    add(
-        group_of(tvlqr, CONTROLLER),
+    tvlqr.group(parser.CONTROLLER).add(
         "--qf",
         "weight on the final error; by default the solution of the algebraic Riccati equation "
         "about the last configuration",
-        assignment,
+        parser.assignment,
         repeatable=True,
     )
-    add_output_file(group_of(tvlqr, OUTPUT), "the gains", RECORD, "GainSchedule")
+    options.add_output_file(tvlqr.group(parser.OUTPUT), "the gains", parser.RECORD, "GainSchedule")
 
 
-def add_trajectory(command: argparse.ArgumentParser, *, required: bool = False) -> None:
+def add_trajectory(command: parser.Command, *, required: bool = False) -> None:
     """Add --trajectory, --hold and --strict; the file then sets the default of --frame."""
-    group = group_of(command, TRAJECTORY)
-    add(
-        group,
+    group = command.group(parser.TRAJECTORY)
+    group.add(
         "--trajectory",
         "use the trajectory in FILE: .npz, .mat, .json or .csv; see fflin.Trajectory.load. --frame "
         "gives the axes of the data; by default the frame named in the file, or local if the file "
         "names none",
-        input_file,
+        Path,
         required=required,
     )
-    add(
-        group,
+    group.add(
         "--hold",
         "inputs between the knots of FILE: interpolated linearly, or held at the value of the "
         "previous knot. By default the setting in the file, or linear if the file has none",
         choices=("linear", "previous"),
     )
-    switch(group, "--strict", "refuse a FILE that does not satisfy the dynamics of the robot")
+    group.switch("--strict", "refuse a FILE that does not satisfy the dynamics of the robot")
 
 
 def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> LinearTrajectory:
@@ -96,11 +77,11 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
             raise InputError(
                 f"--{name} gives a point and --trajectory a motion; give only one of them"
             )
-    robot, options = (
+    robot, settings = (
         robot or load_robot(arguments),
         {"hold": arguments.hold, "frame": arguments.frame},
     )
-    motion = Trajectory.load(arguments.trajectory, robot, **options)
+    motion = Trajectory.load(arguments.trajectory, robot, **settings)
     return linearize_trajectory(robot, motion, strict=arguments.strict)
 
 
@@ -145,10 +126,10 @@ def schedule_of(
     from fflin.control.default_weights import pace_along, rule_weights
     from fflin.control.tvlqr import steady_end, tvlqr
 
-    options: dict[str, Any] = {"sample": arguments.sample, "weights": arguments.weights}
+    settings: dict[str, Any] = {"sample": arguments.sample, "weights": arguments.weights}
     given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
     if any(given.values()):
         pace = pace_along(float(along.t[-1] - along.t[0]), arguments.sample or 0.0)
         Q, R, _, rule = rule_weights(steady_end(along), arguments.weights, given, pace=pace)
-        options |= {"Q": Q, "R": R, "weights": None, "rule": rule}
-    return tvlqr(along, Qf=Qf, **options)
+        settings |= {"Q": Q, "R": R, "weights": None, "rule": rule}
+    return tvlqr(along, Qf=Qf, **settings)

@@ -8,25 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fflin.commands.arguments import (
-    ANIMATION,
-    OUTPUT,
-    PAGE,
-    PICTURE,
-    POINT,
-    ROBOT,
-    Commands,
-    Container,
-    add,
-    add_orbit,
-    add_pose,
-    add_robot,
-    command,
-    group_of,
-    number,
-    switch,
-    yes_or_no,
-)
+from fflin.commands import options, parser
 from fflin.commands.points import configuration_of, load_robot
 from fflin.commands.results import Report
 
@@ -38,58 +20,55 @@ if TYPE_CHECKING:
 _FILES, _SHOWN = ("html", "png", "gif"), ("scene", "follow", "tool")
 
 
-def add_commands(commands: Commands) -> None:
+def add_commands(commands: parser.Commands) -> None:
     """Add view."""
-    view = command(
+    view = parser.command(
         commands,
         "view",
         _view,
         "show a robot live in the browser with a slider for each joint",
         example="fflin view servicer_7dof --joint joint_2=0.4",
     )
-    add_robot(view)
-    add_pose(group_of(view, POINT))
-    add_orbit(group_of(view, ROBOT))
-    page = group_of(view, OUTPUT)
+    options.add_robot(view)
+    options.add_pose(view.group(parser.POINT))
+    options.add_orbit(view.group(parser.ROBOT))
+    page = view.group(parser.OUTPUT)
     frames = "orbital frame used as the world; lvlh by default"
-    add(page, "--frame", frames, choices=("lvlh", "hill"))
+    page.add("--frame", frames, choices=("lvlh", "hill"))
     _add_scene(page)
-    switch(page, "--no-open", "do not open a browser; the address appears on stderr")
+    page.switch("--no-open", "do not open a browser; the address appears on stderr")
     port = "port on 127.0.0.1; a free port by default"
-    add(page, "--port", port, int, "N", default=0)
+    page.add("--port", port, parser.whole, "N")
 
 
 def add_pictures(
-    command: argparse.ArgumentParser, page: str = "that plays the motion without a network"
+    command: parser.Command, page: str = "that plays the motion without a network"
 ) -> None:
     """Add the options of pages, pictures and animations of a motion."""
-    group = group_of(command, OUTPUT)
-    add(group, "--html", f"write a page {page}", PAGE)
-    add(
-        group,
+    group = command.group(parser.OUTPUT)
+    group.add("--html", f"write a page {page}", parser.PAGE)
+    group.add(
         "--png",
         "write a picture (needs Chromium): a strip of four images, or of images at the times of "
         "--times",
-        PICTURE,
+        parser.PICTURE,
     )
-    add(group, "--gif", "write an animation (needs Chromium)", ANIMATION)
-    add(group, "--times", "times of the pictures [s]", number, "T", nargs="+")
+    group.add("--gif", "write an animation (needs Chromium)", parser.ANIMATION)
+    group.add("--times", "times of the pictures [s]", float, "T", nargs="+")
     _add_scene(group)
-    add(group, "--fps", "frames per second of playback", number, "FPS", default=30.0)
+    group.add("--fps", "frames per second of playback", float, "FPS", default=30.0)
     speed = "playback speed, in seconds of motion per second; 1 by default"
-    add(group, "--speed", speed, number, "SPEED")
+    group.add("--speed", speed, float, "SPEED")
 
 
-def _add_scene(group: Container) -> None:
-    add(
-        group,
+def _add_scene(group: parser.Group) -> None:
+    group.add(
         "--scene",
         "show sky and planet (space), or a floor with a grid (lab, the default under gravity)",
         choices=("space", "lab"),
     )
-    add(group, "--tool", "draw the axes and the trail of this frame", metavar="FRAME")
-    yes_or_no(
-        group,
+    group.add("--tool", "draw the axes and the trail of this frame", metavar="FRAME")
+    group.yes_or_no(
         "--follow",
         "whether the camera follows the base; by default it does in long motions",
     )
@@ -135,7 +114,8 @@ def _view(arguments: argparse.Namespace) -> Report:
 
     robot = load_robot(arguments)
     q = configuration_of(robot, arguments, combined(robot.point, robot.start))
-    how: Any = {name: getattr(arguments, name) for name in (*_SHOWN, "port", "frame")}
+    how: Any = {name: getattr(arguments, name) for name in (*_SHOWN, "frame")}
+    how["port"] = arguments.port or 0
     live = visualize(robot, open=False, q=q, **how)
     assert isinstance(live, Live)  # since there is no motion
     print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)

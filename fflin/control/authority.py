@@ -7,6 +7,7 @@ from itertools import combinations, islice, product
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array
@@ -96,18 +97,15 @@ def thruster_report(robot: Robot, q: Array, center: Array) -> str:
     if "thrust" not in actuation.groups:
         return ""
     # Imported where there are thrusters: both take longer than all the rest of the report.
-    from fflin.control.policies import gives_every_wrench
-    from fflin.control.saturation import input_limits
+    from fflin.control.channel import input_limits
 
     thrusters = actuation.groups["thrust"]
     W = actuation.columns(robot.create_data(), _at_origin(q))[:6, thrusters]
     W[:3] -= np.cross(center, W[3:].T).T
     head = f"{counted(len(thrusters), 'thruster')} alone"
-    if not gives_every_wrench(W, np.full(len(thrusters), fill_value=True)):
-        missing = unreachable(W)
+    if any((missing := unreachable(W)).values()):
         shown = [f"{kind} along {', '.join(axes)}" for kind, axes in missing.items() if axes]
-        reason = f": no pure {' and no pure '.join(shown)}" if shown else ""
-        return folded([f"{head} do not push every way{reason}"])
+        return folded([f"{head} do not push every way: no pure {' and no pure '.join(shown)}"])
     low, high = (each[thrusters] for each in input_limits(robot, limits_of(robot)))
     if not np.isfinite(high).all():
         return folded([f"{head} push every way; not all of them have a limit (max)"])
@@ -134,6 +132,23 @@ def unreachable(W: Array) -> dict[str, list[str]]:
             if nnls(directions, wanted)[1] > _ROUNDING:
                 found[kind].append(f"{sign}{axis}")
     return found
+
+
+def gives_every_wrench(W: Array, pushing: NDArray[np.bool_]) -> bool:
+    """Whether columns W (6, k), of which some only push, together give every wrench."""
+    both = np.hstack((W, -W[:, ~pushing]))
+    return not any(unreachable(both).values())
+
+
+def thrusters_give_every_wrench(robot: Robot) -> bool:
+    """Whether a robot has thrusters that, with what else acts on its base, push it every way."""
+    actuation = Actuation(StateMap(robot))
+    thrusters = actuation.groups.get("thrust")
+    if thrusters is None:
+        return False
+    W = actuation.columns(robot.create_data(), robot.neutral())[:6]
+    pushing = np.isin(np.arange(W.shape[1]), thrusters)
+    return gives_every_wrench(W, pushing)
 
 
 def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:

@@ -20,8 +20,8 @@ from fflin.analysis.reduction import (
 from fflin.base.errors import FflinWarning, InputError, listed, unknown
 from fflin.base.names import input_keys
 from fflin.base.validation import Array
+from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
-from fflin.control.saturation import warn_beyond
 from fflin.control.weights import GivenWeight, sampled_cost, weights_of
 from fflin.linear.model import LinearModel
 
@@ -71,7 +71,7 @@ class Pace(NamedTuple):
     """Bandwidth of a loop without active limits, and the fraction of the displacements."""
 
     bandwidth: float = BANDWIDTH  # [rad/s]
-    share: float = 1.0
+    fraction: float = 1.0
     hold: float = 0.0  # [s] that the inputs of a continuous model will be held for
     held: float = _HELD  # what the fastest of the loop may do within a hold [rad]
 
@@ -128,7 +128,7 @@ def _of_inertia(
     lin: LinearModel, M: Array, inverse: Array, pace: Pace, momenta: Mapping[str, float]
 ) -> Weights:
     """Return the weights of an inertia M (m, m) that damping adds to; N^-1 is `inverse`."""
-    h, m, size = lin.dt or 1.0, len(M), displacements(lin, pace.share)
+    h, m, size = lin.dt or 1.0, len(M), displacements(lin, pace.fraction)
     theta = np.abs(inverse) @ size
     D = np.abs(M) @ theta / theta
     S = lin.M @ lin.B[m:] / h
@@ -187,7 +187,7 @@ def _of_inertia(
         driven = (S**2 / cost).sum(axis=1) > _IDLE * D / unit
         least = min(grows._replace(bandwidth=_LEAST_OF_GROWTH * grows.bandwidth), limit)
         limit, achieved = _slowed(lin, costs, size, size * driven, limit, least)
-    rule = _rule(lin, size, limit, achieved, pace.share * ROTATION) + (
+    rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION) + (
         "; joint damping is included" if damped else ""
     )
     terms = h * on_positions.diagonal() * size**2, h * cost * use**2
@@ -217,20 +217,20 @@ def _on_velocities(
     return at
 
 
-def displacements(lin: LinearModel, share: float) -> Array:
-    """Return what each coordinate (m,) is displaced by, a share of what it may be."""
+def displacements(lin: LinearModel, fraction: float) -> Array:
+    """Return what each coordinate (m,) is displaced by, a fraction of what it may be."""
     m = len(lin.M)
     names, units = lin.state_names[:m], lin.state_units[:m]
     radius = _radius_of_gyration(lin.M) if names[:6] == _BASE else 1.0
     size = np.empty(m)
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         if name.startswith("q_b."):
-            size[i] = math.sin(math.radians(share * ROTATION / 2.0))
+            size[i] = math.sin(math.radians(fraction * ROTATION / 2.0))
         elif name.startswith("r_b."):
-            size[i] = share * OFFSET * radius
+            size[i] = fraction * OFFSET * radius
         else:
             most = LENGTH if unit == "m" else ANGLE
-            size[i] = share * min(most, TRAVEL * lin.limits.get(name, math.inf))
+            size[i] = fraction * min(most, TRAVEL * lin.limits.get(name, math.inf))
     return size
 
 
@@ -433,7 +433,7 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: flo
 # With held inputs the loop may be faster than at a point, since the sampled regulator is exact.
 _BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
 
-# The speeds of wheels come back at this share of the bandwidth.
+# The speeds of wheels come back at this fraction of the bandwidth.
 _SPEEDS = 0.1
 
 # A weight that is given and this many times apart from that of the rule is on another scale.
@@ -502,7 +502,7 @@ def _of_regulated(
     at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
     names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
     most = np.array([lin.limits[name] for name in names])
-    # A wheel that is at its limit already is counted as one at rest, and told.
+    # A wheel that is at its limit already is counted as one at rest, and named in the report.
     room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
     found = default_weights(body, pace, dict(zip(names, room, strict=True)))
     Q, R, rule, bandwidth, (of_positions, of_inputs) = found

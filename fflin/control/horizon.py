@@ -122,8 +122,8 @@ class Horizon:
         start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
         states, z, limited = condensed(stages, planned=False)
         (low, high, soft), free = self.bounds(stages), limited[:, size:] @ start
-        slope = 2.0 * z[:, :size].T
-        H, g = slope @ z[:, :size], slope @ (z[:, size:] @ start)
+        double = 2.0 * z[:, :size].T
+        H, g = double @ z[:, :size], double @ (z[:, size:] @ start)
         names = (
             tuple(f"{name}[{k}]" for k in range(self.samples) for name in of)
             for of in (self.inputs, self.limited)
@@ -204,21 +204,21 @@ class Receding:
         (by, d), first = self._due, len(self.of.acting)
         reached, low, high = ((by.E @ e + by.D @ d)[first:], by.low[first:], by.high[first:])
         width = np.where(np.isfinite(high - low), high - low, 1.0)
-        shares = np.maximum(low - reached, reached - high) / width
-        self.passed += bool(shares.max(initial=0.0) > _OVER)
-        if shares.max(initial=0.0) > self._over:
-            at = int(shares.argmax())
-            self._over, by_much = float(shares[at]), shares[at] * width[at]
+        fractions = np.maximum(low - reached, reached - high) / width
+        self.passed += bool(fractions.max(initial=0.0) > _OVER)
+        if fractions.max(initial=0.0) > self._over:
+            at = int(fractions.argmax())
+            self._over, by_much = float(fractions[at]), fractions[at] * width[at]
             self._met = f"{self.of.limited[first + at]} by {by_much:.2g} at {t:.4g} s"
 
     def _count(self, t: float, reached: Array) -> None:
         """Record how far a plan violates the soft limits."""
         excess = np.maximum(self._low - reached, reached - self._high) * self._soft
-        row = int((shares := excess * self._unit).argmax())
-        self.softened += bool(shares[row] > _VIOLATED * self._size)
-        if shares[row] > max(self._worst, _VIOLATED * self._size):
+        row = int((fractions := excess * self._unit).argmax())
+        self.softened += bool(fractions[row] > _VIOLATED * self._size)
+        if fractions[row] > max(self._worst, _VIOLATED * self._size):
             sample, at = divmod(row, len(self.of.limited))
-            self._worst, when = float(shares[row]), t + (sample + 1) * self.of.dt
+            self._worst, when = float(fractions[row]), t + (sample + 1) * self.of.dt
             self._said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
 
     def _change(self, stages: tuple[Stage, ...]) -> None:

@@ -13,7 +13,7 @@ from fflin.analysis.stabilizability import require_detectable, require_disturbed
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
-from fflin.base.validation import Array, dimension
+from fflin.base.validation import Array, dimension, instance
 from fflin.control.gain import Gain, titled
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal.riccati import solve
@@ -300,12 +300,8 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     >>> compensator.dt
     0.1
     """
-    if not isinstance(gain, Gain) or not isinstance(estimator, Estimator):
-        raise InputError(
-            f"lqg got a {type(gain).__name__} and a {type(estimator).__name__}, expected a Gain "
-            "from lqr and an Estimator from kalman"
-        )
-    e = estimator
+    instance("gain", gain, Gain, "a Gain, as fflin.lqr returns it")
+    e = instance("estimator", estimator, Estimator, "an Estimator, as fflin.kalman returns it")
     if gain.dt != e.dt or not (np.array_equal(gain.A, e.A) and np.array_equal(gain.B, e.B)):
         raise InputError(
             "the gain and the estimator belong to different models; use one model for both"

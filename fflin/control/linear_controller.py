@@ -87,10 +87,10 @@ class Compensation:
             self.rates.append(after)
         return u
 
-    def advance(self, shares: Array, last: bool) -> None:
+    def advance(self, weights: Array, last: bool) -> None:
         """Integrate z to the next stage from weights of z at the step's start and of its rates."""
         if not self.dt:
-            self.estimate, self.stages = shares @ np.array(self.rates), self.stages + 1
+            self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:
                 self.rates, self.stages = [self.estimate], 0
 
@@ -366,21 +366,12 @@ class OutputFeedback(LinearController):
         compensator: Compensator,
         noise: Callable[[float], ArrayLike] | None = None,
     ) -> None:
-        if not isinstance(lin, LinearModel) or not isinstance(compensator, Compensator):
+        instance("lin", lin, LinearModel, "a fflin.LinearModel")
+        instance("compensator", compensator, Compensator, "a Compensator, as fflin.lqg returns it")
+        if not lin.dt:
             raise InputError(
-                f"OutputFeedback got a {type(lin).__name__} and a {type(compensator).__name__}, "
-                "expected a LinearModel and a Compensator, as fflin.lqg returns it"
-            )
-        if not lin.dt or lin.moving:
-            raise InputError(
-                "the model must be sampled and about a fixed point; use lin.discretize(dt), and "
-                "design the gain and the estimator for it"
-            )
-        signals = (compensator.input_names, compensator.output_names, compensator.dt)
-        if signals != (lin.output_names, lin.input_names, lin.dt):
-            raise InputError(
-                f"the compensator was designed for another model than '{lin.robot}' with "
-                f"{len(lin.output_names)} outputs at dt = {lin.dt:g} s; use one model for both"
+                "the model must be sampled; use lin.discretize(dt), and design the gain and the "
+                "estimator for it"
             )
         super().__init__(compensator, lin, noise=noise)
         self.compensator = compensator

@@ -13,7 +13,7 @@ from fflin.analysis.mechanics import rate_matrix
 from fflin.analysis.reduction import regulated_part, selection
 from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
-from fflin.base.validation import Array, dimension
+from fflin.base.validation import Array, dimension, instance
 from fflin.control.default_weights import rule_weights
 from fflin.control.gain import Gain, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve
@@ -282,11 +282,7 @@ def _diagonal(
 
 def require_fixed_point(lin: LinearModel) -> None:
     """Raise `EquilibriumError` if f0 is not zero, `ModelError` if the robot has changed."""
-    if not isinstance(lin, LinearModel):
-        raise InputError(
-            f"lin is a {type(lin).__name__}, expected a LinearModel; fflin.linearize returns one"
-        )
-    lin.require_unchanged()
+    instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     if lin.is_equilibrium():
         return
     rate = lin.f0 if lin.drift is None else lin.drift

@@ -13,13 +13,13 @@ from fflin.base.errors import InputError, listed
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
 from fflin.base.tables import folded
-from fflin.base.validation import Array, number, whole
+from fflin.base.validation import Array, instance, number, whole
+from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
 from fflin.control.horizon import Horizon, Matrices, Receding, Stage
 from fflin.control.lqr import lqr
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
 from fflin.control.policies import Feedback, Policy, StateFeedback
-from fflin.control.saturation import input_limits
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import asks_steady, held_stages, steady_regulator, tvlqr
 from fflin.control.weights import Weight, sampled_cost, weight
@@ -118,11 +118,7 @@ def mpc(
     >>> bool(abs(motion.u[:, 6:]).max() <= 1.0), policy.matrices(motion.x[0]).H.shape
     (True, (90, 90))
     """
-    if not isinstance(lin, LinearModel | LinearTrajectory):
-        raise InputError(
-            f"lin is a {type(lin).__name__}, expected a LinearModel or a LinearTrajectory; "
-            "fflin.linearize and fflin.linearize_trajectory return them"
-        )
+    instance("lin", lin, LinearModel | LinearTrajectory, "a LinearModel or a LinearTrajectory")
     samples = whole("horizon", horizon, 1)
     if dt is None and not lin.dt:
         raise InputError("dt is missing; give the sampling time [s]")

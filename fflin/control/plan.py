@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array, number, whole
+from fflin.control.channel import input_limits
 from fflin.control.optimal.plan_search import Search, cost_of_inputs, excess, limited_values
 from fflin.control.optimal.shooting import Point, Shooting
-from fflin.control.saturation import input_limits
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
 from fflin.dynamics.actuation import Actuation
@@ -29,8 +29,8 @@ from fflin.robot.robot import Robot
 # What may be missed of the goal and of limits of states at knots in rad, m and s.
 _REACHED = 1e-7
 
-# Between knots limits are exceeded by no more than this share of them, looked at so many times an
-# interval.
+# Between knots, limits may be exceeded by this fraction of them. Each interval is checked at the
+# ends of so many parts.
 _BETWEEN, _PARTS = 0.01, 16
 
 
@@ -197,7 +197,7 @@ class _Made(NamedTuple):
     missed: Array  # of the goal (nx,)
     at_knots: Array  # what knots exceed of limits of states (nx,)
     beyond: Array  # what the ends of _PARTS equal parts of the intervals exceed (N, parts, nx)
-    most: float  # the largest share of a limit in it
+    most: float  # the largest fraction of a limit in it
 
     @property
     def reached(self) -> bool:

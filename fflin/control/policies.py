@@ -6,14 +6,14 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, as_double
+from fflin.base.validation import Array, as_double, instance
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import Frame, StateMap, readout
-from fflin.kernel.allocation import least_squares, solve
+from fflin.kernel.allocation import nearest
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.limits import limits_of
@@ -82,8 +82,7 @@ class StateFeedback(Feedback):
     K: Array
 
     def __post_init__(self) -> None:
-        if not isinstance(self.lin, LinearModel):
-            raise InputError(f"lin is a {type(self.lin).__name__}, expected a fflin.LinearModel")
+        instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
         if self.lin.moving:
             raise InputError(
                 "the model is about a moving reference, expected one about a fixed point; follow "
@@ -166,8 +165,7 @@ class Allocation:
         InputError
             If the simulated robot and `design` have different joints.
         """
-        if not isinstance(self.design, Robot):
-            raise InputError(f"design is a {type(self.design).__name__}, expected a fflin.Robot")
+        instance("design", self.design, Robot, "a fflin.Robot")
         if self.design.joint_names != robot.joint_names:
             raise InputError(
                 f"the design's joints differ from the joints of '{robot.name}'; give the same "
@@ -270,43 +268,3 @@ def fed_back(policy: Any) -> tuple[str, ...]:
         return ()
     used = np.ones(len(of.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
     return tuple(name for name, size in zip(of.state_names, used, strict=True) if size)
-
-
-def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
-    """Return u (k,) within its bounds (k,) that makes A u nearest to b, the smallest of these."""
-    numbers, size = [0.0] * len(least), len(b)
-    # The entries of a list are read faster than the entries of an array.
-    problem = least_squares(least.tolist(), most.tolist(), size)._replace(
-        columns=np.concatenate((A.T.ravel(), b)),
-        state=[0] * len(least),
-        order=[0] * len(least),
-        **{name: numbers.copy() for name in ("x", "s", "low", "high")},
-    )
-    solve(problem, size, 0)
-    return np.array(problem.x)
-
-
-def gives_every_wrench(W: Array, pushing: NDArray[np.bool_]) -> bool:
-    """Whether columns W (6, k), of which some only push, together give every wrench."""
-    # They do where the rank is 6 and some thrusts, all of them positive, cancel one another.
-    from scipy.optimize import nnls
-
-    size = np.linalg.norm(W, axis=0)
-    W, pushing = W[:, size > 0.0] / size[size > 0.0], pushing[size > 0.0]
-    if np.linalg.matrix_rank(W, tol=1e-6) < len(W):
-        return False
-    if not pushing.any():
-        return True
-    both = np.hstack((W[:, pushing], W[:, ~pushing], -W[:, ~pushing]))
-    return bool(nnls(both, -both.sum(axis=1))[1] < 1e-9)
-
-
-def thrusters_give_every_wrench(robot: Robot) -> bool:
-    """Whether a robot has thrusters that, with what else acts on its base, push it every way."""
-    actuation = Actuation(StateMap(robot))
-    thrusters = actuation.groups.get("thrust")
-    if thrusters is None:
-        return False
-    W = actuation.columns(robot.create_data(), robot.neutral())[:6]
-    pushing = np.isin(np.arange(W.shape[1]), thrusters)
-    return gives_every_wrench(W, pushing)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
-from fflin.base.validation import Array
+from fflin.base.validation import Array, instance
 from fflin.control.gain_schedule import FilterSchedule, GainSchedule
 from fflin.control.kalman import kalman
 from fflin.control.linear_controller import Compensation, LinearController, Loop, Sample
@@ -72,14 +72,9 @@ class TrajectoryFeedback(Feedback):
     frame: ClassVar[Frame] = "local"
 
     def __post_init__(self) -> None:
-        if not (
-            isinstance(self.trajectory, Trajectory) and isinstance(self.schedule, GainSchedule)
-        ):
-            raise InputError(
-                f"TrajectoryFeedback got a {type(self.trajectory).__name__} and a "
-                f"{type(self.schedule).__name__}, expected a LinearTrajectory and a GainSchedule, "
-                "as fflin.linearize_trajectory and fflin.tvlqr return them"
-            )
+        instance("trajectory", self.trajectory, Trajectory, "a fflin.Trajectory")
+        expected = "a GainSchedule, as fflin.tvlqr returns it"
+        instance("schedule", self.schedule, GainSchedule, expected)
 
     @property
     def duration(self) -> float:
@@ -311,12 +306,9 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.filter, FilterSchedule):
-            raise InputError(
-                f"filter is a {type(self.filter).__name__}, expected a FilterSchedule, as "
-                "fflin.tvkalman returns it"
-            )
-        gains, seen = self.schedule, self.filter
+        expected = "a FilterSchedule, as fflin.tvkalman returns it"
+        seen = instance("filter", self.filter, FilterSchedule, expected)
+        gains = self.schedule
         if not (gains.dt and gains.dt == seen.dt and np.array_equal(gains.A, seen.A)):
             raise InputError(
                 f"the gains are sampled at dt = {gains.dt:g} s, the filter at {seen.dt:g} s, "

@@ -171,7 +171,7 @@ def field_of(robot: Robot, frame: str) -> OrbitField | None:
 _SHARES = (2.0, -1.0, -1.0)
 
 
-class Tide(NamedTuple):
+class GravityGradient(NamedTuple):
     """Gravity-gradient field of an orbit at one base pose, in base axes.
 
     A rotation about a unit vector s at unit rate gives a point at x the acceleration [s]x^2 x.
@@ -184,7 +184,7 @@ class Tide(NamedTuple):
     fall: Array  # (3,) what accelerates the base's origin, the frame's turning included [m/s^2]
 
     @classmethod
-    def at(cls, field: OrbitField, q: Array) -> "Tide":
+    def at(cls, field: OrbitField, q: Array) -> "GravityGradient":
         """Return that at a configuration (nq,), which must be near to the orbit's point."""
         field.require_near(q)
         R, place = field.base(q)

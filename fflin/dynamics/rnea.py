@@ -10,7 +10,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.names import ANGULAR, LINEAR, PIN_ANGULAR
-from fflin.dynamics.orbital import Tide, field_of
+from fflin.dynamics.orbital import GravityGradient, field_of
 from fflin.dynamics.state import StateMap
 
 
@@ -85,7 +85,7 @@ class Accelerations:
         Their slopes and by_u are the C-contiguous arrays of their shapes that are given.
         """
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
-        tide = self._field and Tide.at(self._field, q)
+        tide = self._field and GravityGradient.at(self._field, q)
         # Without the base's position and linear velocity: nothing here depends on them, and
         # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
         # accelerates the base origin and nothing against it (equivalence).

@@ -13,12 +13,12 @@ from numpy.linalg import norm
 from fflin.base.errors import FflinError, InputError
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, instance
+from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.kalman import Compensator
 from fflin.control.linear_controller import Compensation, LinearController, Sample
 from fflin.control.policies import Gridded, StateFeedback
-from fflin.control.saturation import input_limits
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap

@@ -17,7 +17,7 @@ from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.record import content_digest
 from fflin.base.validation import Array
-from fflin.base.writing import as_path, write_whole
+from fflin.base.writing import as_path, write_atomically
 from fflin.export.laws import CASES, OutputLaw, StateLaw, law_of
 from fflin.robot.robot import Robot
 
@@ -107,7 +107,7 @@ def write_c(
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{target}: cannot be made: {error.strerror}") from None
-    write_whole(contents)
+    write_atomically(contents)
     return target
 
 

@@ -303,3 +303,17 @@ def _steepest(problem, size):
             if slope > best:
                 best, found = slope, j
     return found
+
+
+def nearest(A, b, least, most):
+    """Return u (k,) within its bounds (k,) that makes A u nearest to b, the smallest of these."""
+    numbers, size = [0.0] * len(least), len(b)
+    # The entries of a list are read faster than the entries of an array.
+    problem = least_squares(least.tolist(), most.tolist(), size)._replace(
+        columns=np.concatenate((A.T.ravel(), b)),
+        state=[0] * len(least),
+        order=[0] * len(least),
+        **{name: numbers.copy() for name in ("x", "s", "low", "high")},
+    )
+    solve(problem, size, 0)
+    return np.array(problem.x)

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     Index: TypeAlias = slice | NDArray[np.intp]
 
 # Terms that cancel exactly still leave their rounding, 1e-16 of their size. Counted with this
-# share they allow for it, and hide nothing larger.
-_ROUNDING_SHARE = 1e-3
+# fraction they allow for it, and hide nothing larger.
+_ROUNDING_FRACTION = 1e-3
 
 
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
@@ -65,7 +65,7 @@ def aba_route(
     own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
     # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
-    # digits; no slope depends on where the base is, nor in the axes of an orbit.
+    # digits; no derivative depends on where the base is, nor in the axes of an orbit.
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
@@ -147,7 +147,7 @@ def _cancelling_terms(
     # What the momentum of wheels does to a turning link, in the units of the rows.
     spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
     slowed = speed.copy()
-    slowed[LINEAR] *= _ROUNDING_SHARE
+    slowed[LINEAR] *= _ROUNDING_FRACTION
     resting = slowed / mobility
     accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
     forces = np.abs(lin.u0) * input_mobility

@@ -94,7 +94,7 @@ _EPS = float(np.finfo(float).eps)
 # Rounding of a difference of outputs: its weights add up to two ulp, each output brings a few.
 _ULPS = 8.0
 
-# And of accelerations at the ends of a step, of which slopes at a slow motion are the difference.
+# Rounding of the accelerations at the ends of a step, whose difference is the derivative.
 _STEP_ULPS = 64.0
 
 # Relative to its block an analytic route agrees to round-off times the conditioning of M, with
@@ -257,8 +257,10 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     bends = np.zeros(nx + len(input_steps), dtype=bool)
     bends[state.groups.q_b] = bends[state.groups.q_m] = True
     point, every = np.concatenate((lin.x0, lin.u0)), np.concatenate((steps, input_steps))
-    slopes = jacobian(lambda rows: model.rates(rows[:, :nx], rows[:, nx:]), point, every, bends)
-    A, B, rounding = slopes[:, :nx], slopes[:, nx:], _STEP_ULPS * _EPS / difference
+    derivatives = jacobian(
+        lambda rows: model.rates(rows[:, :nx], rows[:, nx:]), point, every, bends
+    )
+    A, B, rounding = derivatives[:, :nx], derivatives[:, nx:], _STEP_ULPS * _EPS / difference
     rows += [
         Row("differences", *block, difference)
         for block in compare(state, actuation, lin, M, A, B, steps=steps, rounding=rounding)
@@ -338,7 +340,7 @@ def _output_rows(
     of_x, of_u = (np.ones(len(each), dtype=bool) for each in (step_x, step_u))
     C = jacobian(lambda rows: np.array([y(x, lin.u0) for x in rows]), lin.x0, step_x, of_x)
     D = jacobian(lambda rows: np.array([y(lin.x0, u) for u in rows]), lin.u0, step_u, of_u)
-    # A slope below the rounding of y divided by the step is noise, and not compared more closely.
+    # A derivative below the rounding of y divided by the step is noise.
     scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
     for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):

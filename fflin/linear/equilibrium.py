@@ -284,7 +284,7 @@ def _unbalanced(
 
 _EPS = float(np.finfo(float).eps)
 
-# Largest share of what is to be balanced that may be left over.
+# Largest fraction of what is to be balanced that may be left over.
 TOLERANCE = 1e-9
 
 
@@ -292,19 +292,16 @@ def least_norm(C: Array, d: Array, one_sided: Mask) -> tuple[Array, Array]:
     """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``."""
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
-        u = _least_distance(C, u, one_sided)
-        # Exactly the least on the face that was found: those that do not push stay out.
+        from fflin.kernel.allocation import nearest
+
+        least, most = np.where(one_sided, 0.0, -np.inf), np.full(len(u), np.inf)
+        u = nearest(C, d, least, most)
+        # The same without the rounding of the bounded problem: inputs at zero stay out.
         pushing = ~one_sided | (u > TOLERANCE * float(np.abs(u).max(initial=0.0)))
         polished: Array = np.zeros(len(u))
         polished[pushing] = _pseudo_solve(C[:, pushing], d)
-        left = C @ polished - d
-        most = TOLERANCE * np.linalg.norm(d)
-        if (polished[one_sided] < 0.0).any() or np.linalg.norm(left) > most:
-            from scipy.optimize import lsq_linear
-
-            bounds = np.where(one_sided, 0.0, -np.inf), np.inf
-            polished = lsq_linear(C, d, bounds, method="bvls").x
-        u = polished
+        if (polished[one_sided] >= 0.0).all():
+            u = polished
     return u, C @ u - d
 
 
@@ -315,23 +312,3 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
     # An input below the rounding of the largest one is noise: it counts as zero.
     u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
     return u
-
-
-def _least_distance(C: Array, start: Array, one_sided: Mask) -> Array:
-    """Return the least u = start + Z z with u[one_sided] >= 0, where C Z = 0."""
-    from scipy.linalg import null_space
-    from scipy.optimize import nnls
-
-    # min |z| subject to G z >= h is solved by the residual r = E y - e of min |E y - e|, y >= 0,
-    # with E = [G^T; h^T] and e = (0, ..., 0, 1): z = -r_z / r_e.
-    Z = null_space(C)
-    size = float(np.linalg.norm(start))
-    E = np.vstack((Z[one_sided].T, -start[one_sided] / size))
-    e = np.zeros(len(E))
-    e[-1] = 1.0
-    y = nnls(E, e, maxiter=100 * max(E.shape))[0]
-    r = E @ y - e
-    # r_e = -|r|^2, and zero where the inequalities contradict each other.
-    z = -r[:-1] / r[-1] if r[-1] < -TOLERANCE else np.zeros(Z.shape[1])
-    u: Array = start + Z @ (size * z)
-    return np.where(one_sided, np.maximum(u, 0.0), u)

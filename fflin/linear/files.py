@@ -15,7 +15,7 @@ import numpy as np
 
 from fflin.base import record
 from fflin.base.record import Record, figure, figures, text, texts
-from fflin.base.writing import check_ending, csv_table, read_file, write_whole
+from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
 
 # Of what the rows and columns of each matrix are, and the entries of each vector.
 _MATRICES = {
@@ -61,17 +61,17 @@ def record_of(lin: Any) -> Record:
     return entries
 
 
-def write_model(path: Path, entries: Record, *, sealed: bool) -> None:
-    """Write the record of a model, with its digest if `sealed`; see `LinearModel.save`."""
+def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
+    """Write the record of a model, with its digest if `checksummed`; see `LinearModel.save`."""
     check_ending(path, FORMATS)
     if path.suffix != ".csv":
-        record.write_record(path, entries, sealed=sealed)
+        record.write_record(path, entries, checksummed=checksummed)
         return
     record.require_finite(entries)
     contents = {key: csv_table(rows) for key, rows in _tables(entries).items()}
-    if sealed:
-        contents["info"] += f"{record.SEAL},{record.content_digest(contents)}\n".encode()
-    write_whole({_csv_path(path, key): content for key, content in contents.items()})
+    if checksummed:
+        contents["info"] += f"{record.CHECKSUM},{record.content_digest(contents)}\n".encode()
+    write_atomically({_csv_path(path, key): content for key, content in contents.items()})
 
 
 def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, Any], T]:
@@ -174,10 +174,10 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
     if not _csv_path(path, "info").exists() and path.exists():
         raise ValueError("give the name NAME.csv without the matrix, not NAME.A.csv")
     contents = {key: read_file(_csv_path(path, key), ".csv") for key in _TABLES}
-    body, mark, seal = contents["info"].rpartition(f"\n{record.SEAL},".encode())
+    body, mark, checksum = contents["info"].rpartition(f"\n{record.CHECKSUM},".encode())
     if mark:
         contents["info"] = body + b"\n"
-        if seal != f"{record.content_digest(contents)}\n".encode():
+        if checksum != f"{record.content_digest(contents)}\n".encode():
             raise ValueError(
                 f"{record.DAMAGED}; to read it as it is, delete that line of the info table"
             )

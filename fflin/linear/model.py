@@ -393,7 +393,7 @@ class LinearModel(StateSpace):
         from fflin.base.writing import as_path
         from fflin.linear.files import record_of, write_model
 
-        write_model(as_path(path), record_of(self), sealed=self.verified)
+        write_model(as_path(path), record_of(self), checksummed=self.verified)
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:

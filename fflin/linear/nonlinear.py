@@ -98,8 +98,8 @@ class ErrorDynamics(Nonlinear):
 
     def after_motion(self, x: Array, q: Array, v: Array, a: Array, t: Array) -> Array:
         """Return the errors when reference and robot have both moved on for a time t."""
-        at, still = np.tile(self._q, (len(t), 1)), np.zeros_like(a)
-        ahead = super().after_motion(x, at, np.tile(self._v, (len(t), 1)), still, t)
+        at, at_rest = np.tile(self._q, (len(t), 1)), np.zeros_like(a)
+        ahead = super().after_motion(x, at, np.tile(self._v, (len(t), 1)), at_rest, t)
         errors = moving_errors("local", super().after_motion(x, q, v, a, t), ahead)
         errors[:, -len(self._a) :] -= t * self._a
         return errors
@@ -186,10 +186,10 @@ def jacobian(
     offsets = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
     first, last = np.split(f(np.concatenate((point + offsets, point - offsets))), 2)
     *near, rest = np.split(first - last, [len(curved) * k for k in (1, 2, 3)])
-    slopes: Array = np.empty((rest.shape[1], len(point)))
-    slopes[:, is_curved] = np.tensordot(_WEIGHTS, near, axes=1).T
-    slopes[:, ~is_curved] = 0.5 * rest.T
-    return slopes / steps
+    derivatives: Array = np.empty((rest.shape[1], len(point)))
+    derivatives[:, is_curved] = np.tensordot(_WEIGHTS, near, axes=1).T
+    derivatives[:, ~is_curved] = 0.5 * rest.T
+    return derivatives / steps
 
 
 def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array, Array]:

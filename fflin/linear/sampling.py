@@ -30,7 +30,9 @@ def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, 
         return exponential[..., :n, :n], exponential[..., :n, n:]
 
 
-def held_slopes(A: Array, driven: Array, h: float, dA: Array, d_driven: Array) -> tuple[Array, ...]:
+def held_derivatives(
+    A: Array, driven: Array, h: float, dA: Array, d_driven: Array
+) -> tuple[Array, ...]:
     """Return the derivatives of `held_exponential` along (dA, d_driven)."""
     n = len(A)
     if not dA.any() and not (A @ A).any():
@@ -39,8 +41,8 @@ def held_slopes(A: Array, driven: Array, h: float, dA: Array, d_driven: Array) -
 
     block, along = np.zeros((2, n + driven.shape[1], n + driven.shape[1]))
     block[:n], along[:n] = np.hstack((A, driven)) * h, np.hstack((dA, d_driven)) * h
-    slope = expm_frechet(block, along, compute_expm=False)
-    return slope[:n, :n], slope[:n, n:]
+    derivative = expm_frechet(block, along, compute_expm=False)
+    return derivative[:n, :n], derivative[:n, n:]
 
 
 def held_cost(F: Array, W: Array, h: float | Array) -> Array:

@@ -1,4 +1,8 @@
-"""Trajectory files, also from other programs: npz, mat and json by entries, csv by columns."""
+"""Trajectory files, also from other programs: npz, mat and json by entries, csv by columns.
+
+The last column of a .csv file that fflin writes is ``sha256``, the digest of the other columns, the
+same in every row. Programs that read the file by the names of its columns are not affected.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from fflin.base import record
 from fflin.base.errors import FflinError, FileError, InputError, unknown
 from fflin.base.record import Record, read_record, reading, text
 from fflin.base.validation import Array, as_double
-from fflin.base.writing import check_ending, csv_table, read_file, write_whole
+from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
@@ -28,8 +32,12 @@ def write_csv(path: Path, traj: Any) -> None:
     """Write named columns, as `Trajectory.load` reads them."""
     columns = [f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])]
     names = ["t", *columns, *Actuation(StateMap(traj.robot)).names, "hold", "frame"]
-    rows = np.column_stack((traj.t, traj.q, traj.v, traj.u))
-    write_table(path, names, rows, (traj.hold, traj.frame))
+    rows = np.column_stack((traj.t, traj.q, traj.v, traj.u)).tolist()
+    table = [names, *([*row, traj.hold, traj.frame] for row in rows)]
+    if traj.verified:
+        checksum = _digest(table)
+        table = [[*names, record.CHECKSUM], *([*row, checksum] for row in table[1:])]
+    write_atomically({path: csv_table(table)})
 
 
 def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
@@ -38,9 +46,9 @@ def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
     return [name if unit in ("", "1") else f"{name} [{unit}]" for name, unit in pairs]
 
 
-def write_table(path: Path, names: Sequence[str], rows: Array, last: Sequence[str] = ()) -> None:
-    """Write named columns, and behind them what is the same in every row."""
-    write_whole({path: csv_table([names, *([*row, *last] for row in rows.tolist())])})
+def write_table(path: Path, names: Sequence[str], rows: Array) -> None:
+    """Write named columns."""
+    write_atomically({path: csv_table([names, *rows.tolist()])})
 
 
 def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dict[str, Any]:
@@ -49,7 +57,7 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
     state = StateMap(robot)
     with reading(source, "trajectory"):
         table = source.suffix == ".csv"
-        entries, verified = (_columns(source), False) if table else read_record(source)
+        entries, verified = _columns(source) if table else read_record(source)
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
             entries = struct  # of MATLAB
     try:
@@ -91,8 +99,13 @@ def arguments(
     return found_as | {"q": q, "v": v}
 
 
-def _columns(path: Path) -> Record:
-    """Return the columns of a csv by their names, as texts."""
+def _digest(table: Sequence[Sequence[Any]]) -> str:
+    """Return the digest of a table without its column of digests."""
+    return record.content_digest({"table": csv_table(table)})
+
+
+def _columns(path: Path) -> tuple[Record, bool]:
+    """Return the columns of a csv by their names, as texts, and whether they are verified."""
     lines = csv.reader(io.StringIO(read_file(path, ".csv").decode("utf-8-sig"), newline=""))
     header, *rows = [[cell.strip() for cell in line] for line in lines if any(line)]
     if len({*header}) < len(header):
@@ -101,7 +114,15 @@ def _columns(path: Path) -> Record:
         if len(row) != len(header):
             cells = f"row {number} has {len(row)} cells, the header has {len(header)}"
             raise ValueError(f"{cells}; separate them by commas")
-    return dict(zip(header, zip(*rows, strict=True), strict=True))
+    checksummed = header[-1] == record.CHECKSUM
+    if checksummed:
+        *header, _ = header
+        found, rows = {row[-1] for row in rows}, [row[:-1] for row in rows]
+        if found != {_digest([header, *rows])}:
+            raise ValueError(
+                f"{record.DAMAGED}; to read it as it is, delete the column {record.CHECKSUM}"
+            )
+    return dict(zip(header, zip(*rows, strict=True), strict=True)), checksummed
 
 
 def _entries(columns: Record, state: StateMap) -> Record:

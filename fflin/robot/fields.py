@@ -244,108 +244,32 @@ def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
 
 
 class Field(NamedTuple):
-    """Key of a robot file: what its values are, what they mean, and the check of a field."""
+    """Key of a robot file: what its values are, and the check of a field."""
 
-    meaning: str  # for the guide
     check: Callable[[Any, Scope], Any] = lambda value, _: value
     kind: Kind = NUMBER  # of a value, and of the entries of a list
     table: Kind | None = NUMBER  # of the entries of a table; None if it must not be a table
     parts: bool = False  # whether it is a table of named parts, some of which are tables
     word: str | None = None  # the part that may be a word; empty for the value itself
     merged: bool = False  # whether the entries of a call are added to the entries of a file
-    heading: str = ""  # as a file writes it, if that is not the name alone
 
 
 # In the order in which a file applies them: the names of inputs are known after the inputs.
 FIELDS = {
-    "passive": Field(
-        "joints without a motor. They have no torque input by default, and "
-        '`joint = "*"` omits them',
-        kind=NAME,
-        table=None,
-    ),
-    "inputs": Field(
-        'the inputs in the order of u; `joint = "*"` means every joint with a motor. Default: '
-        "torque and force on the base and a torque on every joint with a motor",
-        heading="[[input]]",
-    ),
-    "appendages": Field(
-        "flexible appendages and slosh, as `[[flexible]]` and `[[slosh]]`",
-        heading="[[flexible]]",
-    ),
-    "outputs": Field(
-        "the outputs, written as for `--output`; the state by default",
-        _outputs,
-        kind=NAME,
-        table=None,
-    ),
-    "stiffness": Field(
-        "joint stiffness [N m/rad]; one number applies to all joints",
-        _stiffness,
-        merged=True,
-        heading="[stiffness]",
-    ),
-    "damping": Field(
-        'joint damping [N m s/rad]; one number applies to all joints; `damping = "urdf"` takes '
-        "the URDF's damping",
-        _damping,
-        word="",
-        merged=True,
-        heading="[damping]",
-    ),
-    "rest": Field(
-        "joint positions at which the springs are relaxed [rad, m]",
-        _rest,
-        merged=True,
-        heading="[rest]",
-    ),
-    "gravity": Field(
-        "uniform gravity in world axes [m/s²]",
-        lambda value, _: three_numbers("gravity", value),
-    ),
-    "orbit": Field(
-        "altitude of a circular orbit above the earth [m]; or a table `[orbit]` with `altitude` "
-        'or `mean_motion` [rad/s], and `body`, such as "mars", or `mu` and `body_radius`. `orbit` '
-        "replaces `gravity`",
-        lambda value, _: checked_orbit(value),
-        word="body",
-    ),
+    "passive": Field(kind=NAME, table=None),
+    "inputs": Field(),
+    "appendages": Field(),
+    "outputs": Field(_outputs, kind=NAME, table=None),
+    "stiffness": Field(_stiffness, merged=True),
+    "damping": Field(_damping, word="", merged=True),
+    "rest": Field(_rest, merged=True),
+    "gravity": Field(lambda value, _: three_numbers("gravity", value)),
+    "orbit": Field(lambda value, _: checked_orbit(value), word="body"),
     "limits": Field(
-        "limits of inputs and states: largest magnitude, or `[least, largest]`. They override "
-        "limits of the URDF and of the inputs",
-        lambda value, scope: given_limits(scope.inputs, scope.joints, value),
-        merged=True,
-        heading="[limits]",
+        lambda value, scope: given_limits(scope.inputs, scope.joints, value), merged=True
     ),
-    "weights": Field(
-        'weights that `lqr` uses by default. `rule` ("urdf" or "identity") sets all weights that '
-        "the other keys do not set; `[weights.q]` and `[weights.r]` set weights of states and "
-        "inputs; `[weights.bryson]` sets largest acceptable values of states or inputs",
-        _weights,
-        parts=True,
-        word="rule",
-        heading="[weights]",
-    ),
-    "point": Field(
-        "`rpy` [deg], `position` [m], `joints`, `velocity`: operating point of the commands "
-        "`linearize`, `check`, `lqr`, `modes` and others. Omitted parts are neutral and at rest. "
-        "Functions in Python take their operating point from their arguments alone",
-        partial(_state, "point"),
-        parts=True,
-        heading="[point]",
-    ),
-    "target": Field(
-        "keys as in `[point]`: state to which the commands `simulate` and `montecarlo` bring the "
-        "robot. Omitted parts are as in `[point]`",
-        partial(_state, "target"),
-        parts=True,
-        heading="[target]",
-    ),
-    "start": Field(
-        "keys as in `[point]`: initial state of `simulate`, `montecarlo`, `plan` and `view`. "
-        "Omitted parts are as in `[point]`",
-        partial(_state, "start"),
-        parts=True,
-        heading="[start]",
-    ),
+    "weights": Field(_weights, parts=True, word="rule"),
+    "point": Field(partial(_state, "point"), parts=True),
+    "target": Field(partial(_state, "target"), parts=True),
+    "start": Field(partial(_state, "start"), parts=True),
 }

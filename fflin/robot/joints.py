@@ -146,6 +146,7 @@ class Coordinates:
     joints: tuple[Joint, ...]
     followers: tuple[Follower, ...]
     _as_made: tuple[pin.Model, pin.Model] | None
+    _removed: tuple[str, ...]
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -187,7 +188,7 @@ class Coordinates:
     def checked_configuration(self, q: Array) -> Array:
         """Return a valid configuration q (nq,), corrected within 1e-6, or raise `InputError`."""
         if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
-            q = vector("q", q, self.nq, _CONFIGURATION)
+            q = self._sized("q", q, self.nq, _CONFIGURATION)
         entries = q.tolist()
         if not math.isfinite(sum(entries)):
             vector("q", q, self.nq, _CONFIGURATION)  # says which entry it is
@@ -215,7 +216,7 @@ class Coordinates:
 
     def checked_velocity(self, v: Array) -> Array:
         """Return a valid velocity v (nv,), without modification, or raise `InputError`."""
-        v = vector("v", v, self.nv, "a velocity in Pinocchio's order")
+        v = self._sized("v", v, self.nv, "a velocity in Pinocchio's order")
         for joint, leader, multiplier, _ in self.followers:
             expected = multiplier * v[leader.idx_v]
             if abs(v[joint.idx_v] - expected) > NORM_TOLERANCE * max(1.0, abs(expected)):
@@ -224,6 +225,13 @@ class Coordinates:
                     f"mimics '{leader.name}', which requires {expected:.9g}"
                 )
         return v
+
+    def _sized(self, name: str, value: Array, size: int, of_what: str) -> Array:
+        """Return a vector (size,); the error for a longer one names the removed coordinates."""
+        if self._removed and np.size(value) > size:
+            removed = ", ".join(self._removed)
+            of_what += f"; the coordinates {removed} left with the replaced inputs or appendages"
+        return vector(name, value, size, of_what)
 
     def _followed(self, q: Array) -> Array:
         """Return a copy of q (nq,) with mimic joints corrected if they are within 1e-6."""

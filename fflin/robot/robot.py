@@ -145,6 +145,8 @@ class Robot(Coordinates):
     appendages: tuple[Appendage, ...] = ()
     # Where some of its joints are wheels or modes: the same robot without them.
     _unequipped: Robot | None = None
+    # Wheels and modes that it had before its inputs or appendages were replaced.
+    _removed: tuple[str, ...] = ()
     # The model, and what it was when the first robot of it was made.
     _as_made: tuple[pin.Model, pin.Model] | None = None
 

@@ -25,30 +25,12 @@ if TYPE_CHECKING:
 # Fields that a file gives as arrays of tables.
 _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
-# The keys of a robot file; a file without `urdf` holds inputs alone.
+# The keys of a robot file; a file without `urdf` holds inputs alone. The guide has their meaning.
 KEYS = {
-    "urdf": Field(
-        "path relative to the file, or a name that `fflin robots` lists", kind=NAME, table=None
-    ),
-    "package_dirs": Field(
-        "folders, relative to the file, in which `package://` mesh paths are searched",
-        kind=NAME,
-        table=None,
-    ),
-    "lock": Field("welded joints: names, or `{ joint = value }` [rad, m]", kind=NAME),
-    "input": FIELDS["inputs"],
-    "flexible": Field(
-        "flexible appendages: `frame`, `frequency` [Hz], `translation` (three rows) [kg^0.5], "
-        "`rotation` [kg^0.5 m], `damping`, `name`; or `op4` and `asm`, files of Nastran, with "
-        "`modes`, `length`, `mass`, `origin` and `rigid`",
-        heading="[[flexible]]",
-    ),
-    "slosh": Field(
-        "liquid that sloshes: `frame`, `mass` [kg], `position` [m], `frequency` [Hz] or `length` "
-        "[m], `axis`, `damping`, `name`; or `radius`, `height` [m], `density` [kg/m³] and "
-        "`acceleration` [m/s²] of a cylinder, with `bottom` and `pendulum`",
-        heading="[[slosh]]",
-    ),
+    "urdf": Field(kind=NAME, table=None),
+    "package_dirs": Field(kind=NAME, table=None),
+    "lock": Field(kind=NAME),
+    **{table: Field() for tables in _TABLES.values() for table in tables},
     **{name: field for name, field in FIELDS.items() if name not in _TABLES},
 }
 

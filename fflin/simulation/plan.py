@@ -10,11 +10,10 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.names import group_of
 from fflin.base.validation import Array, instance, truth, vector
-from fflin.control.channel import Channel, Law
+from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
 from fflin.control.linear_controller import growing
 from fflin.control.plants import notes_of
 from fflin.control.policies import axes_of, bound, fed_back, feedback_of
-from fflin.control.saturation import Saturation, saturation, warn_beyond
 from fflin.control.tracking import (
     Reference,
     TrajectoryFeedback,

@@ -145,7 +145,7 @@ def is_late(settled: Array | NDArray[np.intp] | int, count: int) -> Any:
     return settled > (1.0 - DWELL) * count
 
 
-class Course(NamedTuple):
+class ErrorHistory(NamedTuple):
     """History (N,) of the size of one kind of error, and whether the policy feeds it back."""
 
     title: str
@@ -284,7 +284,7 @@ def _phases(motion: Any) -> list[list[str]]:
     return table
 
 
-def courses(motion: Any) -> list[Course]:
+def courses(motion: Any) -> list[ErrorHistory]:
     """Return the errors of each kind, none without a target; wheels and modes are no joints."""
     if motion.error is None or motion.attitude_error is None:
         return []
@@ -301,11 +301,11 @@ def courses(motion: Any) -> list[Course]:
         if group != "q_b" and not (group == "q_m" and entry in motion.wheels):
             columns.setdefault((title, unit), []).append(i)
     attitude = any(name.startswith("q_b.") for name in steered)
-    found = [Course("attitude", "deg", motion.attitude_error, attitude)]
+    found = [ErrorHistory("attitude", "deg", motion.attitude_error, attitude)]
     for of, at in columns.items():
         fed_back = any(motion.state_names[i] in steered for i in at)
         fed_back &= of[0] != "position" or pushed(motion)
-        found.append(Course(*of, sizes[:, at].max(axis=1), fed_back))
+        found.append(ErrorHistory(*of, sizes[:, at].max(axis=1), fed_back))
     return found
 
 
@@ -314,7 +314,7 @@ def pushed(of: Any) -> bool:
     return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
 
-def verdict(motion: Any, kinds: list[Course]) -> str:
+def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
     """Return one line: whether a motion settled at its target, and what prevented it."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"

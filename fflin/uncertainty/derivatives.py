@@ -21,13 +21,13 @@ from fflin.dynamics.aba import Aba
 from fflin.dynamics.chart import Standing
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.names import LINEAR, PIN_ANGULAR
-from fflin.dynamics.orbital import Tide, field_of
+from fflin.dynamics.orbital import GravityGradient, field_of
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import StateMap
 from fflin.linear.certificate import aba_route
 from fflin.linear.linearization import Prepared, own_reference, prepare
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import held_exponential, held_slopes
+from fflin.linear.sampling import held_derivatives, held_exponential
 from fflin.linear.state_equations import assemble, output_equations
 from fflin.robot.joints import ROOT
 from fflin.robot.outputs import CenterOfMass, Momentum
@@ -42,7 +42,7 @@ _STEP = 2e-3
 _LEAST = 1e-6
 
 
-class ModelSlopes:
+class ModelDerivatives:
     """Derivatives of the matrices of a model that is, or is sampled from, `source`."""
 
     def __init__(self, lin: LinearModel, robot: Robot, source: LinearModel) -> None:
@@ -69,7 +69,7 @@ class ModelSlopes:
         centred = lin.q.copy()  # with the base at the origin
         centred[:3] = 0.0
         Inertia(state, data).invert(centred, inverse)
-        self.bodies = BodySlopes(ready, self._rates, lin.q, lin.v, inverse)
+        self.bodies = BodyDerivatives(ready, self._rates, lin.q, lin.v, inverse)
 
     @cached_property
     def _of_bodies(self) -> AccelerationDerivatives:
@@ -77,7 +77,7 @@ class ModelSlopes:
 
     def over(self, parameters: Sequence[Parameter]) -> tuple[Array, ...]:
         """Return dA, dB, dC, dD, df0 and dy0 (P, ..)."""
-        rates = slopes_of(parameters, self.bodies, self._of_bodies, self._u)
+        rates = derivatives_of(parameters, self.bodies, self._of_bodies, self._u)
         # All is affine in the rates: what no parameter changes is that of none.
         ready, state, nu = self._ready, self._ready.map, self._ready.map.velocities(self.lin.v)
         count, nv = len(rates.c) + 1, len(nu)
@@ -102,7 +102,7 @@ class ModelSlopes:
             driven, h = np.column_stack((self._source.B, self._source.f0)), self.lin.dt
             for row in range(len(A)):
                 given = np.column_stack((B[row], f0[row]))
-                A[row], held = held_slopes(self._source.A, driven, h, A[row], given)
+                A[row], held = held_derivatives(self._source.A, driven, h, A[row], given)
                 B[row], f0[row] = held[:, :-1], held[:, -1]
         C, D, y0 = np.split(self._seen(parameters, rates), (state.nx, -1), axis=2)
         return A, B, C, D, f0, y0[..., 0]
@@ -110,7 +110,7 @@ class ModelSlopes:
     def _seen(self, parameters: Sequence[Parameter], rates: AccelerationDerivatives) -> Array:
         """Return dC, dD and dy0 side by side (P, ny, ..), of outputs that feel or weigh."""
         # The robot's mass times such an output is quadratic in a parameter, with rates that are
-        # linear in it: of three values the slope is exact, whatever the step.
+        # linear in it: of three values the derivative is exact, whatever the step.
         lin, now = self.lin, self._rates
         found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
         outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)
@@ -136,11 +136,11 @@ class ModelSlopes:
 
         total = pin.computeTotalMass(self.robot.model)
         for row, one in enumerate(parameters):
-            step = 1.0 / (self.bodies.share(one.bodies) or 1.0) if one.bodies else 1.0
+            step = 1.0 / (self.bodies.fraction(one.bodies) or 1.0) if one.bodies else 1.0
             mass = sum(change[0] for change in one.bodies.values())
             of = [weighed(one, [part[row] for part in rates], k * step) for k in (0.0, 1.0, 2.0)]
-            slope = (4.0 * of[1] - of[2] - 3.0 * of[0]) / (2.0 * step)
-            found[row, rows] = (slope - mass * of[0] / total) / total
+            derivative = (4.0 * of[1] - of[2] - 3.0 * of[0]) / (2.0 * step)
+            found[row, rows] = (derivative - mass * of[0] / total) / total
         return found
 
 
@@ -156,15 +156,15 @@ def with_bodies(robot: Robot, one: Parameter, size: float) -> dict[int, pin.Iner
     return found
 
 
-def difference(slopes: ModelSlopes, one: Parameter) -> float:
+def difference(derivatives: ModelDerivatives, one: Parameter) -> float:
     """Return the relative error of the derivatives of A and B, by fourth-order differences."""
     if not one.bodies:
         raise InputError(
             f"'{one.name}' is not a parameter of a link or body; check takes only these, such as "
             "'base.mass'"
         )
-    lin, robot = slopes.lin, slopes.robot
-    step = _STEP / slopes.bodies.share(one.bodies)
+    lin, robot = derivatives.lin, derivatives.robot
+    step = _STEP / derivatives.bodies.fraction(one.bodies)
 
     def at(times: float) -> tuple[Array, Array]:
         model = robot.model.copy()
@@ -174,7 +174,7 @@ def difference(slopes: ModelSlopes, one: Parameter) -> float:
         route = aba_route(state, Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
         return held_exponential(*route[:2], lin.dt) if lin.dt else route[:2]
 
-    (dA, dB, *_), worst = slopes.over([one]), 0.0
+    (dA, dB, *_), worst = derivatives.over([one]), 0.0
     for *stepped, now, exact in zip(
         *map(at, (-2.0, -1.0, 1.0, 2.0, 0.0)), (dA[0], dB[0]), strict=True
     ):
@@ -210,7 +210,7 @@ _BODIES = (
 _OF_BODIES = np.linalg.inv([body.toDynamicParameters() for body in _BODIES]).round()
 
 
-class BodySlopes:
+class BodyDerivatives:
     """Derivatives over the ten dynamic parameters of every body at one point, (12.1) and (12.2)."""
 
     def __init__(
@@ -221,9 +221,9 @@ class BodySlopes:
         # Nothing depends on where the base is and how fast it moves along, see `Accelerations`.
         self.q[:3] = self.v[:3] = 0.0
         field = field_of(ready.robot, self.state.frame)
-        self._tide = Tide.at(field, q) if field else None
-        if self._tide:
-            self.v[PIN_ANGULAR] += self._tide.spin
+        self._gradient = GravityGradient.at(field, q) if field else None
+        if self._gradient:
+            self.v[PIN_ANGULAR] += self._gradient.spin
         self.data, self.rates = ready.robot.create_data(), rates
         self.joints = range(ROOT, self.model.njoints)
 
@@ -232,21 +232,24 @@ class BodySlopes:
         rates, size = self.rates, len(self.inverse)
         given = np.concatenate((rates.by_u, rates.slopes), axis=1)
         moved = self._by_inertia(given).reshape(-1, size, given.shape[1])
-        by_u, slopes = np.split(moved, rates.by_u.shape[1:], axis=2)
+        by_u, by_state = np.split(moved, rates.by_u.shape[1:], axis=2)
         found = AccelerationDerivatives(
-            np.zeros((len(moved), size)), slopes, by_u, np.zeros((len(moved), 3))
+            np.zeros((len(moved), size)), by_state, by_u, np.zeros((len(moved), 3))
         )
         if self.v.any() or rates.c.any():
             F, F_q, F_nu, F_turn = self._forces()
             found.c[:] = -F @ self.inverse
-            F_q += [self._slope(self.model, np.zeros_like(self.v), each)[1] for each in found.c]
+            F_q += [
+                self._rnea_derivatives(self.model, np.zeros_like(self.v), each)[1]
+                for each in found.c
+            ]
             found.by_q_m[:] -= self.inverse @ F_q
             found.by_nu[:] -= self.inverse @ F_nu
             found.by_turn[:] -= self.inverse @ F_turn
         found.by_nu[..., LINEAR] = 0.0
         return found
 
-    def share(self, changes: Mapping[int, Array]) -> float:
+    def fraction(self, changes: Mapping[int, Array]) -> float:
         """Return how much of M a change of bodies is at the most: the radius of M^-1 M_p."""
         of_bodies = self._by_inertia(np.eye(len(self.inverse)))
         total = sum(np.tensordot(change, of_bodies[at - ROOT], 1) for at, change in changes.items())
@@ -279,32 +282,35 @@ class BodySlopes:
             of_bodies = []
             for body in _BODIES:
                 lone.inertias[joint] = body
-                of_bodies.append(self._slope(lone, self.v, self.rates.c, self._tide))
+                of_bodies.append(self._rnea_derivatives(lone, self.v, self.rates.c, self._gradient))
             lone.inertias[joint] = pin.Inertia.Zero()
             for kept, values in zip(found, zip(*of_bodies, strict=True), strict=True):
                 kept.append(np.tensordot(_OF_BODIES, values, 1))
         return tuple(np.concatenate(each) for each in found)
 
-    def _slope(
-        self, model: pin.Model, v: Array, c: Array, tide: Tide | None = None
+    def _rnea_derivatives(
+        self, model: pin.Model, v: Array, c: Array, gradient: GravityGradient | None = None
     ) -> tuple[Array, ...]:
-        """Return RNEA and its slopes over q_m, nu and turns, without springs and inputs."""
+        """Return RNEA and its derivatives over q_m, nu and turns, without springs and inputs."""
         state, data, q = self.state, self.data, self.q
         by_turn: Array = np.zeros((len(v), 3))
-        if tide:  # first, as what Pinocchio returns is overwritten
-            pull = tide.force(model, data, q)
-            pull_by_q, by_turn = tide.slopes(model, data, q)
+        if gradient:  # first, as what Pinocchio returns is overwritten
+            pull = gradient.force(model, data, q)
+            pull_by_q, by_turn = gradient.slopes(model, data, q)
         by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q, v, state.spread(c))
         tau = np.array(data.tau)
-        if tide:
+        if gradient:
             tau, by_q = tau - pull, by_q - pull_by_q
-            by_turn = by_v[:, PIN_ANGULAR] @ skew(tide.spin) - by_turn
+            by_turn = by_v[:, PIN_ANGULAR] @ skew(gradient.spin) - by_turn
         project = state.project
         return state.forces(tau), project(by_q)[:, 6:], project(by_v), state.forces(by_turn)
 
 
-def slopes_of(
-    parameters: Sequence[Parameter], at: BodySlopes, of_bodies: AccelerationDerivatives, u: Array
+def derivatives_of(
+    parameters: Sequence[Parameter],
+    at: BodyDerivatives,
+    of_bodies: AccelerationDerivatives,
+    u: Array,
 ) -> AccelerationDerivatives:
     """Return the derivatives of the rates over each parameter, (P, ..); u (nu,) in base axes."""
     found = AccelerationDerivatives(
@@ -323,7 +329,7 @@ def slopes_of(
     return found
 
 
-def _of_force(parameter: Parameter, at: BodySlopes, u: Array) -> AccelerationDerivatives:
+def _of_force(parameter: Parameter, at: BodyDerivatives, u: Array) -> AccelerationDerivatives:
     """Return the derivatives over what changes the forces alone: F_p, F_qp, F_nup and B_p."""
     state, rates, size = at.state, at.rates, len(at.inverse)
     F: Array = np.zeros(size)
@@ -347,13 +353,13 @@ def _of_force(parameter: Parameter, at: BodySlopes, u: Array) -> AccelerationDer
         if u[column]:
             pushed = pin.StdVec_Force(at.model.njoints, pin.Force.Zero())
             pushed[joint] = pin.Force(wrench * u[column])
-            still = np.zeros_like(at.v)
-            by_q = pin.computeRNEADerivatives(at.model, at.data, at.q, still, still, pushed)[0]
+            at_rest = np.zeros_like(at.v)
+            by_q = pin.computeRNEADerivatives(at.model, at.data, at.q, at_rest, at_rest, pushed)[0]
             F_q = state.project(by_q)[:, 6:]
     found = AccelerationDerivatives(
         -at.inverse @ F, np.zeros((size, 2 * size)), at.inverse @ B, np.zeros(3)
     )
     if found.c.any():
-        F_q = F_q + at._slope(at.model, np.zeros_like(at.v), found.c)[1]
+        F_q = F_q + at._rnea_derivatives(at.model, np.zeros_like(at.v), found.c)[1]
     found.by_q_m[:], found.by_nu[:] = -at.inverse @ F_q, -at.inverse @ F_nu
     return found

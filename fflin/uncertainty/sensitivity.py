@@ -13,11 +13,11 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.record import Record, write_record
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array, FrozenArrays, as_double, numbers, whole
+from fflin.base.validation import Array, FrozenArrays, as_double, instance, numbers, whole
 from fflin.base.writing import as_path
 from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel
-from fflin.uncertainty.derivatives import ModelSlopes, difference
+from fflin.uncertainty.derivatives import ModelDerivatives, difference
 from fflin.uncertainty.parameters import Parameter, Parameters
 
 # Poles closer than this, relative to the largest, have no derivative of their own.
@@ -25,7 +25,7 @@ _EQUAL = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Slope(FrozenArrays):
+class Derivatives(FrozenArrays):
     """Derivatives of a linear model with respect to one parameter, or along a direction.
 
     Attributes
@@ -53,7 +53,7 @@ class Slope(FrozenArrays):
     dy0: Array
 
     def __repr__(self) -> str:
-        return f"Slope('{self.name}' = {self.value:.6g} {self.unit}, nx={len(self.dA)})"
+        return f"Derivatives('{self.name}' = {self.value:.6g} {self.unit}, nx={len(self.dA)})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -100,7 +100,7 @@ class Sensitivity:
 
     lin: LinearModel
     parameters: Parameters
-    _slopes: ModelSlopes = field()
+    _derivatives: ModelDerivatives = field()
 
     def __repr__(self) -> str:
         return f"Sensitivity('{self.lin.robot}', {len(self.parameters)} parameters)"
@@ -110,10 +110,12 @@ class Sensitivity:
         """Names of the parameters."""
         return tuple(self.parameters)
 
-    def __getitem__(self, name: str) -> Slope:
+    def __getitem__(self, name: str) -> Derivatives:
         """Return the derivatives with respect to one parameter."""
         one = self._one(name)
-        return Slope(one.name, one.unit, one.value, *(x[0] for x in self._slopes.over([one])))
+        return Derivatives(
+            one.name, one.unit, one.value, *(x[0] for x in self._derivatives.over([one]))
+        )
 
     def _one(self, name: str) -> Parameter:
         found = self.parameters.find(name)
@@ -124,7 +126,7 @@ class Sensitivity:
             )
         return self.parameters[found[0]]
 
-    def along(self, direction: Mapping[str, float]) -> Slope:
+    def along(self, direction: Mapping[str, float]) -> Derivatives:
         """Return the directional derivatives along a change of several parameters.
 
         Parameters
@@ -138,13 +140,15 @@ class Sensitivity:
         named = {name: value for key, value in given.items() for name in self.parameters.find(key)}
         if not named:
             raise InputError("direction is empty, expected {parameter: change}")
-        matrices = self._slopes.over([self.parameters[name] for name in named])
+        matrices = self._derivatives.over([self.parameters[name] for name in named])
         weights = [*named.values()]
-        return Slope(" + ".join(given), "1", 0.0, *(np.tensordot(weights, x, 1) for x in matrices))
+        return Derivatives(
+            " + ".join(given), "1", 0.0, *(np.tensordot(weights, x, 1) for x in matrices)
+        )
 
     @cached_property
     def _all(self) -> tuple[Array, ...]:
-        return self._slopes.over(list(self.parameters.values()))
+        return self._derivatives.over(list(self.parameters.values()))
 
     @property
     def dA(self) -> Array:
@@ -183,12 +187,12 @@ class Sensitivity:
 
         poles, left, right = eig(lin.A - lin.B @ K, left=True)
         changes = self.dA - self.dB @ K
-        slopes = np.einsum("ik,pij,jk->pk", left.conj(), changes, right, optimize=True)
-        slopes = slopes / np.einsum("ik,ik->k", left.conj(), right)
+        derivatives = np.einsum("ik,pij,jk->pk", left.conj(), changes, right, optimize=True)
+        derivatives = derivatives / np.einsum("ik,ik->k", left.conj(), right)
         apart = np.abs(poles[:, None] - poles)
         np.fill_diagonal(apart, np.inf)
-        slopes[:, apart.min(axis=1) <= _EQUAL * max(np.abs(poles).max(), _EQUAL)] = np.nan
-        return poles, slopes
+        derivatives[:, apart.min(axis=1) <= _EQUAL * max(np.abs(poles).max(), _EQUAL)] = np.nan
+        return poles, derivatives
 
     def check(self, names: Sequence[str] | None = None) -> dict[str, float]:
         """Compare the derivatives of A and B with finite differences.
@@ -211,7 +215,7 @@ class Sensitivity:
             names = [name for name, one in self.parameters.items() if one.bodies]
         if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
             raise InputError(f"names is {names!r}, expected a list, such as ['base.mass']")
-        return {name: difference(self._slopes, self._one(name)) for name in names}
+        return {name: difference(self._derivatives, self._one(name)) for name in names}
 
     def __str__(self) -> str:
         """Return `table` with its default arguments."""
@@ -239,9 +243,9 @@ class Sensitivity:
             effect = [step * np.abs(d).max() / of for d, of in zip((dA, dB), sizes, strict=True)]
             if one.name in shown and max(effect) > 0.0:
                 unit = "." if one.unit == "1" else one.unit
-                shares = (f"{100.0 * x:.2g}" for x in effect)
+                percents = (f"{100.0 * x:.2g}" for x in effect)
                 rows.append(
-                    (max(effect), one.name, unit, f"{one.value:.5g}", f"{step:.3g}", *shares)
+                    (max(effect), one.name, unit, f"{one.value:.5g}", f"{step:.3g}", *percents)
                 )
         rows.sort(key=lambda row: -row[0])
         most = [row[1:] for row in rows[: whole("top", top, 1)]]
@@ -264,7 +268,7 @@ class Sensitivity:
         FileError
             If the file has another ending or cannot be written.
         """
-        write_record(as_path(path), sensitivity_record(self), sealed=self.lin.verified)
+        write_record(as_path(path), sensitivity_record(self), checksummed=self.lin.verified)
 
 
 def sensitivity_record(found: Sensitivity) -> Record:
@@ -310,11 +314,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     >>> S["base.mass"].dB.shape, bool(S["base.mass"].dA.any())
     ((18, 9), False)
     """
-    if not isinstance(lin, LinearModel):
-        raise InputError(
-            f"lin is a {type(lin).__name__}, expected a LinearModel; fflin.linearize returns one"
-        )
-    robot = lin._robot
+    robot = instance("lin", lin, LinearModel, "a fflin.LinearModel")._robot
     if robot is None:
         raise InputError(
             "the model was loaded from a file, which contains no robot; linearise the robot again"
@@ -325,4 +325,4 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
             "the continuous model of this sampled model is not known; sample one with discretize"
         )
     lin.require_unchanged()
-    return Sensitivity(lin, Parameters(robot), ModelSlopes(lin, robot, source))
+    return Sensitivity(lin, Parameters(robot), ModelDerivatives(lin, robot, source))

@@ -11,7 +11,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.tables import grid
-from fflin.base.validation import Array, number, numbers, untied, vector, whole
+from fflin.base.validation import Array, instance, number, numbers, untied, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import linearize, prepare
@@ -268,9 +268,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     >>> len(of.samples(5, seed=1))
     5
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
-    robot.require_unchanged()
+    instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     given: dict[str, Any] = {}
     for key, value in mapping("ranges", ranges, "parameter").items():
         if isinstance(value, Mapping) and "range" not in value:
@@ -320,12 +318,12 @@ def _range(one: Parameter, value: Any) -> Range:
     if isinstance(value, tuple | list):
         least, largest = vector(f"range of '{one.name}'", value, 2, "(least, largest)").tolist()
     else:
-        share = number(f"range of '{one.name}'", value)
+        relative = number(f"range of '{one.name}'", value)
         if not one.value:
             raise InputError(
                 f"'{one.name}' is 0, so a relative range is empty; give (least, largest)"
             )
-        least, largest = sorted((one.value * (1.0 - share), one.value * (1.0 + share)))
+        least, largest = sorted((one.value * (1.0 - relative), one.value * (1.0 + relative)))
     expected = "" if least < largest else "least < largest"
     if least < 0.0 and one.part in ("stiffness", "damping"):
         expected = "values of 0 or more"
@@ -352,10 +350,10 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
                 "range, such as 0.2 for 20 %"
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
-    share = abs(float(value))
+    relative = abs(float(value))
     # Of what is below 0 too, more is further from 0.
-    scaled = (each._replace(half=share * each.parameter.value) for each in ranges)
-    return Block(key, "1", 1.0, share, tuple(scaled))
+    scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
+    return Block(key, "1", 1.0, relative, tuple(scaled))
 
 
 def _lft(of: Uncertain, lin: Any) -> LFT:

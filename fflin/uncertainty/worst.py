@@ -226,8 +226,8 @@ def _climbed(figures: Figures, start: Array, makes: Callable[[Array], bool]) -> 
         if not np.isfinite(value):
             break
         around = quick(np.vstack((delta + _DIFFERENCE * unit, delta)))
-        slope = np.nan_to_num(around[:-1] - around[-1], posinf=1.0)
-        steps = _LENGTHS[:, None] * slope / max(np.abs(slope).max(), 1e-300)
+        gradient = np.nan_to_num(around[:-1] - around[-1], posinf=1.0)
+        steps = _LENGTHS[:, None] * gradient / max(np.abs(gradient).max(), 1e-300)
         alone = [np.where(unit, end, delta) for end in (-1.0, 1.0)]
         trials = np.vstack((np.clip(delta + steps, -1.0, 1.0), *alone))
         held = islice(filter(makes, trials[np.argsort(-quick(trials))]), _HELD)

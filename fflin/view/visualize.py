@@ -11,7 +11,7 @@ from warnings import warn
 
 from fflin.base.errors import FflinWarning, FileError, InputError
 from fflin.base.validation import Array, instance, number, truth, whole
-from fflin.base.writing import as_path, check_distinct, check_place, write_whole
+from fflin.base.writing import as_path, check_distinct, check_output_path, write_atomically
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.points import start_of
 from fflin.dynamics.state import StateMap
@@ -199,7 +199,7 @@ def visualize(
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
     shown = outputs.get(".html") if outputs else _temporary(robot.name)
-    write_whole(contents | ({shown: page.encode()} if shown else {}))
+    write_atomically(contents | ({shown: page.encode()} if shown else {}))
     if shown and (not outputs if opened is None else opened):
         import webbrowser
 
@@ -224,7 +224,7 @@ def check_outputs(files: dict[str, Any]) -> dict[str, Path]:
         path = as_path(file)
         if path.suffix.lower() != ending:
             raise FileError(f"'{path}' ends in '{path.suffix}', expected {ending}")
-        check_place(path)
+        check_output_path(path)
         outputs[ending] = path
     check_distinct(*outputs.values())
     if ".png" in outputs or ".gif" in outputs:

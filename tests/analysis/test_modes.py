@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 import fflin
 from fflin.analysis.modes import energy_by_body
 from fflin.commands import cli
-from fflin.commands.model_text import model_report
+from fflin.commands.models import model_report
 from tests.support.messages import hear_lines, says
 from tests.support.robots import BUNDLED, FRAMES, random_point, random_pose
 

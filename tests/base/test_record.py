@@ -196,8 +196,8 @@ def test_the_digest_is_what_the_documents_say(tmp_path):
     for ending in (".npz", ".mat", ".json", ".csv"):
         made("model").save(tmp_path / f"x{ending}")
     text = (tmp_path / "x.json").read_text()
-    body, _, seal = text.partition(',\n"sha256": "')
-    assert seal == hashlib.sha256(body.encode()).hexdigest() + '"\n}\n'
+    body, _, checksum = text.partition(',\n"sha256": "')
+    assert checksum == hashlib.sha256(body.encode()).hexdigest() + '"\n}\n'
     data = (tmp_path / "x.mat").read_bytes()
     assert data[:116].split()[-1].decode() == hashlib.sha256(data[116:]).hexdigest()
     with np.load(tmp_path / "x.npz") as file:

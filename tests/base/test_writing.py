@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.base.writing import check_place, reason, replacing, write_whole
+from fflin.base.writing import check_output_path, reason, replacing, write_atomically
 from fflin.robot.catalog import bundled_directory
 from tests.support.commands import run
 from tests.support.messages import says
@@ -211,7 +211,7 @@ def test_two_outputs_of_one_name_are_refused_before_work(
 
 def test_a_device_is_refused():
     with pytest.raises(fflin.FileError, match="regular file"):
-        write_whole({Path("/dev/null"): b"x"})
+        write_atomically({Path("/dev/null"): b"x"})
     assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
 
 
@@ -223,14 +223,14 @@ def test_whatever_fails_leaves_all_as_it_was(tmp_path):
         raise ZeroDivisionError
     assert old.read_text() == "old" and list(tmp_path.iterdir()) == [old]
     with pytest.raises(fflin.FileError, match="File name too long") as caught:
-        check_place(tmp_path / ("a" * 5000 + ".npz"))
+        check_output_path(tmp_path / ("a" * 5000 + ".npz"))
     assert len(str(caught.value)) < 400
     with pytest.raises(fflin.FileError, match="folder"):
-        check_place(tmp_path / "none" / "x.npz")
+        check_output_path(tmp_path / "none" / "x.npz")
     loop = tmp_path / "loop.npz"
     loop.symlink_to(loop)
     with pytest.raises(fflin.FileError, match="written"):
-        check_place(loop)
+        check_output_path(loop)
 
 
 _LIMITED = """

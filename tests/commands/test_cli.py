@@ -15,7 +15,7 @@ import pytest
 import fflin
 from fflin.base.tables import matrix
 from fflin.commands import cli
-from fflin.commands.arguments import ROBOT
+from fflin.commands.parser import ROBOT
 from fflin.robot.catalog import bundled_directory
 from tests.support.commands import refused, run, without_warnings
 from tests.support.messages import says

@@ -6,7 +6,7 @@ import os
 import pytest
 
 from fflin.commands import cli
-from fflin.commands.arguments import OutputFile, input_file, input_name
+from fflin.commands.parser import OutputFile, input_file, input_name
 from tests.support.commands import run
 from tests.support.messages import any_wording
 

@@ -311,7 +311,7 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     shooting.steps = 64
     q, v, u = shooting.guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
     q, v = shooting.flown((q[0], v[0]), u)
-    A, B, D, inside = shooting.slopes(q, v, u, 4)
+    A, B, D, inside = shooting.jacobians(q, v, u, 4)
     h, nx = 1e-5, A.shape[1]
 
     def ends(z, du):
@@ -344,7 +344,7 @@ def test_a_plan_meets_the_conditions_of_optimality(cube):
     motion = fflin.plan(robot, (goal, None), 6.0, knots=21)
     shooting = Shooting(robot, motion.t, True)
     shooting.steps = 16
-    A, B, *_ = shooting.slopes(motion.q, motion.v, motion.u)
+    A, B, *_ = shooting.jacobians(motion.q, motion.v, motion.u)
     size, reach, maps = np.repeat([1e-3, 1.0], 3), np.eye(A.shape[1]), []
     for k in range(19, -1, -1):
         maps.append((reach @ B[k] * size).T)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog, lsq_linear
 
-from fflin.control.policies import gives_every_wrench, nearest
+from fflin.control.authority import gives_every_wrench
 from fflin.kernel import allocation
+from fflin.kernel.allocation import nearest
 
 
 @pytest.mark.parametrize("seed", range(40))

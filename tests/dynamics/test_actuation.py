@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.commands.model_text import model_report
+from fflin.commands.models import model_report
 from tests.support.robots import FRAMES, random_point, random_pose, random_tree
 
 THRUSTERS = (

@@ -4,8 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from fflin.control.channel import channel_of
-from fflin.control.saturation import Saturation
+from fflin.control.channel import Saturation, channel_of
 from fflin.kernel import channel as rules
 from fflin.kernel.allocation import LEAST, least_squares, solve
 from fflin.kernel.channel import Pulses, Wheels

@@ -232,8 +232,41 @@ def test_what_is_saved_is_read_to_the_last_bit(loop, tmp_path, ending):
     for name in ("t", "q", "v", "u"):
         assert (getattr(again, name) == getattr(along, name)).all()
     assert (again.hold, again.frame) == ("previous", "hybrid")
-    assert again.verified == (ending != "csv")
-    assert ("not verified" in str(again)) == (ending == "csv")
+    assert again.verified and "not verified" not in str(again)
+
+
+def test_a_changed_csv_is_refused_and_one_of_another_program_is_not_verified(loop, tmp_path):
+    robot, run = loop
+    path = tmp_path / "a.csv"
+    along = run(sample=0.1, every=10).trajectory()
+    along.save(path)
+    lines = path.read_text().splitlines()
+    header, rows = lines[0].split(","), [line.split(",") for line in lines[1:]]
+    assert header[-1] == "sha256" and {len(row[-1]) for row in rows} == {64}
+
+    def load(*table):
+        path.write_text("\n".join(map(",".join, table)) + "\n")
+        return fflin.Trajectory.load(path, robot)
+
+    assert load(header, *rows).verified
+    row, at = rows[3], header.index("v[8]")
+    changed = [*row[:at], repr(2.0 * float(row[at])), *row[at + 1 :]]
+    swapped = [*header[:at], header[at + 1], header[at], *header[at + 2 :]]
+    refused = r"a\.csv.*does not match its sha256.*delete the column sha256"
+    for table in (
+        (header, *rows[:3], changed, *rows[4:]),
+        (header, *rows[:3], [*row[:-1], ""], *rows[4:]),
+        (header, *rows[:-1]),
+        (header,),
+        (swapped, *rows),
+    ):
+        with pytest.raises(fflin.FileError, match=refused):
+            load(*table)
+    foreign = load(*(each[:-1] for each in (header, *rows[:3], changed, *rows[4:])))
+    assert "not verified" in str(foreign) and foreign.v[3, 8] == 2.0 * along.v[3, 8]
+    foreign.save(path)
+    assert "sha256" not in path.read_text()
+    assert not fflin.Trajectory.load(path, robot).verified
 
 
 def test_files_of_other_programs_are_read(loop, tmp_path):

@@ -376,6 +376,32 @@ def test_wheels_come_and_go_with_the_inputs():
     assert fflin.load("servicer_7dof", lock=["panel_left"], inputs=robot.inputs[:6]).n == 8
 
 
+def test_a_q_or_v_from_before_the_inputs_were_replaced_names_the_wheels_that_left():
+    robot = fflin.load("planar_detumble")
+    wheels = [ReactionWheel((1, 0, 0), inertia=0.01, name=name) for name in ("roll", "pitch")]
+    full = robot.replace(inputs=[*robot.inputs, *wheels])
+    left = full.replace(inputs=robot.inputs)
+    kept = full.replace(inputs=[*robot.inputs, wheels[1]])
+    q, v = full.neutral(), np.zeros(full.nv)
+    both = "the coordinates roll, pitch left with the replaced inputs or appendages"
+    for call in (
+        lambda: fflin.linearize(left, q),
+        lambda: fflin.linearize(left, v=v),
+        lambda: fflin.simulate(left, q0=q, duration=1.0),
+        lambda: fflin.StateMap(left).to_state(q, v),
+        lambda: fflin.linearize(left.replace(inputs=robot.inputs[:2]), q),
+    ):
+        with pytest.raises(fflin.InputError, match=rf"(q|v)0? has shape .*{both}"):
+            call()
+    with pytest.raises(fflin.InputError, match="the coordinates roll left with"):
+        fflin.linearize(kept, q)
+    for other, wrong in ((robot, q), (full, np.append(q, 0.0)), (left, q[:5])):
+        with pytest.raises(fflin.InputError, match=r"has shape") as error:
+            fflin.linearize(other, wrong)
+        assert "left with" not in str(error.value)
+    assert fflin.linearize(left.replace(inputs=full.inputs), q).A.shape[0] == 2 * (6 + full.n)
+
+
 def test_wheels_are_shown_and_named():
     robot, speeds = spinning(fflin.load("servicer_7dof"))
     rows = [line.split() for line in robot_info(robot).splitlines()]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.control.policies import thrusters_give_every_wrench
+from fflin.control.authority import thrusters_give_every_wrench
 from fflin.simulation.times import time_to_settle
 
 

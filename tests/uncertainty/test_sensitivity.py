@@ -235,8 +235,8 @@ def test_its_own_check_finds_it_right_and_what_is_wrong_wrong():
     S = fflin.sensitivity(fflin.linearize(robot, q, v))
     names = ["link_2.mass", "base.com.x", "link_4.inertia.xy"]
     assert max(S.check(names).values()) < 1e-7
-    S._slopes._of_bodies.by_q_m[:] *= 1.001
-    S._slopes._of_bodies.by_u[:] *= 1.001
+    S._derivatives._of_bodies.by_q_m[:] *= 1.001
+    S._derivatives._of_bodies.by_u[:] *= 1.001
     assert min(S.check(names).values()) > 1e-6
 
 

@@ -17,8 +17,8 @@ from fflin.dynamics.state import StateMap
 _ENDS = 1e-8
 
 # A state is limited at points within an interval once an iterate exceeds its limit there by the
-# first share of it. The limit is tightened by the second share, since the motion may exceed it
-# between these points.
+# first fraction of it. The limit is tightened by the second fraction, since the motion may exceed
+# it between these points.
 _LIMITED, _TIGHTER = 0.002, 0.005
 
 # Intervals are flown as one motion where they miss each other by no more.
@@ -30,7 +30,7 @@ _NEARLY = 1e-3
 # Accuracy of the ends of intervals during the search, and at its end.
 _SEEKS, _FLIES = 1e-6, 1e-8
 
-# Iterations go on until one would save less than this share of the effort, or so often.
+# Iterations go on until one would save less than this fraction of the effort, or so often.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 
 # What a step of wheels costs beside others, as they may take any.
@@ -100,17 +100,17 @@ class Search(NamedTuple):
             z, du, y, outside = step
             # What the multipliers say that it costs to miss (Powell).
             price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
-            was, share = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
+            was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
             saved = was - merit(trial.u + du, 0.0 * trial.missed, outside)
             for _ in range(_MOST_HALVINGS):
-                new = np.clip(trial.u + share * du, *self.limits)
-                there = self._trial(*shooting.moved(trial.q, trial.v, share * z), new)
+                new = np.clip(trial.u + fraction * du, *self.limits)
+                there = self._trial(*shooting.moved(trial.q, trial.v, fraction * z), new)
                 after = merit(new, there.missed, there.outside(limited))
-                if was - after >= 1e-4 * share * saved:
+                if was - after >= 1e-4 * fraction * saved:
                     trial = there
                     break
-                share *= 0.5
-            near = near * (0.2 if share == 1.0 else 1.0 if share > 0.25 else 3.0)
+                fraction *= 0.5
+            near = near * (0.2 if fraction == 1.0 else 1.0 if fraction > 0.25 else 3.0)
             known, limited = limited, limited | self._exceeding(trial)
             if saved <= _SAVED * was and (limited == known).all():
                 break
@@ -150,7 +150,7 @@ class Search(NamedTuple):
         if not max(trial.outside(limited), trial.gap) < np.inf:
             return None
         try:
-            A, B, D, inside = self.shooting.slopes(trial.q, trial.v, u, self.parts)
+            A, B, D, inside = self.shooting.jacobians(trial.q, trial.v, u, self.parts)
         except InputError:  # it has diverged
             return None
         k, part, state = np.nonzero(limited)

@@ -95,7 +95,7 @@ class Shooting:
             if np.abs(missed - before).max() <= accuracy:
                 break
 
-    def slopes(
+    def jacobians(
         self, q: Array, v: Array, u: Array, parts: int = 1
     ) -> tuple[Array, Array, Array, Array]:
         """Return Jacobians of the intervals' ends over z, the input there and the next one.
@@ -108,7 +108,7 @@ class Shooting:
         steps = min(steps, _MOST_OF_JACOBIANS)
         h: Array = self.h[:, None, None] / steps
         Z = np.tile(np.eye(nx, nx + 2 * nu), (len(q) - 1, 1, 1))
-        shares, inside = np.arange(1, parts) / parts * steps, list[Array]()
+        fractions, inside = np.arange(1, parts) / parts * steps, list[Array]()
         at = list(zip(q, v, strict=True))[:-1]
 
         def rates(half: int) -> tuple[Array, Array]:
@@ -128,12 +128,14 @@ class Shooting:
             F = last, rates(2 * step + 1), rates(2 * step + 2)
             total, rate, before = np.zeros_like(Z), np.zeros_like(Z), Z
             last = F[2]
-            for i, share, weight in ((0, 0.0, 1.0), (1, 0.5, 2.0), (1, 0.5, 2.0), (2, 1.0, 1.0)):
-                rate = F[i][0] @ (Z + share * h * rate) + F[i][1]
+            for i, fraction, weight in ((0, 0.0, 1.0), (1, 0.5, 2.0), (1, 0.5, 2.0), (2, 1.0, 1.0)):
+                rate = F[i][0] @ (Z + fraction * h * rate) + F[i][1]
                 total = total + weight * rate
             Z = Z + h / 6.0 * total
             begin, end = (h * (f[0] @ z + f[1]) for f, z in ((F[0], before), (last, Z)))
-            for s in shares[(shares >= step) & (shares < step + 1)] - step:  # cubics of Hermite
+            for s in (
+                fractions[(fractions >= step) & (fractions < step + 1)] - step
+            ):  # cubics of Hermite
                 bend = (
                     s * (1.0 - s) * ((1.0 - s) * begin - s * end + (2.0 * s - 1.0) * (Z - before))
                 )

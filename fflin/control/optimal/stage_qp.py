@@ -58,7 +58,7 @@ class StageQP(NamedTuple):
     high: Array
     soft: Array  # (N + 1, nx + nu)
     rows: StageRows
-    scale: Array  # (nx + nu,), sizes that variables may have, in shares of which it is solved
+    scale: Array  # (nx + nu,), sizes that variables may have, in fractions of which it is solved
 
     def solve(self) -> StageSolution | None:
         """Return the solution; None where the hard bounds leave none, or it is not found."""

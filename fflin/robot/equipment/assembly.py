@@ -104,6 +104,11 @@ def _equipped(robot: Any, inputs: Any, appendages: Sequence[Appendage]) -> Any:
         **{"model": model, "joints": joints, "followers": followers, "inputs": checked},
         appendages=tuple(appendages),
         _unequipped=bare if parts else None,
+        _removed=tuple(
+            dict.fromkeys(
+                name for name in (*robot._removed, *robot.joint_names) if name not in names
+            )
+        ),
         **by_joint,
     )
 

@@ -1,0 +1,285 @@
+"""Parser of the command line: commands, groups of options, and readers of values."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import math
+import os
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
+
+from fflin.base.errors import one_line
+from fflin.commands import BAD_INPUT
+
+if TYPE_CHECKING:
+    from fflin.commands.results import Report
+
+Commands: TypeAlias = "argparse._SubParsersAction[Command]"
+
+# Titles of groups of options in the help. Those of ROBOT repeat settings of a robot.toml.
+POINT, ROBOT, OUTPUT = "operating point", "robot, in place of robot.toml", "output"
+TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
+
+
+def number(text: str) -> float:
+    """Read a finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number") from None
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a finite number")
+    return value
+
+
+def whole(text: str) -> int:
+    """Read a non-negative integer."""
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a non-negative integer")
+    return int(text)
+
+
+def count_of(text: str) -> int:
+    """Read a positive integer."""
+    if not (count := whole(text)):
+        raise argparse.ArgumentTypeError("0 is too small, expected 1 or more")
+    return count
+
+
+def input_file(text: str) -> Path:
+    """Read the path of an input file."""
+    if not text:
+        raise argparse.ArgumentTypeError("the file name is empty, expected a path")
+    return Path(text)
+
+
+def input_name(text: str) -> str:
+    """Read the path of an input file, or a bundled name."""
+    return text
+
+
+@dataclass(frozen=True)
+class OutputFile:
+    """Reader of the path of an output file, with the endings that it may have."""
+
+    endings: tuple[str, ...]
+
+    def __call__(self, text: str) -> Path:
+        """Read the path."""
+        return input_file(text)
+
+    def __str__(self) -> str:
+        *first, last = self.endings
+        return f"{', '.join(first)} or {last}" if first else last
+
+
+RECORD, TABLE = OutputFile((".npz", ".mat", ".json")), OutputFile((".npz", ".mat", ".json", ".csv"))
+ROWS, FIGURE = OutputFile((".npz", ".h5")), OutputFile((".png", ".pdf", ".svg"))
+PAGE, PICTURE, ANIMATION = (OutputFile((f".{ending}",)) for ending in ("html", "png", "gif"))
+
+
+def assignment(text: str) -> tuple[str, float]:
+    """Read NAME=VALUE."""
+    name, separator, value = text.rpartition("=")
+    if not separator or not name:
+        raise argparse.ArgumentTypeError(f"'{text}' is not of the form NAME=VALUE")
+    return name, number(value)
+
+
+def joint_or_all(text: str) -> tuple[str | None, float | str]:
+    """Read NAME=VALUE, or VALUE or urdf for all joints (name None)."""
+    if "=" in text:
+        return assignment(text)
+    return None, text if text == "urdf" else number(text)
+
+
+def orbit(text: str) -> dict[str, float | str]:
+    """Read ALTITUDE or ALTITUDE:BODY."""
+    altitude, _, body = text.partition(":")
+    return {"altitude": number(altitude), "body": body or "earth"}
+
+
+def lock(text: str) -> tuple[str, float | None]:
+    """Read NAME=VALUE, or NAME for the neutral position (value None)."""
+    return assignment(text) if "=" in text else (text, None)
+
+
+_REPEATABLE = " (repeatable)"
+# Types of Python that `Group.add` takes in place of a reader.
+_READERS: dict[Any, Callable[[str], Any]] = {float: number, int: count_of, Path: input_file}
+_METAVARS: dict[Any, str] = {
+    input_file: "FILE",
+    input_name: "FILE.toml",
+    assignment: "NAME=VALUE",
+    joint_or_all: "[NAME=]VALUE",
+    lock: "NAME[=VALUE]",
+    orbit: "ALTITUDE[:BODY]",
+    count_of: "N",
+}
+
+
+class Group(argparse._ArgumentGroup):
+    """Group of options of a command."""
+
+    def add(
+        self,
+        name: str,
+        help: str,
+        type: Callable[[str], Any] = str,
+        metavar: str | tuple[str, ...] | None = None,
+        *,
+        default: object = None,
+        repeatable: bool = False,
+        **more: Any,
+    ) -> None:
+        """Add an option with a value.
+
+        The type float reads a finite number, int a positive integer, and Path the name of an input
+        file. A tuple `metavar` takes as many values. The help states the default of a number.
+        """
+        reader = _READERS.get(type, type)
+        if repeatable:
+            more |= {"action": "append", "default": []}
+            help += _REPEATABLE
+        else:
+            more["default"] = default
+        if default is not None and reader in (number, whole, count_of):
+            help = f"{help}; {default:g} by default"
+        if isinstance(metavar, tuple):
+            more["nargs"] = len(metavar)
+        if "choices" not in more or metavar:
+            file = "FILE" if isinstance(reader, OutputFile) else None
+            more["metavar"] = metavar or _METAVARS.get(reader, file)
+        self.add_argument(name, help=help, type=reader, **more)
+
+    def switch(self, name: str, help: str) -> None:
+        """Add an option without a value."""
+        self.add_argument(name, help=help, action="store_true")
+
+    def yes_or_no(self, name: str, help: str) -> None:
+        """Add the options --NAME and --no-NAME; the value is None without them."""
+        self.add_argument(name, help=help, action=argparse.BooleanOptionalAction)
+
+
+class Command(argparse.ArgumentParser):
+    """Parser of a command; its errors are one line."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        # A negative number such as -1e-3 is a value, not an option.
+        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+
+    def group(self, title: str, description: str | None = None) -> Group:
+        """Return the group of options with this title; the first call creates it."""
+        for group in self._action_groups:
+            if isinstance(group, Group) and group.title == title:
+                return group
+        group = Group(self, title, description)
+        self._action_groups.append(group)
+        return group
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        # argparse ignores errors when it writes a help.
+        if file is not None:
+            file.write(message)
+            file.flush()
+
+    def error(self, message: str) -> NoReturn:
+        """Report wrong arguments in one line, and exit."""
+        print_error(f"fflin: error: {message} (see {self.prog} --help)")
+        self.exit(BAD_INPUT)
+
+
+def print_error(line: str) -> None:
+    """Write a line to stderr; if stderr is closed, the exit code is the only report."""
+    try:
+        print(one_line(line), file=sys.stderr, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+
+
+def command(
+    commands: Commands,
+    name: str,
+    run: Callable[[argparse.Namespace], Report],
+    summary: str,
+    *,
+    example: str,
+    common: str = "",
+) -> Command:
+    """Add a command and its option --json.
+
+    Its help ends with `example`. ``--help`` lists the `common` options and --json, by default all
+    options.
+    """
+    command = commands.add_parser(
+        name,
+        add_help=False,
+        help=summary,
+        description=f"{summary[0].upper()}{summary[1:]}.",
+        epilog=f"example: {example}",
+    )
+    about = "show the common options; --help all describes every option"
+    command.add_argument("-h", "--help", nargs="?", metavar="all", action=_Help, help=about)
+    command.set_defaults(run=run, command=command, common=[*common.split(), "json"] * bool(common))
+    command.group(OUTPUT).switch("--json", "print the results as one JSON object")
+    return command
+
+
+class _Help(argparse.Action):
+    """Option that prints the short help, or the full help if its value is `all`."""
+
+    def __call__(self, parser: argparse.ArgumentParser, _: Any, value: Any, *__: Any) -> None:
+        text = parser.format_help() if value == "all" else short_help(parser)
+        parser._print_message(text, sys.stdout)
+        parser.exit()
+
+
+def short_help(command: argparse.ArgumentParser) -> str:
+    """Return the help of a command with the first sentence about each common option."""
+    arguments = [each for each in command._actions if not each.option_strings]
+    every = [each for each in command._actions if each.option_strings]
+    options = {each.dest: each for each in reversed(every)}  # a former name comes second
+    del options["help"]
+    common = [name.replace("-", "_") for name in command.get_default("common")] or list(options)
+    formatter = argparse.HelpFormatter(command.prog, max_help_position=30)
+    operands = " ".join(str(each.metavar) for each in arguments)
+    formatter.add_text(" ".join(f"usage: {command.prog} {operands} [options]".split()))
+    formatter.add_text(command.description)
+    for title, actions in (
+        ("arguments", arguments),
+        ("options", [options[name] for name in common]),
+    ):
+        formatter.start_section(title)
+        for action in actions:
+            shown, text = copy.copy(action), action.help or ""
+            first = re.split(r"; |(?<!\.)\. ", text.removesuffix(_REPEATABLE))[0]
+            shown.help = first + _REPEATABLE * text.endswith(_REPEATABLE)
+            formatter.add_argument(shown)
+        formatter.end_section()
+    formatter.add_text(command.epilog)
+    if options:
+        formatter.add_text(f"all {len(every) - 1} options in full: {command.prog} --help all")
+    return formatter.format_help()
+
+
+def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[Path]]:
+    """Return the input files and the output files that the arguments name."""
+    inputs: list[Path] = []
+    for action in arguments.command._actions:
+        value = getattr(arguments, action.dest, None)
+        if action.type in (input_file, input_name) and value is not None:
+            inputs += map(Path, value if isinstance(value, list) else [value])
+    return inputs, [path for path, _ in outputs_of(arguments)]
+
+
+def outputs_of(arguments: argparse.Namespace) -> list[tuple[Path, OutputFile]]:
+    """Return the output files that the arguments name, with their readers."""
+    actions = arguments.command._actions
+    given = ((getattr(arguments, action.dest, None), action.type) for action in actions)
+    return [(path, kind) for path, kind in given if isinstance(kind, OutputFile) and path]
