@@ -20,14 +20,13 @@ from fflin.analysis.ranks import (
     FixedPoles,
     Margin,
     Noisy,
-    Values,
     echelon,
     image,
     null_space,
     unit_columns,
 )
 from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays
+from fflin.base.validation import Array, FrozenArrays, Values
 from fflin.linear.model import LinearModel
 
 _LOOPS = (
@@ -61,15 +60,15 @@ class Controllability(FrozenArrays):
     stabilizable : bool
         Whether all fixed poles are stable.
     reach : dict
-        {"base attitude", "base position", "joints": number of independent directions}. Along each
-        of these directions the inputs can bring the state to any value, if the final values of all
-        other states are left free.
+        {"base attitude", "base position", "joints": number of independent directions}. The inputs
+        can bring the state to any value along each of these directions, with the final values of
+        all other states left free.
     method : str
         Method that determined the dimension: "closed form", "modes" or "eigenvalues".
     margin : Margin
         Certainty of the rank decisions: the smallest singular value counted as nonzero and the
-        largest counted as zero, each divided by its tolerance. If they are far above and far below
-        1, the decision is clear.
+        largest counted as zero, each divided by its tolerance. The decision is clear if the first
+        ratio is far above 1 and the second ratio far below 1.
     notes : tuple of str
         Remarks on the result, such as ranks that rounding error leaves undecided.
 
@@ -112,9 +111,10 @@ class Controllability(FrozenArrays):
 def controllability(lin: LinearModel) -> Controllability:
     r"""Determine the controllable subspace from the structure of the model.
 
-    - At rest, the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved. These momenta,
-      and the coordinates :math:`W M N^{-1} x_1` that they drive, are separated exactly. Without
-      springs and dampers nothing else is uncontrollable, and the dimension is 2 rank(B).
+    - At rest, the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved. The conserved
+      momenta and the coordinates :math:`W M N^{-1} x_1` driven by these momenta are separated
+      exactly. Without springs and dampers, all other states are controllable, and the dimension
+      is 2 rank(B).
     - With symmetric springs and dampers, the remaining part is tested in second-order form,
       :math:`M a + D v + K s = S u`, by the rank of :math:`[p^2 M + p D + K, S]` at each pole p.
       Entries within rounding error are set to zero, and each row is scaled by its entries.
@@ -122,9 +122,9 @@ def controllability(lin: LinearModel) -> Controllability:
       test is applied: the rank of :math:`[A - p E, B]` is found from its singular values, with
       states scaled to units of energy.
 
-    A sampled model has the structure of its continuous model. The exception is a vibration whose
-    period divides the sample time: sampling makes it uncontrollable. If a sampled model is loaded
-    from a file, only its sampled matrices are known, and these are analysed.
+    A sampled model has the structure of its continuous model, with one exception: sampling makes
+    a vibration uncontrollable if its period divides the sample time. For a sampled model from a
+    file, only the sampled matrices are analysed.
 
     Every tolerance is a small multiple of the rounding error. `margin` compares the decisions with
     their tolerances, and `notes` lists decisions within rounding error.
@@ -147,10 +147,10 @@ def controllability(lin: LinearModel) -> Controllability:
 
     Notes
     -----
-    All inputs are assumed to act in both directions. This includes thrusters, although they can
-    only push. At a nonzero angular velocity the result applies to the model with A and B frozen at
-    the point. It does not prove that the motion is controllable. At nonzero velocity, poles with a
-    modulus below about 1e-8 times the largest modulus are treated as zero.
+    All inputs, including thrusters, are assumed to act in both directions. At a nonzero angular
+    velocity, the result applies to the model with A and B frozen at the point. Such a result does
+    not prove that the motion is controllable. At nonzero velocity, poles with a modulus below
+    about 1e-8 times the largest modulus are treated as zero.
 
     References
     ----------
@@ -282,6 +282,6 @@ def _notes(
         notes.append("fflin.momentum_reduction removes the conserved momenta")
     if not lin.is_equilibrium():
         notes.append(
-            "the operating point is not an equilibrium; the result holds for the frozen A and B"
+            "the operating point is not an equilibrium; the result is valid for the frozen A and B"
         )
     return tuple(notes)

@@ -39,7 +39,7 @@ class EffectiveMasses(FrozenArrays):
     free : ndarray (6, 6)
         Part of the inertia that joints without a spring do not transmit to the base.
     residual : ndarray (6, 6)
-        Inertia that the base feels if all joints are free to move.
+        Apparent inertia of the base if all joints are free to move.
     total : ndarray (6, 6)
         Inertia of the rigid robot, the sum of all parts.
     robot : str
@@ -95,8 +95,9 @@ class EffectiveMasses(FrozenArrays):
 def effective_masses(lin: LinearModel) -> EffectiveMasses:
     r"""Return the effective masses of a robot's vibration modes with its base clamped.
 
-    K contains the joint springs, and M is in base axes, base before joints. Joints without a spring
-    are condensed out of M, which gives :math:`\tilde M`. With the base at rest the modes are
+    K is the stiffness of the joint springs. M is the mass matrix in base axes, with the base
+    before the joints. Joints without a spring are condensed out of M, which gives :math:`\tilde
+    M`. With the base at rest the modes are
 
     .. math::
         K \phi_i = \omega_i^2 \tilde M_{mm} \phi_i, \qquad \phi_i^T \tilde M_{mm} \phi_i = 1,
@@ -111,9 +112,9 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
         \textstyle\sum_i L_i L_i^T + M_{free} + M_{res} = M_{bb}, \qquad
         M_{res} = M_{bb} - M_{bm} M_{mm}^{-1} M_{mb}.
 
-    With a free base, the natural frequencies are higher; `modes` lists them. If several modes have
-    the same frequency, only the sum of their masses is unique; the first of them is given the
-    largest possible mass.
+    With a free base, the natural frequencies are higher, as listed by `modes`. If several modes
+    have the same frequency, only the sum of their masses is unique. The first of these modes is
+    then given the largest possible mass.
 
     Parameters
     ----------
@@ -129,7 +130,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     Raises
     ------
     InputError
-        If the model is reduced or was loaded from a file. Such a model lacks the robot's springs.
+        If the model is reduced or was loaded from a file, and therefore lacks the robot's
+        springs.
     ModelError
         If the robot's model was changed after the linear model was made.
 

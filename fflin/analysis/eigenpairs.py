@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fflin.analysis.mechanics import warn_of_stiffness
-from fflin.analysis.ranks import EPS, Values
-from fflin.base.validation import Array
+from fflin.analysis.ranks import EPS
+from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
 # A stiffness less than this part of the largest, both scaled to unit inertias, counts as zero:

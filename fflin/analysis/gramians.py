@@ -44,12 +44,13 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
 
     .. math::
         W_c = \int_0^T e^{A t} B B^T e^{A^T t}\,dt, \quad
-        W_o = \int_0^T e^{A^T t} C^T C e^{A t}\,dt,
+        W_o = \int_0^T e^{A^T t} C^T C e^{A t}\,dt.
 
-    or, for a sampled model, the sums over its samples. For an infinite horizon, the Gramians solve
-    Lyapunov equations. For a finite horizon T, they are polynomials in T if :math:`A^2 = 0`, as at
-    rest without springs. Otherwise they are computed for a short horizon, which is then doubled
-    repeatedly, :math:`W(2 t) = W(t) + e^{A t} W(t) e^{A^T t}`.
+    The Gramians of a sampled model are sums over its samples. For an infinite horizon, the
+    Gramians solve Lyapunov equations. For a finite horizon T, the Gramians are polynomials in T
+    if :math:`A^2 = 0`, as at rest without springs. In all other cases, the Gramians are computed
+    for a short horizon, which is then doubled repeatedly, :math:`W(2 t) = W(t) + e^{A t} W(t)
+    e^{A^T t}`.
 
     Parameters
     ----------

@@ -17,7 +17,6 @@ from fflin.analysis.ranks import (
     FixedPoles,
     Margin,
     Noisy,
-    Values,
     decided,
     image,
     judged,
@@ -26,7 +25,7 @@ from fflin.analysis.ranks import (
     stacked,
     unit_columns,
 )
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 
 # A singular value above _SUSPICIOUS is not zero. Only eigenvectors whose product with inputs of
 # unit length is smaller, or whose eigenvalue has a neighbour this near, need a singular value.

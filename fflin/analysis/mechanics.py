@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,14 +13,13 @@ from fflin.analysis.ranks import (
     EPS,
     Margin,
     Noisy,
-    Values,
     echelon,
     null_space,
     stacked,
     without_rounding,
 )
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.validation import Array, instance
+from fflin.base.validation import Array, Values, instance
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
@@ -62,9 +61,9 @@ def warn_of_stiffness(lin: LinearModel) -> None:
     fastest = float((np.abs(rate_matrix(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
     if 0.0 < lin.mean_motion < _SLOWEST * fastest:
         warnings.warn(
-            f"orbital effects on '{lin.robot}' at {lin.mean_motion:.3g} rad/s are within the "
-            f"rounding error of joint vibrations at {fastest:.3g} rad/s, and the result may miss "
-            "them; lock these joints",
+            f"orbital effects on '{lin.robot}' at {lin.mean_motion:.3g} rad/s are smaller than the "
+            f"rounding error of joint vibrations at {fastest:.3g} rad/s, so that the result may "
+            "miss the orbital effects; lock these joints",
             FflinWarning,
             stacklevel=4,
         )
@@ -80,7 +79,7 @@ def rate_matrix(lin: LinearModel) -> Array:
     return (lin.A - np.eye(len(lin.A))) / lin.dt if lin.dt else lin.A
 
 
-def floating_inertia(M: Array, kept: Any, others: Any) -> Array:
+def floating_inertia(M: Array, kept: NDArray[np.intp], others: NDArray[np.intp]) -> Array:
     """Return what coordinates feel while the others float: the Schur complement of M."""
     across = M[np.ix_(others, kept)]
     return M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(others, others)], across)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -14,7 +14,7 @@ from fflin.analysis.eigenpairs import natural_modes
 from fflin.analysis.reduction import ReducedModel
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, grid, width
-from fflin.base.validation import Array, FrozenArrays, instance
+from fflin.base.validation import Array, Complex, FrozenArrays, instance
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
@@ -22,8 +22,6 @@ from fflin.robot.equipment.appendage_bodies import effective_shares
 from fflin.robot.joints import ROOT
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from fflin.robot.robot import Robot
 
 
@@ -42,12 +40,12 @@ class Mode(FrozenArrays):
     margin : float
         Real part of the pole as a multiple of its rounding error; infinite if that error is zero.
     strain : mapping of str to float
-        Fraction of the mode's elastic energy in the spring of each joint, the largest first. Empty
-        if there are no springs, or for a model loaded from a file.
+        Fraction of the mode's elastic energy in the spring of each joint, the largest first. The
+        mapping is empty without springs, or if the model was loaded from a file.
     energy : mapping of str to float
         Fraction of the mode's kinetic energy in each body, the largest first. The fractions are
         nonnegative and sum to 1. A body is named after the joint that carries it; the root body is
-        "base". Empty for a model loaded from a file, which lacks the bodies.
+        "base". The mapping is empty if the model was loaded from a file.
 
     Notes
     -----
@@ -73,7 +71,7 @@ class Mode(FrozenArrays):
     """
 
     pole: complex
-    shape: NDArray[np.complexfloating[Any]]
+    shape: Complex
     unstable: bool
     margin: float
     energy: Mapping[str, float]
@@ -178,7 +176,7 @@ class Modes:
         return (*undecided, "a model from a file lacks the kinetic energies of the bodies")
 
     @property
-    def poles(self) -> NDArray[np.complexfloating[Any]]:
+    def poles(self) -> Complex:
         """All nx eigenvalues of A [rad/s], including zeros and conjugates."""
         listed = [0j] * self.zero_eigenvalues
         for mode in self.modes:
@@ -253,16 +251,16 @@ class Modes:
 def modes(lin: LinearModel) -> Modes:
     r"""Compute the natural modes of a linear model.
 
-    At rest, if a symmetric stiffness is the only force, these are the modes of the free-floating
-    structure:
+    At rest, with a symmetric stiffness as the only force, the result contains the modes of the
+    free-floating structure:
 
     .. math::
-        K \phi = \omega^2 M^* \phi, \qquad M^* = ((M^{-1})_{EE})^{-1},
+        K \phi = \omega^2 M^* \phi, \qquad M^* = ((M^{-1})_{EE})^{-1}.
 
-    over the coordinates E on which the stiffness K acts. M* is a Schur complement of M: the
-    effective inertia of the coordinates E if all other coordinates are free to move. In all other
-    cases the modes are the eigenvectors of A. The zero eigenvalues form Jordan blocks of size two
-    or more. They are separated exactly from the other eigenvalues.
+    E are the coordinates on which the stiffness K acts. M* is a Schur complement of M: the
+    effective inertia of the coordinates E if all other coordinates are free to move. With other
+    forces or motion, the modes are the eigenvectors of A. The zero eigenvalues form Jordan blocks
+    of size two or more, and are separated exactly from the other eigenvalues.
 
     Parameters
     ----------
@@ -342,7 +340,7 @@ def _percents(energy: Mapping[str, float], room: int) -> str:
 
 
 def energy_by_body(
-    robot: Robot | None, lin: LinearModel, shapes: Sequence[Any]
+    robot: Robot | None, lin: LinearModel, shapes: Sequence[Complex]
 ) -> list[Mapping[str, float]]:
     """Return {body: fraction of the kinetic energy} of shapes (nx,), see `Mode`.
 
@@ -370,7 +368,7 @@ def energy_by_body(
 
 
 def strain_by_joint(
-    robot: Robot | None, lin: LinearModel, shapes: Sequence[Any]
+    robot: Robot | None, lin: LinearModel, shapes: Sequence[Complex]
 ) -> list[Mapping[str, float]]:
     """Return {joint: fraction of the elastic energy} of shapes (nx,), see `Mode`."""
     if robot is None:
@@ -387,7 +385,7 @@ def strain_by_joint(
     return found
 
 
-def displacement(lin: LinearModel, chart: Chart, shape: Any) -> Any:
+def displacement(lin: LinearModel, chart: Chart, shape: Complex) -> Complex:
     """Return the displacements (6 + n,) of a shape: rotation and translation in base axes."""
     moved = shape[: len(shape) // 2]
     if isinstance(lin, ReducedModel):

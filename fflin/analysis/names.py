@@ -5,8 +5,8 @@ import re
 import numpy as np
 
 from fflin.analysis.mechanics import ConservedMomenta
-from fflin.analysis.ranks import Margin, Values
-from fflin.base.validation import Array
+from fflin.analysis.ranks import Margin
+from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
 # Of each group of velocities: its momenta, and the coordinates that these drive.
@@ -98,7 +98,7 @@ def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
     """Say where rounding decides whether the slowest motion decays."""
     return tuple(
         f"undecided: whether {shape(lin, at)} decays by itself; its decay rate "
-        f"is {ratio:.1g} times its rounding error; the model is {what} or not {what}"
+        f"is {ratio:.1g} times its rounding error; the model may or may not be {what}"
         for ratio, at, _ in settling.doubts
     )
 

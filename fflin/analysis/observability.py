@@ -7,9 +7,9 @@ import numpy as np
 from fflin.analysis import mechanics
 from fflin.analysis.hautus import split_by_poles, unobservable
 from fflin.analysis.names import combination, undecided, unsettled, with_rates
-from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, Values, echelon, without_rounding
+from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, echelon, without_rounding
 from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays
+from fflin.base.validation import Array, FrozenArrays, Values
 from fflin.linear.model import LinearModel
 
 
@@ -76,7 +76,8 @@ def observability(lin: LinearModel) -> Observability:
     space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. All poles p = 0 are tested
     together. At nonzero velocity, observability is tested as the controllability of the dual pair
     :math:`(A^T, C^T)`, with states scaled to units of energy, as in `controllability`. The
-    unobservable subspace is the orthogonal complement of the controllable subspace of this pair.
+    unobservable subspace is the orthogonal complement of the controllable subspace of the dual
+    pair.
 
     Parameters
     ----------

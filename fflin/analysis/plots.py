@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fflin.analysis.modes import Mode, Modes
-from fflin.analysis.ranks import Values
 from fflin.base.figures import COLORS, drawing, letters_of
 from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted, rounding
-from fflin.base.validation import instance
+from fflin.base.validation import Values, instance
 from fflin.linear.check import Check, Row
 from fflin.linear.model import LinearModel
 
@@ -36,7 +35,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     lin : LinearModel
         Model to draw.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
 
     Examples
     --------
@@ -81,7 +80,14 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def _name(axes: Axes, side: str, names: Sequence[str], keys: Any, units: Any, size: float) -> None:
+def _name(
+    axes: Axes,
+    side: str,
+    names: Sequence[str],
+    keys: Sequence[str],
+    units: Sequence[str],
+    size: float,
+) -> None:
     """Name rows ("y") or columns ("x") on one side and their groups on the other, with lines."""
     across = side == "x"
     axis = axes.xaxis if across else axes.yaxis
@@ -107,7 +113,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     modes : Modes
         Result of `fflin.modes`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
 
     Examples
     --------
@@ -194,7 +200,7 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     check : Check
         Result of `fflin.check`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
 
     Examples
     --------

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    Values: TypeAlias = NDArray[np.inexact[Any]]  # real or complex
-else:
-    Values = np.ndarray
 
 EPS = float(np.finfo(float).eps)
 

@@ -81,22 +81,24 @@ class ReducedModel(LinearModel):
 def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) -> ReducedModel:
     r"""Remove the conserved momenta from a model, exactly.
 
-    A momentum :math:`W M \nu` that no input, spring or damper changes stays zero if it starts at
-    zero. The reduction removes it, and the coordinate that it drives. For an unactuated base these
-    are all six momenta, and with :math:`G = -M_{bb}^{-1} M_{bm}`
+    A conserved momentum :math:`W M \nu`, which no input, spring or damper changes, stays zero if
+    its initial value is zero. The reduction removes each conserved momentum and the coordinate
+    driven by this momentum. For an unactuated base, all six momenta are removed. With :math:`G =
+    -M_{bb}^{-1} M_{bm}`, the reduced model is
 
     .. math::
         \nu_b = G \dot q_m, \quad M^* \ddot q_m = \tau_m - K q_m - D \dot q_m, \quad
         M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}.
 
-    These are equations (9.2) and (9.3) of docs/derivation.md.
+    See equations (9.2) and (9.3) of docs/derivation.md.
 
-    If inputs act on the attitude or on the position of the base, the states of this coordinate are
-    kept. Without springs the result is minimal; with springs it may contain vibrations that no
-    input drives. Its transfer function from inputs to joint states equals the full model's.
+    The base attitude is kept if inputs act on the attitude, and the base position if inputs act
+    on the position. Without springs, the reduced model is minimal. With springs, the reduced
+    model may contain vibrations that no input drives. The reduced and the full model have the
+    same transfer function from inputs to joint states.
 
-    Reaction wheels are removed as well, whatever their momentum (9.4), while the attitude that they
-    control is kept. Three kinds of wheels are kept with their angles:
+    Reaction wheels are also removed, even if they store momentum (9.4), but the attitude
+    controlled by wheels is kept. Three kinds of wheels are kept with their angles:
 
     - wheels whose speeds are to be controlled (9.5);
     - wheels on a carrier that rotates at the operating point;
@@ -107,21 +109,21 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     lin : LinearModel
         Model about rest, continuous or sampled.
     wheel_speeds : bool, optional
-        Whether to keep wheels whose speeds the inputs can control. By default they are kept if
-        inputs other than the wheels can rotate the base.
+        Whether to keep wheels whose speeds the inputs can control. By default, such wheels are
+        kept if other inputs can rotate the base.
 
     Returns
     -------
     ReducedModel
-        `LinearModel` with the maps ``T`` and ``S``. It has 2 r states, where r is nv minus the
-        number of conserved momenta; all states are kept if no momentum is conserved. Its ``M`` is
-        the inertia of the kept coordinates while the others are free to follow. Its outputs are the
-        outputs of `lin`, except outputs of removed wheels, for which ``T`` has zeros.
+        `LinearModel` with the maps ``T`` and ``S``. The model has 2 r states, where r is nv minus
+        the number of conserved momenta. ``M`` is the inertia of the kept coordinates, with the
+        removed coordinates free to move. The outputs are the outputs of `lin`, except that
+        outputs of removed wheels are zero, as in ``T``.
 
     Raises
     ------
     InputError
-        If the operating point drifts in a removed direction, or `lin` is not a linear model.
+        If f0 is nonzero in a removed direction, or `lin` is not a linear model.
     ModelError
         If the robot's model was changed after the linear model was made.
 
@@ -194,7 +196,7 @@ def generalized_inertia(lin: LinearModel) -> Array:
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
     if len(lin.A) != 12 + 2 * joints:
         raise InputError("the model lacks the states of the base; give the unreduced model")
-    inertia = floating_inertia(lin.M, range(6, 6 + joints), range(6))
+    inertia = floating_inertia(lin.M, np.arange(6, 6 + joints), np.arange(6))
     return (inertia + inertia.T) / 2.0
 
 
@@ -312,7 +314,10 @@ def damped_wheels(part: LinearModel) -> str:
     damped = [name for name in names if name in wheel_inputs(part)]
     if not damped:
         return ""
-    return f": wheel speeds stay in the model due to the damping of {listed(damped)}; remove it"
+    return (
+        f": the damping of {listed(damped)} keeps the wheel speeds in the model; remove this "
+        "damping"
+    )
 
 
 def rigid_forces(body: LinearModel) -> Noisy:

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, SingularInertiaError
 from fflin.base.tables import grid
-from fflin.base.validation import Array, FrozenArrays, instance
+from fflin.base.validation import Array, Complex, FrozenArrays, instance
 from fflin.dynamics.names import frame_of
 from fflin.dynamics.orbital import field_of, mean_motion
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from fflin.dynamics.state import Frame
 
 # Of the principal moments, relative to the largest: what eigenvalues and sums over bodies lose.
@@ -33,8 +31,8 @@ class RelativeEquilibrium(FrozenArrays):
     Attributes
     ----------
     q : ndarray (nq,)
-        Configuration with the centre of mass on the orbit. ``equilibrium(robot, q).u`` returns the
-        inputs that hold the joints there.
+        Configuration with the centre of mass on the orbit. ``equilibrium(robot, q).u`` returns
+        the inputs that hold the joints at q.
     moments : ndarray (3,)
         Principal moments of inertia [kg m^2] about the centre of mass: radial axis, along-track
         axis, orbit normal.
@@ -43,8 +41,8 @@ class RelativeEquilibrium(FrozenArrays):
     stable : bool or None
         Whether no pole has a positive real part; None if rounding error leaves this undecided.
     margin : float
-        Value of the smallest stability condition, divided by its rounding error. The equilibrium is
-        unstable if this is below -1, and stable if it is above 1.
+        Value of the smallest stability condition, divided by its rounding error. The equilibrium
+        is unstable if `margin` is below -1, and stable if `margin` is above 1.
 
     Examples
     --------
@@ -56,7 +54,7 @@ class RelativeEquilibrium(FrozenArrays):
 
     q: Array
     moments: Array
-    poles: NDArray[np.complexfloating[Any]]
+    poles: Complex
     stable: bool | None
     margin: float
 
@@ -90,10 +88,10 @@ def relative_equilibria(
 ) -> RelativeEquilibria:
     r"""List the attitudes in which a robot with fixed joints stays at rest in its orbital frame.
 
-    In these attitudes the principal axes of inertia are parallel to the axes of the frame, which is
-    possible in 24 ways. Let :math:`I_r, I_a, I_n` be the moments of inertia about the radial axis,
-    the along-track axis and the orbit normal. The poles of pitch solve the first of these equations
-    (14.8) of docs/derivation.md, and the poles of roll and yaw the second:
+    In each of the 24 attitudes, the principal axes of inertia are parallel to the axes of the
+    orbital frame. Let :math:`I_r, I_a, I_n` be the moments of inertia about the radial axis, the
+    along-track axis and the orbit normal. By (14.8) of docs/derivation.md, the poles
+    :math:`\lambda` of pitch, and of roll and yaw, are the roots of
 
     .. math::
         \lambda^2 = -3 n^2 (I_a - I_r)/I_n, \qquad
@@ -155,7 +153,8 @@ def relative_equilibria(
     sizes, axes = np.linalg.eigh(root.rotation.T @ data.Ig.inertia @ root.rotation)
     if sizes[0] <= _ROUNDING * sizes[2]:
         raise SingularInertiaError(
-            f"'{robot.name}' has no inertia about an axis; give it one, which linearize needs too"
+            f"'{robot.name}' has no inertia about one axis; give the link an inertia about every "
+            "axis"
         )
     n, found = mean_motion(robot), []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
@@ -171,7 +170,7 @@ def relative_equilibria(
     return RelativeEquilibria(sorted(found, key=lambda one: (-one.margin, *one.moments)))
 
 
-def _libration(moments: Array, n: float) -> tuple[NDArray[np.complexfloating[Any]], float]:
+def _libration(moments: Array, n: float) -> tuple[Complex, float]:
     """Return the poles (6,) of a body's attitude, and the least of what stability asks for."""
     radial, along, normal = moments.tolist()
     pitch = 3.0 * (along - radial) / normal

@@ -11,7 +11,7 @@ from fflin.analysis.controllability import controllability
 from fflin.analysis.mechanics import conserved
 from fflin.analysis.names import grouped, with_rates
 from fflin.analysis.observability import observability
-from fflin.analysis.ranks import Margin, Values, judged
+from fflin.analysis.ranks import Margin, judged
 from fflin.analysis.reduction import damped_wheels
 from fflin.base.errors import (
     DetectabilityError,
@@ -21,7 +21,7 @@ from fflin.base.errors import (
     StabilizabilityError,
     listed,
 )
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
 # A relative singular value of the equilibrated Popov-Belevitch-Hautus matrix below this counts as
@@ -94,15 +94,15 @@ def _conclude(
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
     """Raise `InputError` that names the modes on the boundary of stability that Q leaves out."""
-    missed = "Q has no weight on {}, which do not decay by themselves; give them weights"
+    missed = "Q has no weight on {}, which do not decay by themselves; give these states weights"
     _check_reach(lin, A.T, _root(Q), "weighted by Q", missed)
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
     """Raise `InputError` that names the modes on the boundary that no disturbance reaches."""
     missed = (
-        "W does not excite {}, which do not decay by themselves: a steady-state filter would not "
-        "correct them; give them an intensity"
+        "W does not excite {}, which do not decay by themselves, so that a steady-state filter "
+        "would not correct these states; give the noise on these states an intensity"
     )
     _check_reach(lin, lin.A, _root(W), "excited by W", missed)
 
@@ -183,7 +183,7 @@ def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
     joints = [name.partition(".")[2] for name, x in zip(names[6:], involved[6:], strict=True) if x]
     if joints:
         moved = f"joint{'s' * (len(joints) > 1)} {listed(joints)}, which no input moves"
-        advice = "; give each a spring (--stiffness, stiffness=) or a motor"
+        advice = "; give each of these joints a spring (--stiffness, stiffness=) or a motor"
         return " and ".join((*base, moved)) + advice
     kind = "" if len(base) == 2 else "angular " if involved[:3].any() else "linear "
     what = " and ".join(base).replace("and base", "and")

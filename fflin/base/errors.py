@@ -26,7 +26,7 @@ def _cut(text: str, size: int) -> str:
 
 
 class FflinError(Exception):
-    """Base class of every error that fflin raises deliberately; its message is one line.
+    """Base class of every error that fflin raises deliberately. Each message is one line.
 
     Examples
     --------
@@ -133,7 +133,7 @@ class ChartError(FflinError, ValueError):
 
 
 class EquilibriumError(FflinError, ValueError):
-    """Error for a point that no inputs can hold, or that is not a fixed point as required.
+    """Error for an operating point that is not an equilibrium, or that no inputs can hold.
 
     Examples
     --------
@@ -146,7 +146,7 @@ class EquilibriumError(FflinError, ValueError):
 
 
 class StabilizabilityError(FflinError, ValueError):
-    """Error for modes that neither decay by themselves nor can be controlled by the inputs.
+    """Error for modes that do not decay by themselves and that the inputs do not control.
 
     Attributes
     ----------
@@ -166,7 +166,7 @@ class StabilizabilityError(FflinError, ValueError):
 
 
 class DetectabilityError(FflinError, ValueError):
-    """Error for modes that neither decay by themselves nor are observed by the outputs.
+    """Error for modes that do not decay by themselves and that the outputs do not observe.
 
     Attributes
     ----------
@@ -260,8 +260,8 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     if near:
         hint = f"did you mean {', '.join(map(_visible, near))}?"
     elif not names:
-        hint = "there are none"
+        hint = "no such names exist"
     else:
-        hint = f"there are: {', '.join(map(_visible, names[:12]))}"
+        hint = f"known names: {', '.join(map(_visible, names[:12]))}"
         hint += f", ... ({len(names)} in all)" if len(names) > 12 else ""
     return UnknownNameError(f"no {kind} named '{name}'; {hint}")

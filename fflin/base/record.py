@@ -296,7 +296,7 @@ class Design(FrozenArrays):
         with reading(source, name):
             record, verified = read_record(source)
             if text(record["kind"]) != name:
-                raise ValueError(f"it is a {text(record['kind'])}")
+                raise ValueError(f"the file contains: {text(record['kind'])}")
             values = {
                 item.name: _value(cls, item, record[item.name])
                 for item in _saved(cls)

@@ -59,11 +59,11 @@ class Kind(NamedTuple):
     expected: str
 
 
-NAME = Kind(lambda value: isinstance(value, str) and value != "", "a name in quotes")
+NAME = Kind(lambda value: isinstance(value, str) and value != "", "a text in quotes")
 NUMBER = Kind(is_number, "a finite number")
-VECTOR = Kind(is_vector, "three finite numbers, [x, y, z]")
+VECTOR = Kind(is_vector, "three finite numbers [x, y, z]")
 NUMBERS = Kind(
-    lambda value: is_number(value) or is_vector(value), "a finite number or three of them"
+    lambda value: is_number(value) or is_vector(value), "one finite number, or three for [x, y, z]"
 )
 TRUTH = Kind(lambda value: isinstance(value, bool), "true or false")
 
@@ -82,12 +82,12 @@ class TomlFile:
         for number, written in enumerate(text.split("\n"), start=1):
             if written.count(".") > _DOTS_LIMIT:
                 raise InputError(
-                    f"{path}:{number}: line with more than {_DOTS_LIMIT} dots; shorten it"
+                    f"{path}:{number}: the line has more than {_DOTS_LIMIT} dots; shorten the line"
                 )
         try:
             self.record: dict[str, Any] = tomllib.loads(text)
         except RecursionError:
-            message = f"{path}: tables are nested too deeply; expected tables of values"
+            message = f"{path}: tables are nested too deeply; expected tables that contain values"
             raise InputError(message) from None
         except ValueError as error:
             raise InputError(_explain(path, text, str(error))) from None
@@ -97,7 +97,10 @@ class TomlFile:
         for place, value in _values(self.record):
             if type(value) is int and value.bit_length() > _BITS_LIMIT:
                 name = ".".join(map(str, place))
-                message = f"{name} is an integer with too many digits; write a float, such as 1e30"
+                message = (
+                    f"{name} is an integer with too many digits; write the number as a float, such "
+                    "as 1e30"
+                )
                 raise self.error(message, *place)
 
     def line(self, *place: str | int) -> int:
@@ -205,5 +208,5 @@ def _explain(path: Path, text: str, problem: str) -> str:
     what, line, column = found.groups() if found else (problem, None, None)
     if line is None:
         place = f"{path}:{text.rstrip().count(chr(10)) + 1}" if found else str(path)
-        return f"{place}: not TOML: {what}; correct it"
-    return f"{path}:{line}: not TOML: {what} at column {column}; correct it there"
+        return f"{place}: invalid TOML: {what}; correct the file"
+    return f"{path}:{line}: invalid TOML: {what} at column {column}; correct the line there"

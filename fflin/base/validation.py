@@ -17,8 +17,10 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     Array = NDArray[np.floating[Any]]
+    Complex = NDArray[np.complexfloating[Any]]
+    Values = NDArray[np.inexact[Any]]  # real or complex
 else:
-    Array = np.ndarray  # numpy.typing takes a tenth of the command line's start
+    Array = Complex = Values = np.ndarray  # numpy.typing takes a tenth of the command line's start
 
 # A quaternion or a (cos, sin) pair whose squared length misses 1 by up to this has only been
 # rounded and is renormalised; one that misses it by more is taken for a mistake.
@@ -78,13 +80,13 @@ def refuse_masked(name: str, value: Any) -> None:
     """Raise `InputError` if an entry is masked, which NumPy makes NaN or takes as it is."""
     ma: Any = sys.modules.get("numpy.ma")  # what is masked has loaded it
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
-        raise InputError(f"{name} has masked entries; fill them in first")
+        raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
 
 
 def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
     """Return what is of a kind, or raise `InputError` that says what was given and expected."""
     if not isinstance(value, kind):
-        raise InputError(f"{name} is a {type(value).__name__}, expected {expected}")
+        raise InputError(f"{name} has type {type(value).__name__}, expected {expected}")
     return value
 
 
@@ -154,7 +156,7 @@ def as_double(name: str, value: ArrayLike) -> Array:
     refuse_masked(name, value)
     array = _as_array(name, value)
     if array.dtype.kind not in "fiu":
-        raise InputError(f"{name} holds {array.dtype} values, expected real numbers")
+        raise InputError(f"{name} contains {array.dtype} values, expected real numbers")
     return array.astype(np.float64)
 
 
@@ -162,7 +164,7 @@ def _as_array(name: str, value: Any) -> Any:
     try:
         return np.asarray(value)
     except ValueError:
-        raise InputError(f"{name} is not an array: its rows differ in length") from None
+        raise InputError(f"{name} is not an array, because its rows differ in length") from None
 
 
 class FrozenArrays:

@@ -47,8 +47,8 @@ class ChunkJob:
         if engine == "compiled":
             if prepared.sensing is not None:
                 raise InputError(
-                    "engine='compiled' cannot run this: sweeps of other outputs than the state go "
-                    "point by point; leave it out"
+                    "engine='compiled' is not possible, because the outputs are not the state; "
+                    "leave engine out"
                 )
             prepared.kernel()  # which says where there is none
         # There every field of a model but B is known without computing it.

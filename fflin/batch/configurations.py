@@ -251,7 +251,7 @@ def random_configurations(
 def as_configurations(robot: Robot, q: Any) -> Configurations:
     """Return the points that `sweep` is given as rows of this robot."""
     if not isinstance(robot, Robot):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+        raise InputError(f"robot has type {type(robot).__name__}, expected a fflin.Robot")
     if isinstance(q, GivenConfigurations):  # checked already
         return q
     if not isinstance(q, Grid | RandomConfigurations):

@@ -100,7 +100,7 @@ class GainBatch(Design):
     def gain(self, joints: Array) -> Array:
         """Return K (nu, nx) at joint positions (n,) by linear interpolation.
 
-        Outside the grid, the gain at its edge is returned.
+        Outside the grid, the gain at the nearest edge of the grid is returned.
 
         Raises
         ------
@@ -150,9 +150,9 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
 
     For fully actuated models at rest, many gains are computed together:
 
-    1. With L the lower half of B, factorise :math:`L R^{-1} L^T = L_s L_s^T`. This defines
-       coordinates :math:`(p, \dot p)` in which the weight on :math:`\ddot p` is the identity.
-    2. Solve an eigenproblem of half the Hamiltonian's size (see `lqr`) for the poles and modes of
+    1. With L the lower half of B, factorise :math:`L R^{-1} L^T = L_s L_s^T`. The factor defines
+    coordinates :math:`(p, \dot p)` in which the weight on :math:`\ddot p` is the identity. 2.
+    Solve an eigenproblem of half the Hamiltonian's size (see `lqr`) for the poles and modes of
        the closed loop. Inputs u and states x of the modes give :math:`K = -u\,x^{-1}`.
     3. Refine each solution by Newton's method, and compute the residual of its Riccati equation.
 
@@ -184,10 +184,11 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     """
     if not isinstance(batch, LinearBatch):
         raise InputError(
-            f"batch is a {type(batch).__name__}, expected a LinearBatch; fflin.sweep returns one"
+            f"batch has type {type(batch).__name__}, expected a LinearBatch; fflin.sweep returns "
+            "one"
         )
     if not len(batch):
-        raise InputError("the batch has no points; give at least one")
+        raise InputError("the batch has no points; give a batch with at least one point")
     batch[0].require_unchanged()
     Q = weight("Q", Q, batch.state_names)
     R = weight("R", R, input_keys(batch), definite=True)
@@ -322,7 +323,9 @@ class ScheduledFeedback(Feedback):
     def __post_init__(self) -> None:
         for name, kind in (("lin", LinearModel), ("gains", GainBatch)):
             if not isinstance(value := getattr(self, name), kind):
-                raise InputError(f"{name} is a {type(value).__name__}, expected a {kind.__name__}")
+                raise InputError(
+                    f"{name} has type {type(value).__name__}, expected a {kind.__name__}"
+                )
         lin, by = self.lin, self.gains
         here = [k for k, x in enumerate(by.joint_names) if f"q_m.{x}" in lin.state_names]
         lined = replace(

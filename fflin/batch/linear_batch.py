@@ -39,7 +39,7 @@ class LinearBatch(FrozenArrays):
     ``batch[i]`` is the `LinearModel` about point i. ``batch[2:9]`` and ``batch[mask]`` are smaller
     batches. Every array has N rows. An array that is the same at all points, such as A at rest, is
     stored once (its stride over the points is zero). The upper half of B is zero and is not
-    stored. Arrays are read-only. If the batch is in an HDF5 file, they are read on demand.
+    stored. Arrays are read-only. Arrays of a batch in an HDF5 file are read on demand.
 
     Attributes
     ----------
@@ -65,12 +65,12 @@ class LinearBatch(FrozenArrays):
     locked : tuple of str
         Names of the locked joints.
     columns : tuple of (int, int, float)
-        Indices of each joint's entries in q: (index, -1) for one angle or length, or the indices of
-        cos and sin for a continuous joint; and the entry for a unit of q_m, which is 1 except for
-        modal amplitudes.
+        Indices of each joint's entries in q: (index, -1) for one angle or length, or the indices
+        of cos and sin for a continuous joint. The third number is the entry of q per unit of q_m;
+        it differs from 1 only for modal amplitudes.
     verified : bool
-        Whether the data is known to be unchanged. False for a file without a checksum, or if the
-        checksum was not verified.
+        Whether the data is known to be unchanged. The value is False for a file without a
+        checksum, or if the checksum was not verified.
 
     Examples
     --------
@@ -259,8 +259,8 @@ class LinearBatch(FrozenArrays):
         ----------
         path : str or Path
         robot : Robot, optional
-            The robot of the batch. It is needed for the inertia M and the certificate of the
-            models.
+            The robot of the batch. Without `robot`, the models have no inertia M and no
+            certificate.
         verify : bool
             Whether to verify the SHA-256 checksums, which reads all rows. If False, an HDF5 file
             opens at once, and the batch is not `verified`.
@@ -309,7 +309,7 @@ class LinearBatch(FrozenArrays):
         return {key: value for key, value in held.items() if value is not None}
 
     def header(self, count: int) -> dict[str, str]:
-        """Return the header of a file with so many points, as one JSON document."""
+        """Return the header of a file with a given number of points, as one JSON document."""
         first = self[0]
         header = {key: getattr(self, key) for key in _TEXTS}
         header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}

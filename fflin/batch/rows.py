@@ -132,7 +132,7 @@ def _rows(name: str, value: Any, size: int, of_what: str, count: int | None = No
     if array.ndim != 2 or array.shape[1] != size or (count is not None and len(array) != count):
         raise InputError(f"{name} has shape {array.shape}, expected {expected}: {of_what}")
     if not len(array):
-        raise InputError(f"{name} has no rows; give at least one")
+        raise InputError(f"{name} has no rows; give at least one row")
     return np.ascontiguousarray(array)
 
 

@@ -85,7 +85,7 @@ def check_workers(executor: Any, workers: Any, threads: Any, chunk: Any, progres
         raise InputError("executor and workers are both given; give only one of them")
     if executor is not None and not hasattr(executor, "submit"):
         raise InputError(
-            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
+            f"executor has type {type(executor).__name__}, expected a concurrent.futures.Executor"
         )
     for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
         if value is not None:
@@ -159,10 +159,13 @@ def failure(
     if not kept.any():
         store.discard()
     elif store.part is not None:
-        message += f"; the other chunks are in {store.part}, and the same call resumes from them"
+        message += (
+            f"; the results of the other chunks are in {store.part}, from which the same call "
+            "resumes"
+        )
     else:
         batch = made(kept)
-        message += "; the other chunks are in the `batch` of this error"
+        message += "; the results of the other chunks are in the attribute `batch` of this error"
     return SweepError(message, tuple((*span, reason) for span, _, reason in failed), batch)
 
 

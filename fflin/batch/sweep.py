@@ -75,7 +75,7 @@ def sweep(
     eight points on all threads. At rest M depends only on the joint positions, and
     :math:`B = [0;\, M^{-1}]`. The kernel also supports operating points in motion. Without numba,
     or if the robot has outputs other than its state, a `Linearizer` processes the points one by
-    one. These points can be distributed over worker processes.
+    one. The points can be distributed over worker processes.
 
     Parameters
     ----------
@@ -102,22 +102,23 @@ def sweep(
         Number of points in a chunk. By default the result of a chunk takes about 4 MB. A resumed
         sweep uses the chunk size of its unfinished file.
     progress : callable, optional
-        Function ``progress(done, total)``, called after every chunk with the number of finished
-        points and the number of all points.
+        Function ``progress(done, total)``, called after every chunk with the numbers of finished
+        points and of all points.
     out : str or Path, optional
-        File to write, .h5 or .npz. Chunks are first written to NAME.part. After a crash, repeat
-        the same call: it resumes with the intact chunks of that file.
+        File to write, .h5 or .npz. Chunks are first written to NAME.part. After a crash, the same
+        call resumes with the intact chunks in NAME.part.
 
     Returns
     -------
     LinearBatch
-        Models in the order of q. If `out` is an .h5 file, arrays are read from it on demand.
+        Models in the order of q. If `out` is an .h5 file, arrays are read from the file on
+        demand.
 
     Raises
     ------
     InputError
-        If a size or value is wrong; the message names the row. Also if the compiled engine is
-        requested and not available.
+        If a size or value is wrong (the message names the row), or the requested compiled engine
+        is not available.
     UnknownNameError
         If the engine does not exist.
     SweepError

@@ -86,16 +86,17 @@ class Campaign(FrozenArrays):
 
     - ``attitude`` [deg], ``position`` [m], ``joints``, ``turning`` (omega_b), ``moving`` (v_b) and
       ``rates`` (of the joints): final error in these states. These names are the kinds of error.
-    - The name of a state or input: its final value, with sign.
-    - ``worst NAME``: largest value over the whole run; for a state, its largest error.
+    - The name of a state or input: final value of this signal, with sign.
+    - ``worst NAME``: largest value over the whole run, or largest error if NAME is a state.
     - ``settle KIND`` [s]: settling time, after which the error of this kind stays within 2 % of its
       largest value. ``settle`` [s]: the longest of these settling times.
     - ``end`` [s]: end of the run.
     - ``drawn NAME``: value drawn for the dispersed parameter NAME.
 
-    The error of a kind is the largest deviation of its states from the target. Without a target, it
-    is the largest deviation from the initial state. A run that was stopped early violates every
-    bound: its errors, worst values and settling times are infinite, and it meets no condition.
+    The error of a kind is the largest deviation of its states from the target. Without a target,
+    the error is the largest deviation from the initial state. A run that was stopped early
+    violates every bound: its errors, worst values and settling times are infinite, and all
+    conditions are false.
 
     Attributes
     ----------
@@ -111,7 +112,7 @@ class Campaign(FrozenArrays):
     times : tuple of float
         Times [s] of the histories; empty unless `monte_carlo` was called with `histories`.
     error_history, input_history : ndarray (N, M, 6), (N, M, nu)
-        Errors of each kind, and commands, at these times. After a run is stopped, its errors are
+        Errors of each kind, and commands, at the `times`. After a run is stopped, its errors are
         infinite and its commands are zero.
     stop, end : ndarray (N,)
         Outcome (0 completed, 1 diverged, 2 left the chart, 3 stopped for another reason) and end
@@ -185,9 +186,9 @@ class Campaign(FrozenArrays):
     def about(self) -> str:
         """Default figure of `worst` and `sensitivity`.
 
-        It is the figure of the first comparison ``<`` or ``<=`` in the goals. If there is none, it
-        is ``worst KIND`` for the first kind of error, in the order ``attitude``, ``position``,
-        ``joints``, ..., that the policy controls.
+        The default is the figure in the first comparison ``<`` or ``<=`` of the goals. Without
+        such a comparison, the default is ``worst KIND`` for the first kind of error (in the order
+        ``attitude``, ``position``, ``joints``, ...) that the policy controls.
         """
         bounded = [each.name for each in self.bounds if each.sign[0] == "<"]
         return [*bounded, f"worst {(self.judged or tuple(KINDS))[0]}"][0]
@@ -234,7 +235,7 @@ class Campaign(FrozenArrays):
         return np.where(self.stopped[:, None], np.inf, sizes)
 
     def met(self, condition: Any) -> Any:
-        """Return which runs (N,) meet a condition.
+        """Return a mask (N,) of the runs that meet a condition.
 
         Parameters
         ----------
@@ -289,9 +290,10 @@ class Campaign(FrozenArrays):
         return intervals.mean(values, share("confidence", confidence))
 
     def worst(self, k: int = 5, name: str | None = None) -> list[int]:
-        """Return the indices of the k runs in which a figure, by default `about`, is largest.
+        """Return the indices of the k runs with the largest values of a figure.
 
-        Runs that were stopped early come first, sorted by their end times.
+        The default figure is `about`. Runs that were stopped early come first, sorted by their
+        end times.
         """
         order = np.lexsort(
             (-self.values(name or self.about), np.where(self.stopped, self.end, np.inf))
@@ -301,10 +303,10 @@ class Campaign(FrozenArrays):
     def sensitivity(self, name: str | None = None) -> dict[str, float]:
         """Return Spearman's rank correlations {name: value} between dispersed values and a figure.
 
-        The correlation with the largest magnitude comes first. If the figure correlates more
-        strongly with the distance of a value from its median than with the value itself, the
-        correlation with the distance is returned under ``|NAME|``. For example, a figure may grow
-        with an initial attitude error of either sign. The default figure is `about`.
+        The correlation with the largest magnitude comes first. The name ``|NAME|`` means the
+        correlation with the distance of the value from its median. This correlation is returned
+        if its magnitude is larger, as for a figure that grows with an initial error of either
+        sign. The default figure is `about`.
         """
         figure = self.values(name or self.about)
         apart = np.abs(self.drawn - np.median(self.drawn, axis=0))
@@ -319,8 +321,8 @@ class Campaign(FrozenArrays):
     def replay(self, run: int) -> Motion:
         """Simulate a run of the campaign again, and return its motion.
 
-        q, v and u equal the original run bit for bit. x is computed from q and v by other code; it
-        agrees to machine precision, except for full turns of continuous joints.
+        q, v and u equal the original run bit for bit. x is computed from q and v by other code,
+        and agrees to machine precision, except for full turns of continuous joints.
 
         Raises
         ------
@@ -337,8 +339,8 @@ class Campaign(FrozenArrays):
     def _flown(self) -> CampaignJob:
         if self._job is None:
             raise InputError(
-                "the campaign was loaded from a file, which lacks its robot and policy; repeat the "
-                "call of monte_carlo and replay its run: the same seed draws the same values"
+                "the campaign was loaded from a file, which does not contain its robot and policy; "
+                "call monte_carlo again with the same seed, and replay a run of the new campaign"
             )
         return self._job
 
@@ -385,14 +387,14 @@ class Campaign(FrozenArrays):
         Raises
         ------
         FileError
-            If the file cannot be read, is damaged or does not hold a campaign.
+            If the file cannot be read, is damaged or does not contain a campaign.
         """
         source = as_path(path)
         with reading(source, "Campaign"):
             arrays, _, texts, _ = read_rows(source, verify=True)
             header = json.loads(texts["header"])
             if header["kind"] != "Campaign":
-                raise ValueError(f"it is a {header['kind']}")
+                raise ValueError(f"the file contains: {header['kind']}")
             return cls.of(arrays, header)
 
     @classmethod

@@ -31,6 +31,7 @@ from fflin.robot.equipment.appendage_bodies import first_impossible
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import Piece, varied, with_changed
 from fflin.robot.robot import Robot
+from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
 from fflin.uncertainty.parameters import bodies_named
@@ -68,11 +69,6 @@ class Bound(NamedTuple):
     """A policy that a function makes for a robot."""
 
     bind: Callable[[Robot], Policy]
-
-
-def noise_generator(seed: float) -> np.random.Generator:
-    """Return the generator of the noise of a run."""
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
 
 
 class Dispersions:
@@ -113,8 +109,8 @@ class Dispersions:
             own, tied = untied(str(key), spread)
             if kind == "fails" and isinstance(own, int | float):
                 raise InputError(
-                    f"'{key}' is {own:g}, a standard deviation about 0, which does not describe a "
-                    "time of failure; give (least, largest), a list of times or a distribution"
+                    f"'{key}' is {own:g}, a standard deviation, which does not describe a time of "
+                    "failure; give (least, largest) in s, a list of times in s or a distribution"
                 )
             inverse = deviation_of if kind == "noise" else inverse_of
             spreads = by_kind.setdefault(kind, {})
@@ -124,7 +120,9 @@ class Dispersions:
         for kind, spreads in by_kind.items():
             self._add(kind, spreads, list(known[kind]), " | ".join([*known][1:]))
         if not self.columns:
-            raise InputError("dispersions is empty; give at least one, such as {'q_b': 0.05}")
+            raise InputError(
+                "dispersions is empty; give at least one dispersion, such as {'q_b': 0.05}"
+            )
         self._kinds = {column.kind for column in self.columns}
         # Draws of slow distributions, by name and block.
         self._kept: dict[tuple[str, int], Array] = {}
@@ -138,19 +136,19 @@ class Dispersions:
             one, two = pieces[at], pieces[of]
             if at == of or (one.joint == two.joint and (one.whole or two.whole)):
                 names = f"'{self.names[column]}' and '{self.names[other]}'"
-                raise InputError(f"{names} disperse the same mass; give only one of them")
+                raise InputError(f"{names} disperse the same mass; disperse only one of the two")
 
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:
             raise InputError(
-                f"'{next(iter(spreads))}.{kind}' is dispersed, but a "
-                f"{type(self._policy).__name__} has no sensors; use a StateFeedback, "
+                f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy "
+                f"({type(self._policy).__name__}) has no sensors; use a StateFeedback, "
                 "OutputFeedback or LinearController"
             )
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
-                f"{kind} is dispersed, which needs a sampled policy, but this policy is "
-                "continuous; give sample=, a multiple of dt (--sample on the command line)"
+                f"{kind} is dispersed, but this policy is continuous, and only a sampled policy "
+                f"has a {kind}; give sample=, a multiple of dt (--sample on the command line)"
             )
         label = dict(zip(names, names, strict=True))
         try:
@@ -169,8 +167,8 @@ class Dispersions:
             of_spring = kind in _OF_SPRINGS and not getattr(nominal, kind)[at]
             if of_spring or (kind == "frequency" and not nominal.stiffness[self._modes[at]]):
                 raise InputError(
-                    f"'{own}' is dispersed by a factor, but its nominal value is 0; leave it out "
-                    "or give the robot a value"
+                    f"'{own}' is dispersed by a factor, but its nominal value is 0; remove the "
+                    "dispersion, or give the robot a nonzero value"
                 )
             if kind == "misalignment":
                 require_direction(self._plant.robot, at)
@@ -281,14 +279,14 @@ class Dispersions:
                     bound = f" more than {least:g}" if np.isfinite(least) else " a finite number"
                     raise InputError(
                         f"'{column.name}' is drawn as {values[run]:.4g} in run {start + run}, "
-                        f"which gives no valid robot; expected{bound}. Take a smaller spread, or "
-                        "a uniform one (least, largest)"
+                        f"for which no valid robot exists; expected{bound}. Use a smaller standard "
+                        "deviation, or a uniform distribution (least, largest)"
                     )
             try:
                 self.starts(drawn)
             except ChartError as error:
                 said = f"an invalid initial attitude is drawn in the runs from {start} on"
-                raise InputError(f"{said}: {error}; take a smaller spread") from None
+                raise InputError(f"{said}: {error}; use a smaller dispersion") from None
             appendages = self._plant.robot.appendages
             refused = first_impossible(self._model, appendages, self.bodies(drawn))
             if refused is not None:
@@ -296,7 +294,7 @@ class Dispersions:
                     self.one(drawn[refused])
                 except InputError as error:
                     said = f"run {start + refused} draws an invalid mass or inertia"
-                    raise InputError(f"{said}: {error}; take a smaller spread") from None
+                    raise InputError(f"{said}: {error}; use a smaller dispersion") from None
 
     def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
         """Return the draws (N, size, axes) of a kind; zero if not dispersed."""

@@ -54,12 +54,17 @@ _EDGE, _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 176.0, 170.0, np.pi,
 
 
 def ellipsoid_axes(P: Array) -> Array:
-    """Return W (nx, r) whose W W' is the pseudoinverse of P, each error in its own scale."""
+    """Return W (nx, nx) whose W W' is the pseudoinverse of P, each error in its own scale.
+
+    W is the symmetric root in these scales. Eigenvectors alone are not unique, so errors drawn by
+    them would depend on the rounding of the processor.
+    """
     scale = np.sqrt(P.diagonal().clip(min=0.0))
     unit = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
     values, axes = np.linalg.eigh(unit[:, None] * P * unit)
     kept = values > _ROUNDING * values.max()
-    found: Array = unit[:, None] * axes[:, kept] / np.sqrt(values[kept])
+    root = axes[:, kept] / np.sqrt(values[kept]) @ axes[:, kept].T
+    found: Array = unit[:, None] * root
     return found
 
 
@@ -67,8 +72,8 @@ def ellipsoid_axes(P: Array) -> Array:
 class Funnel(Design):
     """Ellipsoids ``e' P(t) e <= rho`` of errors relative to a trajectory; prints as a table.
 
-    Errors are defined as in `linearize_trajectory`; P is the schedule's cost to go. Errors in
-    directions in which P is zero are not tested.
+    The definition of errors is in `linearize_trajectory`; P is the cost to go of the schedule.
+    Errors in the null space of P are not tested.
 
     Attributes
     ----------
@@ -78,17 +83,17 @@ class Funnel(Design):
         Largest level rho of the tested initial errors. The square roots of the levels of all tested
         errors are evenly spread.
     outcomes : ndarray (m, N)
-        Outcome of each run, sorted by ascending level: 0 if it reached the goal, 1 if it was
-        stopped early, 2 if it exceeded `within`, 3 if it missed the goal.
+        Outcome of each run, sorted by ascending level: 0 goal reached, 1 stopped early, 2 bounds
+        `within` exceeded, 3 goal missed.
     rho : ndarray (m,)
-        Largest level up to which every run succeeded.
+        Level up to which every run succeeded.
     inside : ndarray (m,)
         Number of runs that start at or below the level `rho`.
     inside_rate : ndarray (m,)
         Lower bound, at confidence level `confidence`, on the success rate of runs that start at or
         below the level `rho`.
     rate : ndarray (m, 2)
-        Clopper-Pearson interval of the success rate of all runs. All of them start at or below the
+        Clopper-Pearson interval of the success rate of all runs. All runs start at or below the
         level `tried`.
     attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
         Half-axes of the ellipsoids in base attitude [deg], base position [m] and each joint
@@ -202,9 +207,9 @@ class Funnel(Design):
         return P
 
     def root(self, t: float, *, smooth: bool = False) -> Array:
-        """Return W (nx, r): the ellipsoid at time t is the set of all W z with norm(z) <= 1.
+        """Return W (nx, nx): the ellipsoid at time t is the set of all W z with norm(z) <= 1.
 
-        With `smooth`, the level is interpolated between knots, as figures show it.
+        With `smooth`, the level is interpolated between knots, as in figures.
         """
         size = np.interp(t, self.t, np.sqrt(self.rho)) if smooth else np.sqrt(self.level(t))
         return size * ellipsoid_axes(self.cost(t))
@@ -254,12 +259,12 @@ class Funnel(Design):
 
     @classmethod
     def load(cls, path: str | Path, robot: Robot) -> Funnel:  # type: ignore[override]
-        """Read a funnel of a robot from a file that `save` wrote; errors as in `Gain.load`."""
+        """Read a funnel of a robot from a file that `save` wrote; raises as `Gain.load`."""
         return cls._read(as_path(path), robot=robot)
 
 
 def _half_axes(W: Array) -> Array:
-    """Return the half-axes (3,) of the ellipsoid that W (3, r) makes of the unit sphere."""
+    """Return the half-axes (3,) of the ellipsoid that W (3, nx) makes of the unit sphere."""
     return np.linalg.svd(np.hstack((W, np.zeros((3, 3)))))[1]
 
 
@@ -283,10 +288,11 @@ def funnel(
     r"""Estimate the initial errors from which a trajectory tracking loop reaches a goal.
 
     At each knot, errors are drawn from an ellipsoid :math:`e^T P(t)\,e \le \rho` of the schedule's
-    cost to go. Their directions are uniformly distributed, and the square roots of their levels are
-    evenly spread. The nonlinear robot is simulated from each error to the end of the trajectory.
-    The largest level tried is the level at which about one run in sixteen fails, or at which the
-    attitude error reaches 170 deg. The result is a statistical estimate, not a proof.
+    cost to go. The directions of the errors are uniformly distributed, and the square roots of
+    the levels are evenly spaced. The nonlinear robot is simulated from each error to the end of
+    the trajectory. The largest level tried is the level at which about one run in sixteen fails,
+    or at which the attitude error reaches 170 deg. The result is a statistical estimate, not a
+    proof.
 
     Parameters
     ----------
@@ -295,10 +301,10 @@ def funnel(
         Schedule designed by `tvlqr`, continuous or sampled.
     goal : mapping or float
         {"attitude" [deg], "position" [m], "joints" [rad|m], "turning" [rad/s], "moving" [m/s],
-        "rates" [rad/s|m/s]: largest final error}, with the kinds of `Campaign`; or the largest
-        final value of ``e' P e``.
+        "rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`. A number
+        is the largest final value of ``e' P e``.
     within : mapping, optional
-        Largest errors allowed at any time of a run, with the kinds of `goal`.
+        Largest errors allowed at any time of a run, as a mapping with the same keys as `goal`.
     knots : int or sequence of float
         Number of knots to test, or times [s]. The knot nearest to each time is tested.
     samples : int
@@ -375,14 +381,19 @@ def funnel(
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
-            axes = ellipsoid_axes(by.P[first])
+            P, axes = by.P[first], ellipsoid_axes(by.P[first])
 
             def simulate(
-                roots: Array, job: CampaignJob = job, axes: Array = axes, rng: Any = rng
+                roots: Array,
+                job: CampaignJob = job,
+                P: Array = P,
+                axes: Array = axes,
+                rng: np.random.Generator = rng,
             ) -> Array:
                 """Return the outcomes of runs from random errors at roots (N,) of the levels."""
-                z = rng.normal(size=(len(roots), axes.shape[1]))
-                e = (roots / np.linalg.norm(z, axis=1))[:, None] * z @ axes.T
+                e = rng.normal(size=(len(roots), len(P))) @ axes.T
+                # Directions in which P is zero do not count.
+                e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
                 x = moved_by("local", np.tile(job.x0, (len(e), 1)), e)
                 starts = Draws(x - job.x0, np.arange(len(e), dtype=float))
                 return _judged(job, completed(job, starts.part, len(e), **how), final, limits, by)
@@ -468,7 +479,10 @@ def _bounds(name: str, given: Any, kinds: Iterable[str]) -> dict[str, float]:
         if key not in kinds:
             raise unknown(f"kind of error in {name}", str(key), list(kinds))
     if name == "goal" and not given:
-        raise InputError("goal is empty; give at least one, such as {'attitude': 1.0}")
+        raise InputError(
+            "goal is empty; give the largest final error of at least one kind, such as "
+            "{'attitude': 1.0} in deg"
+        )
     found = numbers(name, given, "kind", name)
     for key, value in found.items():
         if not value > 0.0:
@@ -497,7 +511,7 @@ def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int
         times = vector("knots", times, times.size, "times of knots")
         chosen = both[np.abs(motion.t[both] - times[:, None]).argmin(axis=1)]
     if not len(chosen):
-        raise InputError("knots is empty; give a number of knots, or times [s]")
+        raise InputError("knots is empty; give the number of knots, or a list of times [s]")
     return [(k, int(at[k])) for k in sorted({*chosen.tolist()})]
 
 

@@ -70,7 +70,8 @@ def monte_carlo(
     r"""Run a Monte Carlo campaign: simulate a policy many times with dispersed parameters.
 
     Each run is a call of `simulate`. With numba the compiled loop computes eight runs at a time.
-    For each run, a record of fixed size is kept. `Campaign.replay` simulates any run again in full.
+    A record of fixed size is kept for each run. `Campaign.replay` simulates any run again in
+    full.
 
     Parameters
     ----------
@@ -86,35 +87,35 @@ def monte_carlo(
         - a list of values, all equally likely;
         - a frozen distribution of scipy.stats.
 
-        Each name in a pattern or group is drawn independently; ``{"range": spread, "tied": True}``
-        makes one draw for all of them. A name is one of
+        Each name in a pattern or group is drawn independently. With ``{"range": spread, "tied":
+        True}``, all names of a pattern or group have the same draw. A name is one of
 
         - a state, ``q_b``, ``r_b.x``, ``q_m.*``, ``omega_b``: the drawn value is added to the
           initial state.
-        - ``LINK.mass``, ``LINK.density``: relative changes d of the parameters of `sensitivity` and
-          `uncertain`. ``mass`` is multiplied by 1 + d at constant inertia about the centre of mass;
-          ``density`` multiplies mass and inertia by 1 + d.
+        - ``LINK.mass``, ``LINK.density``: relative change d of a parameter of `sensitivity` and
+          `uncertain`. A draw of ``mass`` multiplies the mass by (1 + d) at constant inertia about
+          the centre of mass. A draw of ``density`` multiplies mass and inertia by (1 + d).
         - ``LINK.com`` [m]: shift of the centre of mass along each axis of the link. Mass and
           inertia about the centre of mass are unchanged, as for ``LINK.com.x`` in `sensitivity`
           and `uncertain`.
         - ``LINK.inertia``: the second moments of the mass distribution along the axes of the link's
-          frame are multiplied by 1 + d, with a d for each axis, as in `Robot.perturbed`; the mass
-          is unchanged. The pseudo-inertia stays positive definite.
+          frame are multiplied by (1 + d), with an independent d for each axis, as in
+          `Robot.perturbed`. The mass is unchanged. The pseudo-inertia stays positive definite.
 
-          LINK is a name in the URDF, and may be a link that is fixed to another link. A whole body
-          of several links has the name of its joint, or ``base``; for a body of one link, these
-          are other names of the link. A pattern stands for links.
-        - ``INPUT.gain`` (relative change d) and ``INPUT.bias`` (b, in N m or N): a command u acts
-          as (1 + d) u + b. ``INPUT.fails`` [s]: the input is zero from that time on. The recorded
+          LINK is the name of a link in the URDF. The name of a joint, or ``base``, means the
+          whole body that the joint carries, with all links fixed to it. A pattern selects links.
+        - ``INPUT.gain`` (relative change d) and ``INPUT.bias`` (b, in N m or N): the actual input
+          is (1 + d) u + b for a command u. ``INPUT.fails`` [s]: time from which the input is
+          zero. The recorded
           inputs are the commands, even after a failure.
         - ``INPUT.misalignment`` [rad]: rotates the direction of a thruster, the axis of a wheel, or
           an axis of tau_b or F_b about two perpendicular axes. Each angle is drawn independently.
         - ``NAME.sensor``: offset of a state that a `StateFeedback` reads, or of an output that an
           `OutputFeedback`, `LinearController` or `TrajectoryOutputFeedback` measures.
-          ``NAME.noise``: white noise added at each sample. A number is its standard deviation; any
-          other spread draws one standard deviation for each run.
-        - ``delay`` [s]: added to the `delay` of `simulate`. The sum is rounded to whole steps; a
-          negative sum becomes 0.
+          ``NAME.noise``: white noise added at each sample. A number is the standard deviation of
+          the noise. Any other spread draws the standard deviation of the noise of each run.
+        - ``delay`` [s]: change of the `delay` of `simulate`. The total delay is rounded to whole
+          steps; a negative total becomes 0.
         - ``JOINT.stiffness`` and ``JOINT.damping``: relative changes from the nominal values.
         - ``MODE.frequency`` and ``MODE.damping`` of flexible appendages and slosh: relative changes
           of the frequency and of the damping ratio.
@@ -129,11 +130,12 @@ def monte_carlo(
         Conditions such as ``"attitude < 1 deg"``, see `Campaign.fraction`. The report and the
         figure show the success rate of each goal and its interval.
     until : str, optional
-        Condition that stops the campaign early: no further runs are made once the confidence
-        interval of its success rate is at most `width` wide. The interval is checked after 256
-        runs, and whenever the number of runs has grown by a quarter.
+        Condition that stops the campaign early, when the confidence interval of its success rate
+        is at most `width` wide. The interval is checked after 256 runs, and whenever the number
+        of runs has grown by a quarter.
     width, confidence : float
-        Width and confidence level of that interval. The report uses the same confidence level.
+        Width and confidence level of the interval for `until`. The report uses the same
+        confidence level.
     executor, workers, threads, progress : optional
         As in `sweep`. The workers of an executor must be able to import the policy's modules.
     chunk : int, optional
@@ -142,14 +144,15 @@ def monte_carlo(
         Number of evenly spaced times at which the errors and inputs of each run are recorded. The
         bands of `plot_campaign` need them.
     out : str or Path, optional
-        File to write, .h5 or .npz. Unfinished results are kept in NAME.part: after a crash, the
-        same call resumes from its intact chunks. If a .h5 file already holds all of these runs, it
-        is read, even if its goals differ.
+        File to write, .h5 or .npz. Unfinished results are kept in NAME.part. After a crash, the
+        same call resumes from the intact chunks in NAME.part. If a .h5 file already contains all
+        of these runs, the file is read, even if its goals differ.
     overwrite : bool
-        Whether to replace the file `out` if a different call wrote it. By default this is an error.
+        Whether to replace the file `out` if a different call wrote the file. By default, such a
+        file is an error.
     engine : {"python", "compiled"}, optional
-        Engine that runs the loop; by default the compiled engine if it supports these runs, see
-        `simulate`.
+        Engine that runs the loop. The default is the compiled engine if it supports these runs,
+        see `simulate`.
     **options
         Options of `simulate`: x0, q0, v0, dt, method, project, sample, delay, limits, disturbance,
         target, frame, reference.
@@ -157,7 +160,7 @@ def monte_carlo(
     Returns
     -------
     Campaign
-        Runs in their order. If `out` is given, arrays are read from that file on demand.
+        Runs in their order. If `out` is given, arrays are read from the file on demand.
 
     Raises
     ------
@@ -250,12 +253,12 @@ def _goals(given: Any, until: Any, shapes: Any, header: dict[str, Any]) -> list[
     """Return the goals; an invalid goal is refused before any run."""
     goals = [given] if isinstance(given, str) else given
     if not isinstance(goals, list | tuple):
-        said = f"goals is a {type(given).__name__}"
+        said = f"goals has type {type(given).__name__}"
         raise InputError(f"{said}, expected a list such as ['attitude < 1 deg']")
     goals = [*goals, *([] if until is None or until in goals else [until])]
     for goal in goals:
         if not isinstance(goal, str):
-            said = f"a goal is a {type(goal).__name__}"
+            said = f"a goal has type {type(goal).__name__}"
             raise InputError(f"{said}, expected a text such as 'attitude < 1 deg'")
         Campaign.of(MemoryStore(1, 1, shapes).arrays, header | {"goals": []}).met(goal)
     return goals

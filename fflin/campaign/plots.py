@@ -41,8 +41,8 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     """Draw the error histories, final errors, inputs and rank correlations of a campaign.
 
     The bands contain 100 %, 90 % and 50 % of the runs. The worst runs, ranked by `Campaign.about`,
-    are drawn over the bands. From the moment a run is stopped early, it ranks as worse than all
-    other runs. Dashed lines mark the bounds of the goals and the limits of the inputs. Without
+    are drawn over the bands. A run that was stopped early ranks as worse than all other runs from
+    its stop on. Dashed lines mark the bounds of the goals and the limits of the inputs. Without
     histories, the figure shows only the histograms and the correlations.
 
     Parameters
@@ -106,7 +106,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     validity : Validity
         Result of `fflin.validity`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
 
     Examples
     --------
@@ -168,7 +168,7 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
     funnel : Funnel
         Result of `fflin.funnel`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. Errors as in `plot_motion`.
+        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
 
     Examples
     --------

@@ -6,7 +6,8 @@ import math
 from typing import Any
 
 from fflin.base.tables import folded, grid
-from fflin.campaign.statistics import KINDS, STOPS
+from fflin.campaign.statistics import KINDS
+from fflin.simulation.run import STOPS
 
 _SHARES = (0.5, 0.95, 0.99)
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from concurrent.futures import Executor
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from fflin.batch.run import ChunkResult, Progress, Rows, run_chunks
 from fflin.batch.store import MemoryStore
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.spreads import placed
-from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, outcome_of, stop_of
+from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, outcome_of
 from fflin.control.channel import Saturation
 from fflin.dynamics.state import states_of
 from fflin.kernel.compiled import available_cores
@@ -26,14 +26,13 @@ from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
 from fflin.simulation.compiled import engine_of
 from fflin.simulation.conservation import conserved_by
+from fflin.simulation.lanes import LaneLoop, LaneRows, Runs, Statistics, noises, recorded
 from fflin.simulation.motion import Motion
+from fflin.simulation.packing import SLOTS, noise_of, packed
 from fflin.simulation.plan import Plan, law_of, planned
 from fflin.simulation.plant import Plant
-from fflin.simulation.run import Recording, go
+from fflin.simulation.run import Recording, go, stop_of
 from fflin.simulation.simulate import motion_of
-
-if TYPE_CHECKING:
-    from fflin.campaign.lanes import Lanes, Statistics, Watcher
 
 ARRAYS = Outcome._fields
 _LARGEST_CHUNK = 256
@@ -104,12 +103,10 @@ class CampaignJob:
         """
         if self.engine == "python":
             return content_digest(self.run(first, 0).arrays)
-        from fflin.campaign.lanes import loop_arrays
-
-        tree = batch_tree(self.plant.robot)
-        assert tree is not None
-        runs = self.dispersions.in_lanes(first.drawn, tree)
-        return content_digest(loop_arrays(self.plan, self.plant) | runs | {"target": self.target})
+        runs = self._in_lanes(first.drawn)
+        return content_digest(
+            {**_loop_arrays(self.plan, self.plant), **runs, "target": self.target}
+        )
 
     def run(self, rows: Draws, start: int, out: Mapping[str, Array] | None = None) -> ChunkResult:
         """Simulate the runs of some rows."""
@@ -125,25 +122,23 @@ class CampaignJob:
     def _space(self, count: int) -> dict[str, Array]:
         return {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
 
-    def _fly(
-        self, drawn: Array, out: Mapping[str, Array], watcher: Watcher | None = None
-    ) -> tuple[Lanes, list[str]]:
-        """Simulate runs (N, k) in compiled code; say why each of the last eight was stopped."""
-        from fflin.campaign.lanes import Lanes
-
-        tree, stopped = batch_tree(self.plant.robot), list[str]()
-        assert tree is not None
-        runs = self.dispersions.in_lanes(drawn, tree)
+    def _fly(self, drawn: Array, out: Mapping[str, Array]) -> None:
+        """Simulate runs (N, k) in compiled code, eight at a time."""
+        runs = self._in_lanes(drawn)
+        loop = LaneLoop(self.plan, self.plant, runs)
         state, path = self.plant.state, self._path
         own = RunStatistics(self.plan, state, self.target, self.steps, path)
-        lanes = Lanes(self.plan, self.plant, runs, copy(self.rule) or own)
         for first in range(0, len(drawn), LANES):
             eight, their_out = (
                 {key: each[first : first + LANES] for key, each in arrays.items()}
                 for arrays in (runs, out)
             )
-            stopped = lanes.fly(eight, their_out, watcher)
-        return lanes, stopped
+            loop.fly(copy(self.rule) or own, their_out, eight)
+
+    def _in_lanes(self, drawn: Array) -> Runs:
+        tree = batch_tree(self.plant.robot)
+        assert tree is not None
+        return self.dispersions.in_lanes(drawn, tree)
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
         """Return the plan of a run (k,), and its robot."""
@@ -175,53 +170,24 @@ class CampaignJob:
         if self.engine == "python":
             run = _recorded(plan, plant, plan.times.every)
         else:
-            run = self._recorded_in_lanes(drawn, plan, plant)
+            run = recorded(self.plan, self.plant, self._in_lanes(drawn[None]))
         return motion_of(plan, plant, self.engine, run)
 
     def paths(self, drawn: Array, most: int) -> list[Array]:
         """Return up to `most` + 1 configurations (rows, nq) of each of some runs (N, k)."""
-        times, found = self.plan.times, list[Array]()
-        every = -(-times.steps // most)
+        every = -(-self.plan.times.steps // most)
         if self.engine == "python":
             return [_recorded(*self.plan_of(each), every).q for each in drawn]
+        found = []
         for first in range(0, len(drawn), LANES):
-            (q, *_), out, *_ = self._watched(drawn[first : first + LANES], every)
-            counts = -(-(out["end"] / times.dt).round().astype(int) // every)
-            ends = zip(counts, out["q"], strict=True)
-            found += [np.vstack((q[:count, lane], end)) for lane, (count, end) in enumerate(ends)]
+            runs = self._in_lanes(drawn[first : first + LANES])
+            loop = LaneLoop(self.plan, self.plant, runs)
+            rows = LaneRows(loop, every, len(runs["q"]))
+            loop.fly(rows, rows.ends, runs)
+            q, ends = loop.columns[0], rows.ends["last"]
+            for run, count in enumerate(rows.counts):
+                found.append(np.vstack((rows.kept[:count, q, run], ends[run, q])))
         return found
-
-    def _watched(self, drawn: Array, every: int) -> tuple[list[Array], Any, Lanes, list[str]]:
-        """Return rows (steps, lanes, ..) of up to eight runs, and how they ended."""
-        kept, out = list[list[Array]](), self._space(len(drawn))
-
-        def watch(first: int, rows: list[Array]) -> None:
-            kept.append([each[-first % every :: every].copy() for each in rows])
-
-        lanes, stopped = self._fly(drawn, out, watch)
-        return [np.concatenate(slices) for slices in zip(*kept, strict=True)], out, lanes, stopped
-
-    def _recorded_in_lanes(self, drawn: Array, plan: Plan, plant: Plant) -> Recording:
-        """Return the recording of one run, which is simulated in all lanes."""
-        every, dt, state = plan.times.every, plan.times.dt, plant.state
-        rows, out, lanes, [stopped, *_] = self._watched(np.tile(drawn, (LANES, 1)), every)
-        rows, end = [each[:, 0] for each in rows], float(out["end"][0])
-        t = every * dt * np.arange(len(rows[0]))
-        if not stopped.startswith("diverged"):
-            last = out["q"][0], state.velocities(out["v"][0]), out["u"][0], *lanes.conserved(end)
-            rows, t = [np.vstack(x) for x in zip(rows, last, strict=True)], np.append(t, end)
-        q, nu, u, momentum, center = rows
-        return Recording(
-            t=t,
-            q=q,
-            v=state.spread(nu),
-            u=u,
-            momentum=momentum,
-            center=center,
-            steps=round(end / dt),
-            stopped=stopped,
-            engine="compiled",
-        )
 
 
 def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:
@@ -231,6 +197,27 @@ def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:
     if run.stopped.startswith("interrupted"):
         raise KeyboardInterrupt
     return run
+
+
+def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, Any]:
+    """Return the arrays and numbers by which the compiled loop knows a plan, without compiling it.
+
+    Two plans with the same arrays have the same runs.
+    """
+    parts = packed(plan, plant)
+    last = min(plan.times.steps, SLOTS * plan.times.sample)
+    samples = noises(plan, len(parts.law.y), 0, last)[1] if noise_of(plan) else np.zeros(0)
+    found: dict[str, Any] = {"noise": samples}
+
+    def collect(name: str, value: Any) -> None:
+        if isinstance(value, tuple):
+            for index, each in enumerate(value):
+                collect(f"{name}.{index}", each)
+        else:
+            found[name] = value
+
+    collect("loop", parts)
+    return found
 
 
 def _remade(arguments: tuple[Any, ...], engine: str) -> CampaignJob:

@@ -159,7 +159,7 @@ def settling_runs(
         raise InputError(
             f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
             f"1/s: a run would take {horizon / dt:.3g} steps, expected at most "
-            f"{_MOST_STEPS:,}; give a gain whose poles are closer together, or add damping"
+            f"{_MOST_STEPS:,}; give a gain with poles of more similar speed, or add damping"
         )
     if not lin.dt:
         every = max(1, int(horizon / dt / _CHECKS)) if predicts else 4
@@ -197,10 +197,11 @@ class Settling:
 
     # Index into OUTCOMES, and largest relative prediction error.
     FIELDS: ClassVar[tuple[str, ...]] = ("outcome", "error")
+    every = 1
     span = 128  # steps between checks of `over`
 
     def __init__(self, loop: Loop, every: int, step: Array | None) -> None:
-        self._loop, self.every, self._step = loop, every, step
+        self._loop, self.checked_every, self._step = loop, every, step
         self.reset()
 
     def reset(self) -> None:
@@ -216,7 +217,7 @@ class Settling:
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Add the rows (steps, count, ..) from step `first` on."""
         begin, self._next = max(first, self._next), first + len(rows[0])
-        checked = slice(begin - first + -begin % self.every, None, self.every)
+        checked = slice(begin - first + -begin % self.checked_every, None, self.checked_every)
         loop, (q, nu) = self._loop, (each[checked] for each in rows[:2])
         if not (shape := q.shape[:2])[0]:
             return
@@ -276,7 +277,7 @@ def settle(
 def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     """Return the loop of a gain, or raise `InputError` where it cannot settle at the point."""
     if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
-        given = f"robot is a {type(robot).__name__}, lin is a {type(lin).__name__}"
+        given = f"robot has type {type(robot).__name__}, lin has type {type(lin).__name__}"
         raise InputError(f"{given}; expected a fflin.Robot and its fflin.LinearModel")
     K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
     kept = getattr(gain, "regulated", ())

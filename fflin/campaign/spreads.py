@@ -64,17 +64,18 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        {name: spread}, as `monte_carlo` takes it. If `monte_carlo` refuses a name or spread, its
-        message names file and line.
+        {name: spread}, the argument `dispersions` of `monte_carlo`. If a name or spread is
+        invalid, the error of `monte_carlo` names file and line.
 
     Raises
     ------
     FileError
         If the path is not a regular file, or the file cannot be read or is too large.
     UnknownNameError
-        If a table, kind of spread, distribution or parameter is unknown; with file and line.
+        If a table, kind of spread, distribution or parameter is unknown. The message names file
+        and line.
     InputError
-        If the file is not TOML or a value is wrong; with file and line.
+        If the file is not TOML or a value is wrong. The message names file and line.
 
     Examples
     --------
@@ -86,7 +87,7 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     try:
         document = TomlFile(as_path(path))
     except InputError as error:  # q_b = 1 and q_b.sensor = 1 are a number and a table
-        hint = '; names with dots stand in quotes, "q_b.sensor"' * ("overwrite" in str(error))
+        hint = '; put names that contain dots in quotes, "q_b.sensor"' * ("overwrite" in str(error))
         raise InputError(f"{error}{hint}") from None
     table = document.record.get(_TABLE)
     for key in (*document.record, _TABLE):
@@ -127,7 +128,7 @@ def _spread(value: Any) -> Any:
     right = {"normal": given is not entries, "uniform": len(entries) == 2, "values": given}
     if not others and all(map(is_number, entries)) and right.get(form):
         return tuple(entries) if form == "uniform" else given
-    raise InputError(f"{reprlib.repr(value)} is not a spread, expected {_EXPECTED}")
+    raise InputError(f"{reprlib.repr(value)} is not a dispersion, expected {_EXPECTED}")
 
 
 def _distribution(distribution: str, **given: Any) -> Any:
@@ -163,20 +164,24 @@ def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
             middle = np.nan
         if not np.isfinite(middle):
             raise InputError(
-                f"the distribution of '{name}' has no median; give a frozen distribution"
+                f"the distribution of '{name}' has no median; give a frozen distribution of "
+                "scipy.stats"
             )
         return spread.ppf
     if isinstance(spread, tuple):
         if len(spread) != 2:
-            raise InputError(f"'{name}' is {spread!r}, expected (least, largest)")
+            raise InputError(f"'{name}' is {spread!r}, expected the bounds (least, largest)")
         least, largest = (number(f"'{name}'", each) for each in spread)
         if not least <= largest:
-            raise InputError(f"'{name}' is ({least:g}, {largest:g}), expected (least, largest)")
+            raise InputError(
+                f"'{name}' is ({least:g}, {largest:g}), expected bounds (least, largest) with "
+                "least <= largest"
+            )
         return partial(_uniform, least, largest)
     if isinstance(spread, list | np.ndarray):
         values = [number(f"'{name}'", each) for each in np.ravel(spread).tolist()]
         if not values:
-            raise InputError(f"'{name}' is a list without values; give at least one")
+            raise InputError(f"the list of values of '{name}' is empty; give at least one value")
         return partial(_choice, np.array(values))
     deviation = number(f"'{name}'", spread)
     if deviation < 0.0:

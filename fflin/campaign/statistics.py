@@ -28,7 +28,7 @@ from fflin.kernel.tree import LANES
 from fflin.simulation.packing import no_law
 from fflin.simulation.plan import Plan
 from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
-from fflin.simulation.run import Recording
+from fflin.simulation.run import Recording, stop_of
 
 # Kinds of errors with their units; the error of a kind is its largest entry. Wheels and modes are
 # no joints.
@@ -40,7 +40,6 @@ KINDS = {
     "moving": "m/s",
     "rates": "rad/s|m/s",
 }
-STOPS = ("", "diverged", "left the chart", "stopped")
 
 
 class Outcome(NamedTuple):
@@ -59,12 +58,6 @@ class Outcome(NamedTuple):
     input_history: Array  # (N, times, nu), zero after a run was stopped
     stop: Array  # (N,), index into STOPS
     end: Array  # (N,) [s]
-
-
-def stop_of(message: str) -> int:
-    """Return the index into STOPS of the message with which a run ended."""
-    found = (at for at, word in enumerate(STOPS) if word and message.startswith(word))
-    return next(found, len(STOPS) - 1) if message else 0
 
 
 def kinds_of(state: StateMap) -> NDArray[np.intp]:
@@ -166,9 +159,10 @@ def marks_of(
 
 
 class RunStatistics:
-    """Statistics of eight parallel runs in compiled code; see `lanes.Statistics`, `marks_of`."""
+    """Statistics of eight parallel runs in compiled code; see `marks_of`."""
 
     FIELDS: ClassVar[tuple[str, ...]] = Outcome._fields
+    every = 1
     span = 2**20  # steps between checks of `over`
 
     def __init__(

@@ -49,12 +49,12 @@ class Validity(FrozenArrays):
         Levels at which the prediction error was measured.
     prediction_error : ndarray (k,)
         Largest error of the linear closed loop over three time constants, relative to the
-        displacement. Errors are measured in the norm of the loop's Lyapunov function. NaN if a run
-        left the chart.
+        displacement. Errors are measured in the norm of the loop's Lyapunov function. The value
+        is NaN if a run left the chart.
     slope : float
-        Order with which the absolute error grows with the displacement, fitted to the four smallest
-        levels; 2 is expected. NaN if one of these errors is as small as the integration error, or a
-        run left the chart.
+        Exponent of the displacement in the growth of the absolute error, fitted to the four
+        smallest levels; 2 is expected. The value is NaN if one of these errors is as small as the
+        integration error, or a run left the chart.
     trusted : dict
         Displacement {"attitude" [deg], "position" [m], "joint" [joint_unit]} at which
         `prediction_error` reaches 10 %.
@@ -138,8 +138,12 @@ class Validity(FrozenArrays):
         for each in (self, *self.frames.values()) if self.frames else ():
             upto = shown(each.holds, self.joint_unit)
             lines.append(
-                f"feedback in frame {each.frame}: {each.settled} of {count} runs settled, "
-                + (f"all up to {upto}" if each.inside else "not even the smallest displacement")
+                f"with feedback in frame {each.frame}, {each.settled} of {count} runs settled: "
+                + (
+                    f"every run up to {upto} settled"
+                    if each.inside
+                    else "the smallest displacement did not settle"
+                )
             )
         return folded(lines)
 
@@ -170,7 +174,7 @@ def validity(
     progress: Progress | None = None,
     engine: str | None = None,
 ) -> Validity:
-    """Measure for which displacements a linear model predicts the motion and its loop settles.
+    """Find the displacements up to which a linear model predicts the motion and its loop settles.
 
     The nonlinear robot is simulated under ``u = u0 - K (x - x0)``, held between samples if the
     model is sampled. All runs start at displaced configurations with the operating point's
@@ -178,8 +182,8 @@ def validity(
 
     - Displacements of growing size, to compare the motion with the linear prediction.
     - Random displacements. A run has settled if its error falls to a thousandth of its initial
-      value. The time allowed is three times the time that the slowest mode of the linear loop
-      needs.
+      value within the allowed time. The allowed time is three times the settling time of the
+      slowest mode of the linear loop.
 
     With numba the compiled loop computes eight runs at a time.
 
@@ -193,7 +197,7 @@ def validity(
         Gain K, which must stabilise the linear loop.
     attitude, position, joint : float
         Largest displacement of the base [deg] and [m], and of the most displaced joint [rad|m].
-        States that a reduced model lacks, or that are not regulated, are not displaced, and their
+        States that are not in a reduced model, or are not regulated, are not displaced. Their
         displacement is reported as 0.
     samples, seed : int
         Number of random runs, and random seed. The same seed gives the same result for any executor
@@ -201,8 +205,8 @@ def validity(
     confidence : float
         Confidence level of the intervals.
     frames : sequence of {"hybrid", "local", "world"}
-        Further frames in whose axes to test the same linear loop, from the same displacements. The
-        base of the operating point must not be rotated relative to the reference.
+        Other frames in whose axes the same linear loop is tested, with the same displacements.
+        The base of the operating point must not be rotated relative to the reference.
     limits : optional
         Limits at which the inputs saturate, as in `simulate`. By default no input saturates, except
         that thrusters never pull.

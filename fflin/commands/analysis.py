@@ -56,7 +56,7 @@ def add_commands(commands: parser.Commands) -> None:
         commands,
         "equilibrium",
         _equilibrium,
-        "show the inputs that hold a point, the deflection of springs, and the stability",
+        "show the inputs that hold an operating point, the spring deflections and the stability",
         example="fflin equilibrium servicer_7dof --stiffness panel_left=100 --gravity 0 0 -0.01",
         common="joint rpy velocity relative-equilibrium orbit stiffness gravity passive inputs "
         "frame output-file",
@@ -73,18 +73,25 @@ def _add_sensitivity(commands: parser.Commands) -> None:
         commands,
         "sensitivity",
         _sensitivity,
-        "show or save the derivatives of A and B with respect to masses, springs, thrusters ...",
+        "show or save the derivatives of A and B with respect to masses, springs, thrusters and "
+        "others",
         example="fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
         common="joint rpy velocity equilibrium inputs frame dt top only output-file",
     )
     options.add_point(sensitivity)
     model = sensitivity.group("derivatives")
-    model.add("--dt", "differentiate the sampled model, with inputs held for H [s]", float, "H")
+    model.add(
+        "--dt",
+        "differentiate the model sampled at the sample time H [s] with zero-order hold",
+        float,
+        "H",
+    )
     top = "show the N parameters with the largest effect"
     model.add("--top", top, int, default=15)
     model.add(
         "--only",
-        "show only the parameters of this kind, link or pattern, such as mass, link_3, *.density",
+        "show only these parameters. NAME is a kind, a link or a pattern, such as mass, link_3 or "
+        "*.density",
         metavar="NAME",
     )
     what = "dA, dB, df0 for each parameter"
@@ -96,20 +103,24 @@ def _add_uncertain(commands: parser.Commands) -> None:
         commands,
         "uncertain",
         _uncertain,
-        "show or save the exact linear-fractional model (LFT) at rest for uncertain parameters",
+        "show or save the exact linear-fractional model (LFT) of a robot at rest with uncertain "
+        "parameters",
         example="fflin uncertain servicer_7dof --vary base.mass=0.2 "
         "--vary panel_left.stiffness=80:120 -o uncertain.mat",
     )
     point = uncertain.group(parser.POINT)
-    neutral = "position of a joint [rad|m]; by default as in robot.toml, else neutral"
+    neutral = (
+        "position of a joint [rad|m]. The default is the position in robot.toml, or the neutral "
+        "position"
+    )
     point.add("--joint", neutral, parser.assignment, repeatable=True)
     options.add_robot(uncertain)
     options.add_system(uncertain)
     uncertain.group("parameters").add(
         "--vary",
-        "range of a parameter named by `fflin sensitivity`, or of all parameters that match a "
-        "pattern: a fraction of the nominal value, such as 0.2, or LEAST:LARGEST. With RANGE,tied "
-        "all parameters of the pattern share one delta",
+        "range of the parameter NAME, or of all parameters that match a pattern; `fflin "
+        "sensitivity` lists the names. RANGE is a fraction of the nominal value, such as 0.2, or "
+        "LEAST:LARGEST. With RANGE,tied all parameters of the pattern share one delta",
         _range,
         "NAME=RANGE",
         repeatable=True,
@@ -186,7 +197,7 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
     from fflin.linear.linearization import linearize
 
     if arguments.effort:
-        raise InputError("--effort sets the inputs, which this command computes; remove --effort")
+        raise InputError("this command computes the inputs at the point; remove --effort")
     robot, q, v, reference = point_of(arguments)
     if arguments.relative_equilibrium:
         q, reference = attitude(robot, q, arguments.relative_equilibrium, arguments.frame)
@@ -260,7 +271,7 @@ def _uncertain(arguments: argparse.Namespace) -> Report:
 
     robot, ranges = load_robot(arguments), once("--vary", arguments.vary)
     if robot.point.get("velocity"):
-        text = "uncertain is about rest; the velocity of [point] is ignored"
+        text = "the uncertain model is at rest, so that the velocity in [point] is ignored"
         warnings.warn(text, FflinWarning, stacklevel=2)
     base, joints = base_of(robot.point), robot.point.get("joints")
     lft = uncertain(robot, ranges).lft(placed(robot, "--joint", arguments.joint, base, joints))

@@ -138,8 +138,8 @@ def require_own_kind(arguments: argparse.Namespace) -> None:
     if found not in kinds and path.stat().st_size:
         there = f"holds a {found}" if found else "exists and is not a result of fflin"
         raise FileError(
-            f"{path} {there}; without --force this command replaces only files of kind "
-            f"{' or '.join(kinds)}. Name another file or add --force"
+            f"{path} {there}; without --force, this command replaces only files that contain a "
+            f"{' or '.join(kinds)}. Give another file name, or add --force"
         )
 
 

@@ -49,12 +49,16 @@ def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> 
 
 def refuse_law(arguments: argparse.Namespace) -> None:
     """Refuse the options of a regulator together with --free."""
-    _refuse(arguments, ("limit", "delay"), "--free has no input to limit or delay")
+    _refuse(
+        arguments,
+        ("limit", "delay"),
+        "--free means no inputs, so that limits and delays have no effect",
+    )
     names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "reduce", "allocate", "gain", "controller", "mpc")
     _refuse(
         arguments,
         names,
-        "--free has no regulator, so that weights, a target or thrusters have no effect",
+        "--free means no regulator, so that weights, a target or thrusters have no effect",
     )
 
 
@@ -65,8 +69,8 @@ def add_loop(command: parser.Command) -> None:
     options.add_pose(start)
     start.add(
         "--offset",
-        "initial error relative to the start of the trajectory, in base axes. NAME is a state, "
-        "group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]",
+        "initial error from the start of the trajectory, in base axes. NAME is a state, group or "
+        "pattern such as r_b.x, q_m or omega_b.z (SI units), or roll, pitch or yaw [deg]",
         parser.assignment,
         repeatable=True,
     )
@@ -78,13 +82,13 @@ def add_loop(command: parser.Command) -> None:
     run = command.group(parser.SIMULATION)
     run.add(
         "--duration",
-        "duration [s]; by default the duration of the trajectory, or the settling time of the "
-        "linear loop, between 60 and 600 s",
+        "duration [s]. The default is the duration of the trajectory; without a trajectory, the "
+        "settling time of the linear loop, limited to 60 ... 600 s",
         float,
         "T",
     )
     options.add_step(run)
-    methods = "integrator: cf4 (default), rkmk4 or semi_implicit_euler"
+    methods = "integration method: cf4 (default), rkmk4 or semi_implicit_euler"
     run.add("--method", methods, metavar="METHOD", default="cf4")
     options.add_system(command)
     options.add_frame(run)
@@ -93,40 +97,40 @@ def add_loop(command: parser.Command) -> None:
 def _add_controllers(group: parser.Group) -> None:
     group.add(
         "--schedule",
-        "follow the trajectory with the gains that tvlqr saved; without this option, gains are "
-        "designed along --trajectory",
+        "follow the trajectory with gains saved by `fflin tvlqr`. By default, gains are designed "
+        "along --trajectory",
         Path,
     )
     group.add(
         "--gain",
-        "use a gain that lqr saved, and regulate to the operating point for which this gain was "
-        "designed",
+        "use a gain saved by `fflin lqr`, and regulate to the operating point of its design",
         Path,
     )
     group.add(
         "--controller",
-        "use a linear controller K with positive feedback, u - u0 = K (y - y0) about the target: "
-        ".mat, .npz or .json with A, B, C, D, and dt or Ts if it is sampled. y is set by --output",
+        "use a linear controller K with positive feedback, u - u0 = K (y - y0), about the target. "
+        "FILE (.mat, .npz or .json) contains A, B, C, D, and dt or Ts if the controller is "
+        "sampled. --output defines y",
         Path,
     )
     group.switch(
         "--negative-feedback",
-        "the controller assumes negative feedback, u - u0 = -K (y - y0)",
+        "use the controller of --controller with negative feedback, u - u0 = -K (y - y0)",
     )
     group.yes_or_no(
         "--allocate",
-        "design with torque and force on the base, and allocate the nearest wrench to the "
-        "thrusters, which cannot pull. This is the default if the thrusters can push in every "
-        "direction. With --no-allocate, negative thrust is set to zero",
+        "design the regulator with base torque and force, and let thrusters produce the nearest "
+        "possible wrench. Allocation is the default if the thrusters can push in every direction. "
+        "With --no-allocate, negative thrust is set to zero",
     )
     group.switch(
         "--mpc",
-        "use model predictive control with the limits of the robot; it needs --sample",
+        "use model predictive control (MPC) with the limits of the robot; MPC requires --sample",
     )
     group.add("--horizon", "number of samples in the horizon of --mpc", int, default=20)
-    group.switch("--free", "simulate without a regulator and without inputs")
+    group.switch("--free", "simulate the robot without a regulator and without inputs")
     options.add_limits(group)
-    delay = "time [s] from a sample until its command acts"
+    delay = "delay [s] from a sample until the command computed from this sample acts"
     group.add("--delay", delay, float, "T", default=0.0)
 
 
@@ -144,7 +148,7 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         "duration": arguments.duration,
     }
     if not arguments.controller:
-        _refuse(arguments, ("negative_feedback",), "only a --controller has a feedback sign")
+        _refuse(arguments, ("negative_feedback",), "only --controller has a feedback sign")
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
         return Loop(policy, settings | start)
@@ -334,7 +338,8 @@ def require_held(robot: Robot, policy: Any, q: Array) -> None:
     if loose and loose == beside:
         raise InputError(
             f"the start differs from the target only in states that are not regulated: "
-            f"{listed(loose)}; no input would act: give inputs that move them, or another start"
+            f"{listed(loose)}, so that no input would act; give inputs that move these states, or "
+            "another start"
         )
     if loose:
         text = (

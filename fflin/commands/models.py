@@ -34,7 +34,8 @@ def add_commands(commands: parser.Commands) -> None:
         commands,
         "info",
         _info,
-        "show mass, inertia, wheels and thrusters at a point, and tree, limits and settings",
+        "show mass, inertia, wheels and thrusters at a configuration, and the joint tree, limits "
+        "and settings",
         example="fflin info servicer_7dof",
     )
     options.add_robot(info)
@@ -44,10 +45,10 @@ def add_commands(commands: parser.Commands) -> None:
         commands,
         "init",
         _init,
-        "write a first robot.toml from a URDF: inputs, limits, joints without a motor",
+        "write a first robot.toml for a URDF, with its inputs, limits and joints without a motor",
         example="fflin init my.urdf && fflin simulate my.toml",
     )
-    urdf = "path of a URDF, or name of a robot in `fflin robots`"
+    urdf = "path of a URDF, or a robot name listed by `fflin robots`"
     init.add_argument("robot", metavar="URDF", type=parser.input_name, help=urdf)
     what = "the robot file (by default the URDF's name with .toml, in the current folder)"
     options.add_output_file(
@@ -72,10 +73,10 @@ def _add_linearize(commands: parser.Commands) -> None:
     )
     options.add_point(linearize)
     made = linearize.group(parser.OUTPUT)
-    made.add("--dt", "sample the model, with inputs held for H [s]", float, "H")
+    made.add("--dt", "sample the model at the sample time H [s] with zero-order hold", float, "H")
     made.add(
         "--for",
-        "convert the model to the coordinates of this tool; needs -o FILE",
+        "convert the model to the coordinates of a tool, and save the result; requires -o FILE",
         choices=("drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"),
         dest="tool",
     )
@@ -100,7 +101,7 @@ def _add_check(commands: parser.Commands) -> None:
     options.add_point(check)
     add_trajectory(check)
     shown = check.group(parser.OUTPUT)
-    tolerance = "relative tolerance of all errors; by default each error has its own"
+    tolerance = "relative tolerance of all errors. By default, each error has a different tolerance"
     shown.add("--tolerance", tolerance, float, "X")
     options.add_figure(check, "the errors and their tolerances")
 
@@ -178,11 +179,13 @@ def _init(arguments: argparse.Namespace) -> Report:
 
     found = find_robot(arguments.robot)
     if found.path.suffix.lower() == ".toml":
-        raise InputError(f"{found.path} is already a robot file; give a URDF")
+        raise InputError(f"{found.path} is already a robot file; give the path of a URDF")
     target = arguments.output_file or Path(f"{found.name}.toml")
     check_output_path(target)
     if target.exists() and not arguments.force:
-        raise FileError(f"{target} already exists; give another name with -o, or add --force")
+        raise FileError(
+            f"{target} already exists; give another name with -o, or replace the file with --force"
+        )
     urdf = found.name
     if found.origin == "file":
         urdf = os.path.relpath(os.path.realpath(found.path), os.path.realpath(target.parent))
@@ -191,14 +194,18 @@ def _init(arguments: argparse.Namespace) -> Report:
         robot = load(arguments.robot)
     write_atomically({target: draft(robot, urdf).encode()})
     load(target)  # warns of settings that the file leaves open
-    text = f"robot file of '{robot.name}'; try: fflin simulate {target}"
+    text = (
+        f"wrote {target}, a robot file of '{robot.name}'; to simulate the robot, run: fflin "
+        f"simulate {target}"
+    )
     return Report(robot.name, {}, text, {target: None})
 
 
 def _linearize(arguments: argparse.Namespace) -> Report:
     if arguments.tool and (arguments.trajectory or not arguments.output_file):
         raise InputError(
-            "--for saves a model at a point; give it with -o FILE and without --trajectory"
+            "--for converts a model at a point and saves it; use --for with -o FILE and without "
+            "--trajectory"
         )
     if arguments.output_file and (arguments.tool or arguments.trajectory):
         check_ending(arguments.output_file, parser.RECORD.endings)

@@ -23,8 +23,8 @@ def add_commands(commands: parser.Commands) -> None:
         commands,
         "montecarlo",
         _montecarlo,
-        "simulate a loop many times with random parameters; show quantiles, success rates, the "
-        "worst runs and their causes",
+        "simulate a control loop many times with random parameters; show quantiles, success rates "
+        "and the worst runs with their causes",
         example="fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png",
         common="runs seed until width confidence workers goal worst joint rpy trajectory "
         "gain schedule duration inputs output-file plot",
@@ -34,7 +34,7 @@ def add_commands(commands: parser.Commands) -> None:
         "dispersions",
         metavar="DISPERSIONS",
         type=parser.input_file,
-        help="TOML file with a table [dispersions] of the random parameters, for "
+        help="TOML file with a table [dispersions] that defines the random parameters; see "
         "fflin.load_dispersions",
     )
     runs = montecarlo.group("runs")
@@ -42,30 +42,30 @@ def add_commands(commands: parser.Commands) -> None:
     runs.add("--seed", "random seed", parser.whole, "S", default=0)
     runs.add(
         "--until",
-        "stop when the confidence interval of the success rate of a condition, such as 'attitude < "
-        "1 deg', is at most --width wide",
+        "stop when the success rate of CONDITION, such as 'attitude < 1 deg', has a confidence "
+        "interval of at most --width",
         metavar="CONDITION",
     )
-    width = "width of the confidence interval at which --until stops"
+    width = "width of the confidence interval at which --until stops the runs"
     runs.add("--width", width, float, "P", default=0.02)
     runs.add("--confidence", "confidence level of all intervals", float, "P", default=0.95)
     runs.add("--workers", "distribute the runs over N processes", int)
-    threads = "distribute the runs over N threads; by default one for each core"
+    threads = "distribute the runs over N threads; by default one per core"
     runs.add("--threads", threads, int)
     dask = "distribute the runs over the workers of a dask scheduler"
     runs.add("--dask", dask, metavar="ADDRESS")
     shown = montecarlo.group(parser.OUTPUT)
     shown.add(
         "--goal",
-        "report the fraction of runs that meet a condition, such as 'attitude < 1 deg and settle < "
-        "60 s', and draw the bounds of the condition",
+        "report the fraction of runs that meet CONDITION, such as 'attitude < 1 deg and settle < "
+        "60 s', and plot the bounds in CONDITION",
         metavar="CONDITION",
         repeatable=True,
     )
     shown.add("--worst", "list the K worst runs", parser.whole, "K", default=3)
     options.add_figure(montecarlo, "quantile bands over time, histograms and the worst runs")
-    what = "the runs, which are collected in FILE.part, from which the same command resumes,"
-    force = "replace the file of -o even if another call wrote it"
+    what = "the runs (after an interruption, the same command resumes from FILE.part)"
+    force = "replace the file of -o even if the file contains another campaign"
     options.add_output_file(shown, what, parser.ROWS, force=force)
     add_pictures(montecarlo, "that plays the worst run, with the paths of other runs as thin lines")
 

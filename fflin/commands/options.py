@@ -29,7 +29,9 @@ class _FormerName(argparse.Action):
 
     def __call__(self, _: Any, given: argparse.Namespace, value: Any, option: Any = None) -> None:
         new = f"--{self.dest.replace('_', '-')}"
-        warnings.warn(f"{option} is now {new}; write {new} {value}", FflinWarning, stacklevel=2)
+        warnings.warn(
+            f"{option} has the new name {new}; write {new} {value}", FflinWarning, stacklevel=2
+        )
         setattr(given, self.dest, value)
 
 
@@ -41,12 +43,12 @@ def add_former_name(group: Group, name: str, new: str) -> None:
 
 def add_robot(command: Command) -> None:
     """Add ROBOT and --lock."""
-    what = "name of a robot in `fflin robots`, or path of a URDF or of a robot.toml"
+    what = "robot name listed by `fflin robots`, or path of a URDF or robot.toml"
     command.add_argument("robot", metavar="ROBOT", type=input_name, help=what)
     command.group(ROBOT).add(
         "--lock",
-        "lock a joint at VALUE [rad|m], or at its neutral position; NAME may be a pattern such as "
-        "'hinge_*', here and in all other options",
+        "lock a joint at VALUE [rad|m]; by default at its neutral position. In all options, NAME "
+        "may be a pattern such as 'hinge_*'",
         lock,
         repeatable=True,
     )
@@ -67,7 +69,7 @@ def add_pose(group: Group) -> None:
     """Add the options for the configuration and velocity of the robot."""
     group.add(
         "--joint",
-        "position of a joint [rad|m]; other joints are as in robot.toml, or at their neutral "
+        "position of a joint [rad|m]. The default is the position in robot.toml, or the neutral "
         "position",
         assignment,
         repeatable=True,
@@ -77,7 +79,8 @@ def add_pose(group: Group) -> None:
     group.add("--position", "base position [m]", float, ("X", "Y", "Z"))
     group.add(
         "--velocity",
-        "velocity of a joint or wheel [rad/s|m/s], or omega_b.x ... v_b.z of the base in base axes",
+        "velocity of a joint or wheel [rad/s|m/s], or a component omega_b.x ... v_b.z of the base "
+        "velocity in base axes",
         assignment,
         repeatable=True,
     )
@@ -87,8 +90,8 @@ def add_target(group: Group) -> None:
     """Add the options for the configuration and velocity of the target."""
     group.add(
         "--target-joint",
-        "target position of a joint [rad|m]; by default [target] of robot.toml, then its [point], "
-        "then the neutral position",
+        "target position of a joint [rad|m]. The default is the value in [target] of robot.toml, "
+        "then in [point], then the neutral position",
         assignment,
         repeatable=True,
     )
@@ -97,8 +100,8 @@ def add_target(group: Group) -> None:
     group.add("--target-position", "target position of the base [m]", float, ("X", "Y", "Z"))
     group.add(
         "--target-velocity",
-        "target velocity, such as the speed of a wheel. In a simulation it is also the initial "
-        "velocity unless --velocity is given",
+        "target velocity, such as the speed of a wheel. In a simulation, the target velocity is "
+        "also the initial velocity unless --velocity is given",
         assignment,
         repeatable=True,
     )
@@ -108,16 +111,16 @@ def add_limits(group: Group) -> None:
     """Add --limits and --limit."""
     group.add(
         "--limits",
-        "limits of the inputs: urdf (default) uses the limits of the robot and of --limit, none "
-        "uses --limit alone. The limits of the robot are the efforts of the URDF, max and min of "
-        "the inputs, and the speeds of the wheels",
+        "limits of the inputs. `urdf` (default) uses the limits of the robot and of --limit; "
+        "`none` uses only --limit. The limits of the robot are the efforts in the URDF, max and "
+        "min of the inputs, and the speeds of the wheels",
         choices=("urdf", "none"),
         default="urdf",
     )
     group.add(
         "--limit",
-        "largest magnitude of an input, or of all inputs of a group such as tau_m or a pattern. "
-        "This value takes precedence over --limits",
+        "largest magnitude of an input, or of all inputs in a group or pattern such as tau_m. This "
+        "limit replaces the limit of the robot",
         assignment,
         repeatable=True,
     )
@@ -133,13 +136,13 @@ def settle_step(arguments: argparse.Namespace) -> None:
     """Set --dt and --sample from their former names, --step and --dt, with a warning."""
     said = ""
     if arguments.step is not None:
-        said = "--step is now --dt, the integration step"
+        said = "the integration step --step has the new name --dt"
         if arguments.dt is not None:
-            said += ", and --dt is now --sample, the sample time of the controller"
+            said += ", and the sample time --dt has the new name --sample"
             arguments.sample = arguments.dt
         arguments.dt = arguments.step
     elif arguments.dt is not None and arguments.sample is None:
-        said = "--dt is the integration step; the sample time of the controller is --sample"
+        said = "--dt is the integration step; give the sample time of the controller by --sample"
     if said:
         warnings.warn(said, FflinWarning, stacklevel=2)
 
@@ -148,21 +151,22 @@ def add_inputs_there(group: Group) -> None:
     """Add the options for the inputs at the operating point."""
     group.add(
         "--effort",
-        "input at the operating point, by its name in u, such as tau_m.joint_1",
+        "value of an input at the operating point. NAME is the name of the input in u, such as "
+        "tau_m.joint_1",
         assignment,
         repeatable=True,
     )
     group.switch(
         "--equilibrium",
-        "apply the minimum-norm inputs that balance springs, gravity and the inertial forces of a "
-        "steady motion at the operating point. Passive joints sag on their springs. If no inputs "
-        "hold the point, the command reports an error",
+        "apply the minimum-norm inputs that make the operating point an equilibrium under springs "
+        "and gravity, or a steady motion. Passive joints deflect their springs to balance the "
+        "load. If no inputs hold the point, the command reports an error",
     )
     group.add(
         "--relative-equilibrium",
-        "in orbit, use the N-th (default: first) of the 24 attitudes without gravity-gradient "
-        "torque, and the inputs that --equilibrium computes. Attitude and position in the state "
-        "are relative to this pose",
+        "for a robot in orbit: use the N-th of the 24 attitudes without gravity-gradient torque (1 "
+        "by default), and the inputs that --equilibrium computes. Attitude and position in the "
+        "state are relative to the pose of this equilibrium",
         int,
         "N",
         nargs="?",
@@ -175,8 +179,8 @@ def add_reference(group: Group) -> None:
     """Add the option for the reference of attitude and position."""
     group.add(
         "--reference",
-        "reference of attitude and position in the state: the base pose of the operating point "
-        "(default), or the world",
+        "reference pose of attitude and position in the state: the base pose at the operating "
+        "point (base, default), or the world frame (world)",
         choices=("base", "world"),
         default="base",
     )
@@ -186,11 +190,12 @@ def add_frame(group: Group) -> None:
     """Add the option for the axes of velocities and wrenches."""
     group.add(
         "--frame",
-        "axes of velocities and wrenches. hybrid (default): angular parts in base axes, linear "
-        "parts in reference axes; local: all in base axes; world: all in reference axes. For a "
-        "robot in orbit, the axes are as in hybrid, and the orbital frame is the world. lvlh "
-        "(default): x along the orbit, y opposite to the orbit normal, z towards the central body; "
-        "hill: x away from the central body, y along the orbit, z along the orbit normal",
+        "axes of base velocities and wrenches. `hybrid` (default) uses base axes for angular parts "
+        "and reference axes for linear parts. `local` uses base axes for all parts, and `world` "
+        "uses reference axes for all parts. A robot in orbit has the axes of `hybrid`, and an "
+        "orbital frame is its world. In `lvlh` (default in orbit), x is along the orbit, y "
+        "opposite to the orbit normal and z towards the central body. In `hill`, x is away from "
+        "the central body, y along the orbit and z along the orbit normal",
         choices=("hybrid", "local", "world", "lvlh", "hill"),
     )
 
@@ -199,8 +204,8 @@ def add_orbit(group: Group) -> None:
     """Add --orbit."""
     group.add(
         "--orbit",
-        "circular orbit at an altitude [m] above the earth (default), moon, mars ...; the world is "
-        "then the frame of the orbit",
+        "circular orbit at an altitude [m] above a central body: earth (default), moon, mars ... "
+        "The world is then the orbital frame",
         orbit,
     )
 
@@ -217,8 +222,8 @@ def add_system(command: Command) -> None:
     )
     group.add(
         "--damping",
-        "damping of a joint [N m s/rad|N s/m], or one value for all joints; `urdf` uses the "
-        "damping in the URDF",
+        "damping of a joint [N m s/rad|N s/m], or one value for all joints. The value `urdf` means "
+        "the damping in the URDF",
         joint_or_all,
         repeatable=True,
     )
@@ -226,14 +231,14 @@ def add_system(command: Command) -> None:
     group.add("--gravity", gravity, float, ("X", "Y", "Z"))
     group.add(
         "--passive",
-        "treat this joint as having no motor: the default inputs omit its torque",
+        "joint without a motor: the default inputs do not include a torque at this joint",
         metavar="NAME",
         repeatable=True,
     )
     group.add(
         "--inputs",
-        "inputs of the robot: a file for fflin.load_inputs, a bundled name, `joints` (joint "
-        "torques only) or `base` (base torque and force only). The default is the inputs of "
+        "inputs of the robot: a TOML file of inputs, a bundled name such as cubesat, `joints` "
+        "(joint torques only) or `base` (base torque and force only). The default is the inputs in "
         "robot.toml, or base torque, base force and all joint torques",
         input_name,
     )
@@ -241,8 +246,8 @@ def add_system(command: Command) -> None:
         "--output",
         "outputs of the model: state (default), base, joints, rates, joints:NAME, rates:NAME (a "
         "joint or a pattern), com, momentum, frame:NAME (pose and velocity), pose:NAME, "
-        "velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (NAME relative to "
-        "frame TO)",
+        "velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (frame NAME relative "
+        "to frame TO)",
         metavar="SPEC",
         repeatable=True,
     )
@@ -258,7 +263,10 @@ def add_output_file(
     what = f"save {what} to FILE: {endings}"
     group.add_argument("-o", "--output-file", metavar="FILE", type=endings, help=what)
     if kinds:
-        force = "allow -o to replace a file that does not contain the same kind of result"
+        force = (
+            "let -o replace a file of any content; by default -o replaces only results of the same "
+            "kind"
+        )
         group.set_defaults(kinds=kinds)
     group.switch("--force", force)
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Commands: TypeAlias = "argparse._SubParsersAction[Command]"
 
 # Titles of groups of options in the help. Those of ROBOT repeat settings of a robot.toml.
-POINT, ROBOT, OUTPUT = "operating point", "robot, in place of robot.toml", "output"
+POINT, ROBOT, OUTPUT = "operating point", "robot (these options override robot.toml)", "output"
 TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 
 
@@ -224,7 +224,7 @@ def command(
         description=f"{summary[0].upper()}{summary[1:]}.",
         epilog=f"example: {example}",
     )
-    about = "show the common options; --help all describes every option"
+    about = "show help for the common options; --help all shows help for all options"
     command.add_argument("-h", "--help", nargs="?", metavar="all", action=_Help, help=about)
     command.set_defaults(run=run, command=command, common=[*common.split(), "json"] * bool(common))
     command.group(OUTPUT).switch("--json", "print the results as one JSON object")
@@ -264,7 +264,7 @@ def short_help(command: argparse.ArgumentParser) -> str:
         formatter.end_section()
     formatter.add_text(command.epilog)
     if options:
-        formatter.add_text(f"all {len(every) - 1} options in full: {command.prog} --help all")
+        formatter.add_text(f"help for all {len(every) - 1} options: {command.prog} --help all")
     return formatter.format_help()
 
 

@@ -77,7 +77,7 @@ def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(values) < len(pairs):
         names = [name for name, _ in pairs]
         double = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{option} names '{double}' twice; give it one value")
+        raise InputError(f"{option} gives '{double}' two values; give one value")
     return values
 
 
@@ -156,7 +156,8 @@ def refuse_pose(arguments: argparse.Namespace, prefix: str = "") -> None:
     if arguments.relative_equilibrium and any(getattr(arguments, name) for name in names):
         rpy, position = (f"--{name.replace('_', '-')}" for name in names)
         raise InputError(
-            f"--relative-equilibrium sets the base pose, as {rpy} and {position} do; give either"
+            f"--relative-equilibrium sets the base pose, but so do {rpy} and {position}; give only "
+            "one of these options"
         )
 
 

@@ -34,7 +34,7 @@ def _add_validity(commands: parser.Commands) -> None:
         commands,
         "validity",
         _validity,
-        "measure how far the robot can be displaced until the linear model or its regulator fails",
+        "find how far the robot can be displaced before the linear model or its regulator fails",
         example="fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
         common="joint inputs weights q r bryson sample reduce attitude offset spread samples seed "
         "jobs limits frames plot",
@@ -47,16 +47,17 @@ def _add_validity(commands: parser.Commands) -> None:
     runs.add("--spread", "largest displacement of a joint [rad|m]", float, "X", default=1.0)
     runs.add("--samples", "number of random runs", int, default=100)
     runs.add("--seed", "random seed of the runs", parser.whole, "S", default=0)
-    runs.add("--jobs", "number of processes, at most one for each core", int, default=1)
+    runs.add("--jobs", "number of processes; at most one per core", int, default=1)
     runs.add(
         "--limits",
-        "saturate the inputs at the limits of the robot (urdf), or never (none, default)",
+        "urdf: saturate the inputs at the limits of the robot; none (default): do not saturate the "
+        "inputs",
         choices=("urdf", "none"),
         default="none",
     )
     runs.add(
         "--frames",
-        "also test the loop with base velocities and inputs in these axes",
+        "also test the regulator with base velocities and wrenches in these axes",
         choices=("hybrid", "local", "world"),
         nargs="+",
         default=(),
@@ -69,7 +70,7 @@ def _add_funnel(commands: parser.Commands) -> None:
         commands,
         "funnel",
         _funnel,
-        "measure from which errors the regulator along a trajectory still reaches a goal",
+        "find the initial errors from which the regulator along a trajectory reaches a goal",
         example="fflin funnel arm.toml --trajectory plan.csv --schedule gains.npz "
         "--goal attitude=1",
         common="trajectory schedule goal within weights q r knots samples seed threads "
@@ -83,20 +84,19 @@ def _add_funnel(commands: parser.Commands) -> None:
     runs, shown = funnel.group("runs"), funnel.group(parser.OUTPUT)
     funnel.group(parser.CONTROLLER).add(
         "--schedule",
-        "use the gains that tvlqr saved; without this option, gains are designed along the "
-        "trajectory",
+        "use gains saved by `fflin tvlqr`. By default, gains are designed along the trajectory",
         Path,
     )
     goal = f"largest error allowed at the end: {_ERRORS}"
     runs.add("--goal", goal, parser.assignment, repeatable=True)
-    within = "largest error allowed at any time of a run; names as in --goal"
+    within = "largest error allowed at any time of a run. NAME is as in --goal"
     runs.add("--within", within, parser.assignment, repeatable=True)
     options.add_limits(runs)
     runs.add("--knots", "number of knots to test", int, default=10)
     runs.add("--samples", "number of runs from each knot", int, default=100)
     runs.add("--seed", "random seed of the runs", parser.whole, "S", default=0)
     runs.add("--confidence", "confidence level of the intervals", float, "P", default=0.95)
-    runs.add("--threads", "number of threads; by default one for each core", int)
+    runs.add("--threads", "number of threads; by default one per core", int)
     options.add_step(runs)
     shown.add("--html", "write a page that plays the motion with the funnel as a tube", parser.PAGE)
     options.add_figure(funnel, "the funnel")
@@ -104,7 +104,7 @@ def _add_funnel(commands: parser.Commands) -> None:
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 
-_FREE = "as large as it takes; --limits urdf cuts them"
+_FREE = "not limited; --limits urdf saturates the inputs"
 
 
 def _validity(arguments: argparse.Namespace) -> Report:
@@ -137,7 +137,7 @@ def _validity(arguments: argparse.Namespace) -> Report:
         bar.close()
     text = str(found)
     if cut or any(name in lin.limits for name in lin.input_names):
-        text += "\ninputs were " + ("cut to the limits of the robot" if cut else _FREE)
+        text += "\ninputs were " + ("saturated at the limits of the robot" if cut else _FREE)
     return Report(robot.name, found, text, {arguments.plot: figure_of("plot_validity", found)})
 
 

@@ -36,7 +36,7 @@ def _add_lqr(commands: parser.Commands) -> None:
     options.add_point(lqr)
     add_weights(lqr)
     options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD, "Gain")
-    options.add_figure(lqr, "the poles, and the loop of each input with its margins,")
+    options.add_figure(lqr, "the poles, and the loop gain of each input with its margins,")
 
 
 def _add_export(commands: parser.Commands) -> None:
@@ -50,19 +50,22 @@ def _add_export(commands: parser.Commands) -> None:
     what = "gain, compensator or gain schedule saved by fflin: .npz, .mat or .json"
     export.add_argument("file", metavar="FILE", type=parser.input_file, help=what)
     group = export.group(parser.OUTPUT)
-    folder = "folder of the code; it is made if necessary"
+    folder = "folder for the code; a missing folder is created"
     group.add_argument("-o", "--output-folder", metavar="FOLDER", required=True, help=folder)
     group.add(
         "--robot",
-        "robot that the design was made for: a name in `fflin robots`, a URDF or a robot.toml. By "
-        "default the robot that FILE names",
+        "robot of the design: a name listed by `fflin robots`, or the path of a URDF or "
+        "robot.toml. The default is the robot named in FILE",
         metavar="ROBOT",
         type=parser.input_name,
     )
-    limits = "limit the inputs as in simulate (urdf), or not (none, default)"
+    limits = (
+        "urdf: saturate the inputs at the limits of the robot, as `fflin simulate` does; none "
+        "(default): do not saturate the inputs"
+    )
     group.add("--limits", limits, choices=("urdf", "none"), default="none")
-    group.add("--name", "prefix of the names in C", metavar="NAME", default="controller")
-    real = "type of the numbers; double by default"
+    group.add("--name", "prefix of all names in the C code", metavar="NAME", default="controller")
+    real = "floating-point type in the C code; double by default"
     group.add("--real", real, choices=("double", "float"), default="double")
 
 
@@ -74,36 +77,37 @@ def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
     group = command.group(parser.CONTROLLER)
     group.add(
         "--weights",
-        "rule that sets all weights not given by --q, --r or --bryson. `urdf` (default) keeps the "
-        "inputs within the limits of the URDF for displacements of 30 deg of the base and 0.3 rad "
-        "of the joints; `identity` sets every weight to 1",
+        "rule for all weights that --q, --r and --bryson do not set. `urdf` (default) keeps the "
+        "inputs within the limits of the URDF after displacements of 30 deg of the base and 0.3 "
+        "rad of the joints. `identity` sets every weight to 1",
         choices=("urdf", "identity"),
     )
     group.add(
         "--q",
-        "weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b, q_m.hinge_*",
+        "weight on states. NAME is a state, a group or a pattern, such as q_m.joint_1, q_b or "
+        "q_m.hinge_*",
         parser.assignment,
         "NAME=W",
         repeatable=True,
     )
     group.add(
         "--r",
-        "weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*",
+        "weight on inputs. NAME is an input, a group or a pattern, such as tau_b or tau_m.hinge_*",
         parser.assignment,
         "NAME=W",
         repeatable=True,
     )
     group.add(
         "--bryson",
-        "largest acceptable value of a state, an input or a group, which gets the weight "
-        "1/VALUE^2. The other weights, from the rule, are scaled to match",
+        "largest acceptable value of a state, an input or a group. The weight is 1/VALUE^2, and "
+        "the weights of the rule are scaled to match",
         parser.assignment,
         repeatable=True,
     )
     group.add(
         "--sample",
-        "sample time of the controller [s]: inputs are held for H; the continuous-time cost is "
-        "still minimised",
+        "sample time of the controller [s], with zero-order hold of the inputs. The sampled gain "
+        "minimises the continuous-time cost",
         float,
         "H",
     )
@@ -111,13 +115,13 @@ def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
         options.add_former_name(group, "--dt", "sample")
     group.switch(
         "--reduce",
-        "if momentum is conserved, regulate only the states that the inputs can control",
+        "regulate only the states that the inputs can control if momentum is conserved",
     )
     group.yes_or_no(
         "--wheel-speeds",
-        "whether to return the speeds of reaction wheels to their values at the operating point. "
-        "By default, they are returned if thrusters or a base torque can absorb the wheel torque. "
-        "--wheel-speeds also returns the combinations of wheel speeds that exert no net torque on "
+        "regulate the speeds of reaction wheels to their values at the operating point, or not. By "
+        "default, wheel speeds are regulated if thrusters or a base torque can absorb the wheel "
+        "torque. --wheel-speeds also regulates combinations of wheel speeds without net torque on "
         "the robot (redundant wheels)",
     )
 
@@ -185,7 +189,7 @@ def _export(arguments: argparse.Namespace) -> Report:
     kind = kind_of(arguments.file)
     if kind not in kinds and arguments.file.is_file():
         raise FileError(
-            f"{arguments.file} holds {kind or 'no result of fflin'}, expected a Gain, a "
+            f"{arguments.file} contains {kind or 'no result of fflin'}, expected a Gain, a "
             "GainSchedule or a Compensator"
         )
     law = kinds.get(kind, Gain).load(arguments.file)

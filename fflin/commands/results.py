@@ -57,7 +57,7 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
             if path is None:
                 continue
             if report.interrupted and path.exists():
-                said.append(f"{path} is left as it was")
+                said.append(f"{path} is unchanged")
                 continue
             if write:
                 write(path)

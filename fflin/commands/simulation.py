@@ -44,11 +44,11 @@ def _add_plan(commands: parser.Commands) -> None:
     group = plan.group(parser.TRAJECTORY)
     group.add("--duration", "duration of the motion [s]", float, "T", required=True)
     group.add("--knots", "number of equally spaced knots", int, default=101)
-    hold = "inputs between knots: held (previous, default), or interpolated (linear)"
+    hold = "inputs between knots: constant (previous, default) or linearly interpolated (linear)"
     group.add("--hold", hold, choices=("previous", "linear"), default="previous")
-    free = "state whose final value is free: a name, group or pattern"
+    free = "state whose final value is free. NAME is a state, group or pattern"
     group.add("--free-end", free, metavar="NAME", repeatable=True)
-    weight = "weight on an input, a group or a pattern; by default 1/limit^2"
+    weight = "weight on an input, a group or a pattern. The default is 1/limit^2"
     group.add("--r", weight, parser.assignment, "NAME=W", repeatable=True)
     options.add_limits(group)
     options.add_output_file(
@@ -72,14 +72,15 @@ def _add_simulate(commands: parser.Commands) -> None:
     add_loop(simulate)
     simulate.group(parser.SIMULATION).add(
         "--every",
-        "number of steps between saved rows; chosen automatically for long runs",
+        "save one row for every N integration steps; by default N is 1, or larger for long runs",
         int,
     )
     options.add_figure(simulate, "the nonlinear and the linear motion")
     shown = simulate.group(parser.OUTPUT)
     shown.add(
         "--show",
-        "show only these curves in --plot: a state, input, group or pattern, as q_m or '*.hinge_*'",
+        "show only these curves in --plot. NAME is a state, input, group or pattern, such as q_m "
+        "or '*.hinge_*'",
         metavar="NAME",
         repeatable=True,
     )
@@ -143,8 +144,8 @@ def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> 
     pulled = (asked < -1e-9 * abs(asked).max(initial=0.0)).any(axis=1).mean()
     if pulled > 0.0:
         warnings.warn(
-            f"thrusters cannot pull: in {100.0 * pulled:.1f} % of the run a thrust below zero was "
-            "asked for and cut; --allocate gives the wrench with thrusts that push",
+            f"thrusters cannot pull: negative thrust was commanded in {100.0 * pulled:.1f} % of "
+            "the run and set to zero; --allocate produces the wrench with positive thrusts",
             FflinWarning,
             stacklevel=2,
         )

@@ -42,13 +42,13 @@ def add_commands(commands: parser.Commands) -> None:
     )
     points = sweep.group(
         "points",
-        "give --grid, --random or --configurations; without --velocity, points are at rest, or "
-        "move as [point] of robot.toml does",
+        "give --grid, --random or --configurations. The default velocity of all points is the "
+        "velocity in [point] of robot.toml, or zero",
     )
     points.add(
         "--grid",
-        "N values of a joint [rad|m] from LO to HI; for several joints, all combinations are used, "
-        "and the last joint varies fastest",
+        "N values of a joint [rad|m] from LO to HI. With several joints, the points are all "
+        "combinations, and the last joint varies fastest",
         _axis,
         "JOINT=LO:HI:N",
         repeatable=True,
@@ -57,15 +57,15 @@ def add_commands(commands: parser.Commands) -> None:
     points.add("--random", drawn, int)
     points.add(
         "--configurations",
-        "q (N, nq) in Pinocchio's order, saved by numpy.savez, and optionally v (N, nv) and u (N, "
-        "nu)",
+        "file of numpy.savez with q (N, nq) in Pinocchio's order, and optionally v (N, nv) and u "
+        "(N, nu)",
         Path,
         "FILE.npz",
     )
     points.add("--seed", "random seed of --random", parser.whole, "S", default=0)
     points.add(
         "--range",
-        "with --random: range of a joint, which replaces the joint limits",
+        "range of a joint [rad|m] for --random; replaces the joint limits",
         _range,
         "JOINT=LO:HI",
         repeatable=True,
@@ -74,7 +74,8 @@ def add_commands(commands: parser.Commands) -> None:
     options.add_pose(point)
     point.add(
         "--effort",
-        "input at all points, by its name in u, such as tau_m.joint_1",
+        "value of an input at all points. NAME is the name of the input in u, such as "
+        "tau_m.joint_1",
         parser.assignment,
         repeatable=True,
     )
@@ -85,16 +86,16 @@ def add_commands(commands: parser.Commands) -> None:
     work = sweep.group("computation")
     work.add(
         "--engine",
-        "compute the points in compiled code or in Python; by default compiled if numba is "
+        "compute the points in compiled code or in Python. The default is compiled if numba is "
         "installed and the outputs are the state",
         choices=("compiled", "python"),
     )
-    workers = "distribute the work over N processes, at most one for each core"
+    workers = "distribute the work over N processes; at most one per core"
     work.add("--workers", workers, int)
     dask = "distribute the work over the workers of a dask scheduler"
     work.add("--dask", dask, metavar="ADDRESS")
     work.switch("--yes", "permit results of more than 10 GB")
-    what = "the models, which are collected in FILE.part, from which the same command resumes,"
+    what = "the models (after an interruption, the same command resumes from FILE.part)"
     options.add_output_file(sweep.group(parser.OUTPUT), what, parser.ROWS, "LinearBatch")
 
 
@@ -188,7 +189,8 @@ def _points(
     kinds = [bool(arguments.grid), arguments.random is not None, bool(arguments.configurations)]
     if sum(kinds) != 1:
         raise InputError(
-            "the points need exactly one of --grid, --random and --configurations; give one"
+            "the points of the sweep are not defined; give exactly one of --grid, --random and "
+            "--configurations"
         )
     if arguments.range and arguments.random is None:
         raise InputError("--range needs --random; --grid has its own ranges")
@@ -199,7 +201,8 @@ def _points(
             )
         if arguments.rpy or arguments.position:
             raise InputError(
-                "--rpy, --position and --configurations all set the base pose; give one"
+                "--rpy or --position is given with --configurations, which also sets the base "
+                "pose; give only one of them"
             )
         given = _given(arguments.configurations)
         for name, value in (("v", v), ("u", u)):

@@ -38,8 +38,8 @@ def add_commands(commands: parser.Commands) -> None:
     add_weights(tvlqr)
     tvlqr.group(parser.CONTROLLER).add(
         "--qf",
-        "weight on the final error; by default the solution of the algebraic Riccati equation "
-        "about the last configuration",
+        "weight on the final error. The default is the solution of the algebraic Riccati equation "
+        "at the last configuration",
         parser.assignment,
         repeatable=True,
     )
@@ -52,18 +52,19 @@ def add_trajectory(command: parser.Command, *, required: bool = False) -> None:
     group.add(
         "--trajectory",
         "use the trajectory in FILE: .npz, .mat, .json or .csv; see fflin.Trajectory.load. --frame "
-        "gives the axes of the data; by default the frame named in the file, or local if the file "
-        "names none",
+        "defines the axes of the data. The default of --frame is the frame named in FILE, or local",
         Path,
         required=required,
     )
     group.add(
         "--hold",
-        "inputs between the knots of FILE: interpolated linearly, or held at the value of the "
-        "previous knot. By default the setting in the file, or linear if the file has none",
+        "inputs between the knots of FILE: linearly interpolated (linear), or constant from each "
+        "knot to the next (previous). The default is the setting in FILE, or linear",
         choices=("linear", "previous"),
     )
-    group.switch("--strict", "refuse a FILE that does not satisfy the dynamics of the robot")
+    group.switch(
+        "--strict", "report an error if the trajectory in FILE violates the dynamics of the robot"
+    )
 
 
 def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> LinearTrajectory:
@@ -75,7 +76,8 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
         given = getattr(arguments, name, None)
         if given is True or any(given or ()):
             raise InputError(
-                f"--{name} gives a point and --trajectory a motion; give only one of them"
+                f"--{name} defines an operating point, but --trajectory defines a motion; give "
+                "only one of them"
             )
     robot, settings = (
         robot or load_robot(arguments),

@@ -36,25 +36,23 @@ def add_commands(commands: parser.Commands) -> None:
     frames = "orbital frame used as the world; lvlh by default"
     page.add("--frame", frames, choices=("lvlh", "hill"))
     _add_scene(page)
-    page.switch("--no-open", "do not open a browser; the address appears on stderr")
+    page.switch("--no-open", "do not open a browser, and print the address on stderr")
     port = "port on 127.0.0.1; a free port by default"
     page.add("--port", port, parser.whole, "N")
 
 
-def add_pictures(
-    command: parser.Command, page: str = "that plays the motion without a network"
-) -> None:
+def add_pictures(command: parser.Command, page: str = "that plays the motion offline") -> None:
     """Add the options of pages, pictures and animations of a motion."""
     group = command.group(parser.OUTPUT)
     group.add("--html", f"write a page {page}", parser.PAGE)
     group.add(
         "--png",
-        "write a picture (needs Chromium): a strip of four images, or of images at the times of "
-        "--times",
+        "write a picture with a strip of images at the times of --times (four images by default); "
+        "requires Chromium",
         parser.PICTURE,
     )
-    group.add("--gif", "write an animation (needs Chromium)", parser.ANIMATION)
-    group.add("--times", "times of the pictures [s]", float, "T", nargs="+")
+    group.add("--gif", "write an animation; requires Chromium", parser.ANIMATION)
+    group.add("--times", "times of the images in --png [s]", float, "T", nargs="+")
     _add_scene(group)
     group.add("--fps", "frames per second of playback", float, "FPS", default=30.0)
     speed = "playback speed, in seconds of motion per second; 1 by default"
@@ -64,13 +62,15 @@ def add_pictures(
 def _add_scene(group: parser.Group) -> None:
     group.add(
         "--scene",
-        "show sky and planet (space), or a floor with a grid (lab, the default under gravity)",
+        "background: sky and planet (space), or a floor with a grid (lab). The default under "
+        "gravity is lab",
         choices=("space", "lab"),
     )
-    group.add("--tool", "draw the axes and the trail of this frame", metavar="FRAME")
+    group.add("--tool", "draw the axes and the path of this frame", metavar="FRAME")
     group.yes_or_no(
         "--follow",
-        "whether the camera follows the base; by default it does in long motions",
+        "let the camera follow the base, or not. By default, the camera follows the base in long "
+        "motions",
     )
 
 

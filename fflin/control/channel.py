@@ -92,13 +92,13 @@ def _pulses(
         if not sample:
             raise InputError(
                 f"thruster '{name}' is pulsed (on_off, least_impulse), which needs sampled "
-                "commands; give the time between samples, or a policy on a sampled model"
+                "commands; give sample=, or a policy for a sampled model"
             )
         if (item.least_impulse or 0.0) > largest * sample * dt:
             raise InputError(
                 f"thruster '{name}' has a least impulse of {item.least_impulse:g} N s, but "
                 f"can give only {largest * sample * dt:.3g} N s within a sample; give a longer "
-                "sampling time"
+                "sample time"
             )
     return Pulses(
         at=np.array(at),
@@ -165,8 +165,9 @@ class Law:
         names = self._names
         if u.shape != self._shape:
             raise InputError(
-                f"policy(t, q, v) returned shape {u.shape} at t = {t:g} s, expected {self._shape}: "
-                f"one value for each of {', '.join(names[:8])}" + (", ..." if names[8:] else "")
+                f"policy(t, q, v) returned shape {u.shape} at t = {t:g} s, expected {self._shape} "
+                "with one value for each of "
+                f"{', '.join(names[:8])}" + (", ..." if names[8:] else "")
             )
         wrong = np.flatnonzero(~np.isfinite(np.clip(u, *self._limits)))
         if len(wrong) and float(v.dot(v)) < self._slow:

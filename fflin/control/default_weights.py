@@ -19,7 +19,7 @@ from fflin.analysis.reduction import (
 )
 from fflin.base.errors import FflinWarning, InputError, listed, unknown
 from fflin.base.names import input_keys
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Complex, Values
 from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.control.weights import GivenWeight, sampled_cost, weights_of
@@ -119,7 +119,7 @@ def _damping(lin: LinearModel) -> Array:
     # Coupling by motion moves energy between coordinates, and an orbit rotates them: no damping.
     size = np.sqrt(lin.M.diagonal())
     whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
-    damped: Any = rates.sum() > 1e-9 * whole
+    damped = bool(rates.sum() > 1e-9 * whole)
     forces = lin.M @ modes
     return (forces * rates.clip(0.0)) @ forces.T * damped
 
@@ -315,8 +315,8 @@ class _Trial(NamedTuple):
     left: float  # factor on the bandwidth that the efforts allow, as far as it is below 1
     effort: str  # the input that allows the least
     K: Array
-    rates: Any  # of the modes (nx,) [1/s]
-    modes: Any
+    rates: Values  # of the modes (nx,) [1/s]
+    modes: Complex
     required: Array  # largest inputs (nu,)
 
 
@@ -375,10 +375,13 @@ def _achieved(lin: LinearModel, trial: _Trial) -> str:
     said += f"damping ratio at least {(decay / fast).min():.2g}"
     slow = np.flatnonzero(decay < _AS_SLOW * math.sqrt(0.5) * trial.limit.bandwidth)
     if vibrating := _vibrations(lin, trial, slow.tolist()):
-        said += f"; left to their damping: {listed(list(dict.fromkeys(vibrating.values())))}"
+        said += (
+            "; decaying by their own damping only: "
+            f"{listed(list(dict.fromkeys(vibrating.values())))}"
+        )
     slow = np.setdiff1d(slow, list(vibrating)).astype(int)
     if names := _moving_most(lin, trial.modes[:, slow]):
-        said += f"; slower than without springs, gravity or motion: {listed(names)}"
+        said += f"; slowed by springs, gravity or motion: {listed(names)}"
     return said
 
 
@@ -399,7 +402,7 @@ def _vibrations(lin: LinearModel, trial: _Trial, slow: list[int]) -> dict[int, s
     return found
 
 
-def _moving_most(lin: LinearModel, modes: Any) -> list[str]:
+def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
     """Return the coordinates that modes (nx, k) move most, weighed by inertia."""
     m = len(lin.M)
     large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
@@ -421,9 +424,9 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: flo
         sizes = " or ".join(f"{d:.2g} {unit}" for unit, d in joints.items())
         from_where.append(f"{sizes} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
-    slow = f"; bandwidth set by {limit.what}" if limit.what else ""
+    slow = f"; bandwidth limited by {limit.what}" if limit.what else ""
     if beyond := [name for name, room in _efforts(lin).items() if room <= 0.0]:
-        slow += f"; at or beyond the URDF limit at the point itself: {listed(beyond)}"
+        slow += f"; already at or beyond the URDF limit at the operating point: {listed(beyond)}"
     pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"
     return f"from {source}, for displacements of {' and '.join(from_where)}: {pace}{slow}"
 
@@ -479,7 +482,7 @@ def rule_weights(
     if named:
         Q, R = _reweighed(lin, Q, R, terms, given_weights)
         rule = f"{', '.join(named)} as given, the others {rule}"
-        rule += " (figures of this rule alone)" if terms.any() else ""
+        rule += " (with this rule alone)" if terms.any() else ""
     if source.dt == lin.dt:
         return Q, R, None, rule
     return (*sampled_cost(source, lin.dt, Q, R), rule)
@@ -507,7 +510,7 @@ def _of_regulated(
     found = default_weights(body, pace, dict(zip(names, room, strict=True)))
     Q, R, rule, bandwidth, (of_positions, of_inputs) = found
     if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
-        rule += f"; at or beyond the URDF limit at the point itself: {listed(beyond)}"
+        rule += f"; already at or beyond the URDF limit at the operating point: {listed(beyond)}"
     S = selection(body.state_names, lin.state_names)
     Q = S.T @ Q @ S
     terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
@@ -539,13 +542,13 @@ def _reweighed(
         if terms.any() and not largest and value > 0.0 and own > 0.0:
             ratio = value / own
             if not 1.0 / _APART < ratio < _APART:
-                apart[names[index]] = f"{names[index]} is {value:.3g}, by the rule {own:.3g}"
+                apart[names[index]] = f"{names[index]} is {value:.3g}, the rule gives {own:.3g}"
         matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
     if apart:
         warnings.warn(
             f"the weights given differ in scale from the rule's weights: {listed(apart.values())}; "
-            "one of the two groups will dominate the cost; give largest values (bryson) instead, "
-            "to which the rule's weights are scaled",
+            "one of the two groups will dominate the cost, so give largest acceptable values "
+            "(bryson) instead of weights",
             FflinWarning,
             stacklevel=4,
         )

@@ -15,7 +15,7 @@ from fflin.base.errors import InputError, listed
 from fflin.base.names import group_of, input_keys
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import cut, grid, matrix, width
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 from fflin.control.margins import Margins, input_margins
 from fflin.control.optimal.riccati import rates_of
 from fflin.linear.model import LinearModel, state_space
@@ -47,8 +47,8 @@ class Gain(Design):
     residual : float
         Norm of the Riccati equation's residual, relative to the sum of the norms of its terms.
     margin : float
-        Distance of the poles to the stability boundary. For a continuous model, the slowest decay
-        rate [1/s]. For a sampled model, 1 minus the largest modulus.
+        Distance of the poles to the stability boundary: the slowest decay rate [1/s] for a
+        continuous model, 1 minus the largest modulus for a sampled model.
     method : str
         Solver: "structured" (half-size), "general" (SciPy) or "closed form".
     A, B, Q, R, N : ndarray
@@ -65,11 +65,11 @@ class Gain(Design):
     weights : str
         Description of the rule that made the weights.
     regulated : tuple of str (nz,)
-        States that are fed back; if empty, all states are fed back. K, P, Q and N are zero for the
-        other states.
+        States that are fed back; if empty, all states are fed back. K, P, Q and N are zero for
+        states that are not fed back.
     placement : ndarray (7,)
-        Reference of the model: position [m] and quaternion x, y, z, w. Empty if an older file does
-        not contain it.
+        Reference of the model: position [m] and quaternion x, y, z, w. The array is empty if a
+        file of an older version lacks the reference.
     urdf_sha256 : str
         Hash of the robot of the design, see `Robot`.
 
@@ -88,7 +88,7 @@ class Gain(Design):
 
     K: Array
     P: Array
-    poles: Any
+    poles: Values
     residual: float
     margin: float
     method: str
@@ -286,9 +286,9 @@ def _unregulated(gain: Gain) -> str:
             np.linalg.matrix_rank(selection(names, gain.state_names) @ B)
             for names in (gain.regulated, (*gain.regulated, *speeds))
         )
-        tied = "tied to the body's rate by the conserved momentum"
+        tied = "determined by the body's rate, as momentum is conserved"
         if gain.frame in ("lvlh", "hill"):
-            tied = "tied to the body's rate, except for the forces of the orbit"
+            tied = "determined by the body's rate, except for orbital forces"
         why = tied if held == both else "wheel_speeds=True regulates the controllable ones"
         parts.append(f"wheel speeds ({why})")
     return ", ".join(parts)
@@ -308,7 +308,7 @@ def _blocks(gain: Gain) -> str:
 
 
 def _poles(gain: Gain) -> str:
-    poles: Any = gain.poles[gain.poles.imag >= 0.0]
+    poles = gain.poles[gain.poles.imag >= 0.0]
     if gain.dt:
         order, heads = np.argsort(-np.abs(poles)), ["pole", "modulus", "frequency [rad/s]"]
         rates = rates_of(poles, gain.dt)

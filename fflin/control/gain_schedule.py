@@ -79,13 +79,13 @@ class GainSchedule(Schedule):
         Times [s] of the knots: the trajectory's knots, and knots added to interpolate P. For a
         sampled schedule, the sample times.
     K : ndarray (M, nu, nx)
-        Gains. In a sampled schedule the last row repeats the gain before it.
+        Gains. In a sampled schedule, the last two gains are equal.
     P : ndarray (M, nx, nx)
-        Cost matrix: the optimal cost from t on is e' P(t) e.
+        Cost matrix: the optimal cost from time t to the end is e' P(t) e.
     A : ndarray (M, nx, nx)
     B : ndarray (M, nx, nu)
-        Linear model at the knots. A sampled schedule has M - 1 matrices A and B; each pair leads
-        from one sample to the next.
+        Linear model at the knots. A sampled schedule has M - 1 matrices A and B; each pair gives
+        the transition from one sample to the next.
     Q, R, Qf : ndarray
         Weights of the continuous cost.
     residual : float
@@ -145,8 +145,8 @@ class GainSchedule(Schedule):
         """Return the trajectory that the gains were designed for."""
         if not self.knots.size:
             raise InputError(
-                "the file of gains contains no trajectory; load one with fflin.Trajectory.load "
-                "and use TrajectoryFeedback"
+                "the file of gains contains no trajectory; load the trajectory with "
+                "fflin.Trajectory.load and use TrajectoryFeedback"
             )
         state, made = StateMap(robot), f"the gain schedule was made for '{self.robot}'"
         for kind, there, own in (
@@ -184,13 +184,13 @@ class FilterSchedule(Schedule):
         Times [s] of the knots: the trajectory's knots, and knots added to interpolate P. For a
         sampled filter, the sample times.
     L : ndarray (M, nx, ny)
-        Filter gains. In a sampled filter the last row repeats the gain before it.
+        Filter gains. In a sampled filter, the last two gains are equal.
     P : ndarray (M, nx, nx)
         Covariance of the estimation error; for a sampled filter, before the measurement update.
     A, B, W : ndarray (M, nx, nx), (M, nx, nu), (M, nx, nx)
         Linear model and intensity of the disturbance at the knots. A sampled filter has M - 1 of
-        each: the transitions from one sample to the next, and the covariance of the disturbance
-        over that time.
+        each: transition matrices from one sample to the next, and the covariance of the
+        disturbance over one sample.
     C, D, y : ndarray (M, ny, nx), (M, ny, nu), (M, ny)
         Output matrices, and the outputs along the trajectory.
     V : ndarray (ny, ny)

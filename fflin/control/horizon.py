@@ -155,7 +155,10 @@ class Receding:
                 f"; the robot exceeds a soft limit at {self.passed} samples (worst: {self._met})"
             )
         if self.unfinished:
-            said += f"; {self.unfinished} plans were not found: the saturated regulator was used"
+            said += (
+                f"; {self.unfinished} plans had no solution, so that the saturated LQR command was "
+                "applied"
+            )
         return (said,) if self.solves else ()
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
@@ -188,8 +191,9 @@ class Receding:
             self.unfinished += 1
             if self.unfinished == 1:
                 warnings.warn(
-                    f"no plan was found at t = {t:g} s (DAQP exit flag {flag}): at such samples "
-                    "the regulator's command is applied, cut at the limits",
+                    f"the MPC optimisation found no solution at t = {t:g} s (DAQP exit flag "
+                    f"{flag}); in such samples, the LQR command is applied, saturated at the "
+                    "input limits",
                     FflinWarning,
                     2,
                 )

@@ -13,7 +13,7 @@ from fflin.analysis.stabilizability import require_detectable, require_disturbed
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
-from fflin.base.validation import Array, dimension, instance
+from fflin.base.validation import Array, Values, dimension, instance
 from fflin.control.gain import Gain, titled
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal.riccati import solve
@@ -27,8 +27,8 @@ class Estimator(Design):
     r"""Steady-state Kalman filter for the deviations of the state from the operating point.
 
     In continuous time, ``d(xh)/dt = A xh + B u + L (y - C xh - D u)``. For a sampled model, the
-    left side is the prediction for the next sample. The filtered estimate, which includes the
-    present measurement, is ``xh + L_update (y - C xh - D u)``.
+    left side is the prediction for the next sample. The filtered estimate, which uses the present
+    measurement, is ``xh + L_update (y - C xh - D u)``.
 
     Attributes
     ----------
@@ -57,8 +57,8 @@ class Estimator(Design):
     state_names, input_names, output_names : tuple of str
     robot : str
     estimated : tuple of str (nz,)
-        Estimated states; if empty, all states are estimated. L, P and W are zero for the other
-        states.
+        Estimated states; if empty, all states are estimated. L, P and W are zero for states that
+        are not estimated.
 
     Examples
     --------
@@ -73,7 +73,7 @@ class Estimator(Design):
     L: Array
     L_update: Array
     P: Array
-    poles: Any
+    poles: Values
     residual: float
     margin: float
     A: Array
@@ -144,7 +144,7 @@ class Compensator(Design):
     A: Array
     B: Array
     C: Array
-    poles: Any
+    poles: Values
     y0: Array
     u0: Array
     dt: float
@@ -183,9 +183,10 @@ def kalman(
 
     .. math:: A P + P A^T - P C^T V^{-1} C P + W = 0,\qquad L = P C^T V^{-1}
 
-    or its discrete-time counterpart. SciPy solves the equation, and Newton's method refines the
-    solution, see `lqr`. For a model with reaction wheels, the filter estimates only the states that
-    `lqr` regulates. It uses only outputs that depend on no other states.
+    For a sampled model, P solves the discrete-time Riccati equation. SciPy solves the equation,
+    and Newton's method refines the solution, as in `lqr`. For a model with reaction wheels, the
+    filter estimates only the states that `lqr` regulates. The filter uses only outputs that
+    depend on the estimated states alone.
 
     Parameters
     ----------
@@ -197,8 +198,8 @@ def kalman(
         Intensity of the measurement noise, positive definite, in the same forms as W, but with
         names of outputs.
     G : array_like (nx, nw), optional
-        Input matrix of the disturbance; W is then (nw, nw). With ``G=lin.B`` the disturbance acts
-        at the inputs; if W is a mapping, its keys are then names of inputs.
+        Input matrix of the disturbance; W is then (nw, nw). With ``G=lin.B``, the disturbance
+        acts at the inputs, and the keys of a mapping W are names of inputs.
     wheel_speeds : bool, optional
         As in `lqr`.
 
@@ -209,13 +210,13 @@ def kalman(
     Raises
     ------
     DetectabilityError
-        If a mode does not decay by itself and the outputs do not observe it; the message names the
+        If the outputs do not observe a mode that does not decay by itself; the message names the
         mode.
     EquilibriumError
         If the point is not a fixed point.
     InputError
         If a size or value is wrong, or if no disturbance reaches a mode that does not decay by
-        itself. The filter would stop correcting such a mode.
+        itself. A filter without such a disturbance would stop correcting the mode.
     UnknownNameError
         If a name does not exist.
     ModelError
@@ -269,12 +270,12 @@ def kalman(
 
 
 def lqg(gain: Gain, estimator: Estimator) -> Compensator:
-    r"""Return the LQG compensator, which feeds back the estimate: u - u0 = -K xh.
+    r"""Return the LQG compensator, which feeds back the state estimate: u - u0 = -K xh.
 
     .. math:: \dot z = (A - B K - L C + L D K) z + L (y - y_0),\qquad u - u_0 = -K z
 
-    For a sampled model, xh is the prediction from earlier samples, which leaves one sampling time
-    for the computation.
+    For a sampled model, xh is the prediction from earlier samples, so that one sampling time is
+    available for the computation.
 
     Parameters
     ----------
@@ -309,8 +310,8 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     names = e.estimated or e.state_names
     if unseen := [name for name in gain.regulated if name not in names]:
         raise InputError(
-            f"the gain feeds back {listed(unseen)}, which the estimator does not estimate; give "
-            "the same wheel_speeds to both"
+            f"the gain feeds back {listed(unseen)}, which the estimator does not estimate; use the "
+            "same wheel_speeds= for both designs"
         )
     S = selection(names, e.state_names)
     return Compensator(

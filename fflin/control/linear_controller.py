@@ -144,8 +144,8 @@ class LinearController(Feedback):
     .. math:: \dot z = A z + B (y - y_0),\qquad u - u_0 = C z + D (y - y_0),\qquad z(0) = 0
 
     y is the vector of the robot's outputs in the chart of the model, as `outputs` returns it. The
-    output of the controller is added to u0. This is positive feedback, as for controllers from
-    ``hinfsyn`` and ``h2syn``.
+    output of the controller is added to u0. The sign is positive feedback, as for controllers
+    from ``hinfsyn`` and ``h2syn``.
 
     A continuous controller is integrated together with the robot, in the same Runge-Kutta stages.
     If `simulate` is given `sample` or `delay`, y is held between samples and z is advanced exactly.
@@ -160,8 +160,8 @@ class LinearController(Feedback):
         - a state space or transfer function;
         - a gain D (nu, ny);
         - (A, B, C, D) or (A, B, C, D, dt);
-        - a .mat, .npz or .json file with A, B, C, D, and with dt or Ts if sampled;
-        - such a file with D alone.
+        - a .mat, .npz or .json file with A, B, C, D, and dt or Ts if the controller is sampled;
+        - a .mat, .npz or .json file with D alone.
 
         The controller's input names must be names of the model's outputs, and its output names must
         be names of the model's inputs, with dots or underscores. In a file the names are
@@ -171,7 +171,8 @@ class LinearController(Feedback):
     lin : LinearModel
         Continuous or sampled model. The controller acts on deviations from the point of this model.
     sign : {1, -1}
-        Give -1 for a controller designed for negative feedback, u - u0 = -K (y - y0).
+        Sign of the feedback: -1 for a controller designed for negative feedback, u - u0 = -K (y -
+        y0).
     noise : callable, optional
         noise(t) -> (ny,), added to y.
 
@@ -222,9 +223,9 @@ class LinearController(Feedback):
         felt = lin.D.any(axis=1) & by.D.any(axis=0)
         if felt.any():
             raise InputError(
-                f"D of the controller acts on {listed(compress(lin.output_names, felt))}, which "
-                "depends directly on the inputs: an algebraic loop; set D to 0 there, for example "
-                "with a low-pass filter on this output"
+                "D of the controller forms an algebraic loop with "
+                f"{listed(compress(lin.output_names, felt))}, which depends directly on the "
+                "inputs; set D to 0 for this output, for example with a low-pass filter"
             )
         dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
         dt = lin.dt or dt if dt < 0.0 else dt
@@ -272,7 +273,7 @@ class LinearController(Feedback):
         return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
 
     def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
-        """Return the model augmented by the controller's states, and K and u of u + K e."""
+        """Return the model with the controller's states, and K and u of the law u + K e."""
         A, B, C, D, u0, y0, *_ = self.terms
         apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
         both = replace(
@@ -292,7 +293,7 @@ class LinearController(Feedback):
         return both.A + both.B @ K
 
     def sampled(self, dt: float) -> LinearController:
-        """Return the controller sampled at dt [s], with y held; itself if already sampled."""
+        """Return the controller sampled at dt [s]; a sampled controller is unchanged."""
         by = self.system
         if by.dt or not len(by.A):
             return self
@@ -300,11 +301,12 @@ class LinearController(Feedback):
         return replace(self, system=by._replace(A=A, B=B, dt=dt))
 
 
-def growing(policy: Any) -> tuple[str, ...]:
+def growing(policy: object) -> tuple[str, ...]:
     """Return warnings on unstable poles of a linear controller and of its linear loop."""
-    said, by = [], decider(policy)
-    of = ("linear loop", "controller by itself") if isinstance(by, LinearController) else ()
-    for what in of:
+    said, by = list[str](), decider(policy)
+    if not isinstance(by, LinearController):
+        return ()
+    for what in ("linear loop", "controller by itself"):
         poles = np.linalg.eigvals(by.loop if what == "linear loop" else by.system.A)
         growth = np.abs(poles) - 1.0 if by.dt else poles.real
         if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
@@ -320,7 +322,7 @@ def growing(policy: Any) -> tuple[str, ...]:
     return tuple(said)
 
 
-def closed_loop(policy: Any) -> tuple[Array, float, tuple[str, ...]] | None:
+def closed_loop(policy: object) -> tuple[Array, float, tuple[str, ...]] | None:
     """Return the closed-loop matrix, dt [s] and state names of a policy with a linear loop."""
     (lin, K), by = feedback_of(policy), decider(policy)
     if isinstance(by, LinearController):

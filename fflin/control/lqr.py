@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +12,7 @@ from fflin.analysis.mechanics import rate_matrix
 from fflin.analysis.reduction import regulated_part, selection
 from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
-from fflin.base.validation import Array, dimension, instance
+from fflin.base.validation import Array, Values, dimension, instance
 from fflin.control.default_weights import rule_weights
 from fflin.control.gain import Gain, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve
@@ -44,32 +43,33 @@ def lqr(
     For a continuous model, the feedback u = u0 - K (x - x0) minimises
 
     .. math:: \int_0^\infty \delta x^T Q\,\delta x + 2\,\delta x^T N\,\delta u
-              + \delta u^T R\,\delta u\;dt,
+              + \delta u^T R\,\delta u\;dt.
 
-    For a sampled model, it minimises the corresponding sum over the samples. `sampled_cost`
-    converts the weights of the integral to weights of the sum.
+    For a sampled model, the feedback minimises the corresponding sum over the samples.
+    `sampled_cost` converts the weights of the integral to weights of the sum.
 
     For a fully actuated model, the Riccati equation is solved by an eigenproblem of half the usual
-    size. For any other model, SciPy solves it. Newton's method refines both solutions. The result
-    contains the residual in the model's own variables. A weight that is computed from an
-    ill-conditioned inertia, such as M^-1 R_a M^-1 for accelerations, is inaccurate whichever solver
-    is used. `acceleration_lqr` avoids this loss.
+    size. For any other model, SciPy solves the Riccati equation. Newton's method refines both
+    solutions. The result contains the residual in the model's own variables. A weight computed
+    from an ill-conditioned inertia, such as M^-1 R_a M^-1 for accelerations, is inaccurate with
+    any solver. `acceleration_lqr` avoids this loss of accuracy.
 
-    Without weights, the regulator respects the limits of the URDF, (10.7) of docs/derivation.md.
-    Its slowest motion has a bandwidth of 0.2 rad/s. The bandwidth is lower if the robot would
-    otherwise exceed an effort or speed limit. The limits are checked for a return from a
-    displacement of 30 deg of the base and 0.3 rad of each joint. Each input then has a phase margin
-    of 60 deg and tolerates any gain factor above one half. With springs or gravity, each mode that
-    the inputs reach decays as fast as it would without springs and gravity (10.8). ``gain.weights``
-    states the bandwidth, decay rate and damping of the loop, and lists slower modes.
+    Without weights, the regulator respects the limits of the URDF, see (10.7) of
+    docs/derivation.md. The slowest closed-loop motion has a bandwidth of 0.2 rad/s. The bandwidth
+    is lower if the robot would otherwise exceed an effort or speed limit. The limits are checked
+    for a return from a displacement of 30 deg of the base and 0.3 rad of each joint. With these
+    weights, each input has a phase margin of at least 60 deg and tolerates any gain factor above
+    one half. With springs or gravity, each controllable mode decays as fast as without springs
+    and gravity (10.8). ``gain.weights`` states the bandwidth, decay rate and damping of the loop,
+    and lists slower modes.
 
-    For a model with reaction wheels, only the controllable part is regulated, (9.4) of
-    docs/derivation.md; ``gain.regulated`` lists its states. Weights on the following states have no
-    effect:
+    For a model with reaction wheels, only the controllable part is regulated, see (9.4) of
+    docs/derivation.md; ``gain.regulated`` lists its states. Weights on the following states have
+    no effect:
 
     - wheel angles, which are ignorable;
-    - wheel speeds that follow the body's rate, if the wheels alone turn the body;
-    - the position and velocity of the base, if no input pushes it.
+    - wheel speeds that are determined by the body's rate, if only wheels rotate the body;
+    - the position and velocity of the base, if no input pushes the base.
 
     Parameters
     ----------
@@ -83,14 +83,15 @@ def lqr(
     N : array_like (nx, nu), optional
         Cross weight. Q - N R^-1 N' must be positive semidefinite.
     weights : {"urdf", "identity"}, optional
-        Rule for the weights, instead of Q and R: "urdf" is the rule above (default), "identity"
-        is 1 on every state and input. For a sampled model, the rule applies to the continuous
-        cost, which is then sampled under zero-order hold.
+        Rule for the weights, instead of Q and R: "urdf" (default) respects the limits of the
+        URDF, "identity" is 1 on every state and input. For a sampled model, the rule defines the
+        continuous-time cost, which `sampled_cost` converts.
     wheel_speeds : bool, optional
-        Whether to regulate the wheel speeds to their values at the point. By default they are
-        regulated if inputs other than the wheels can change them. With True, combinations of wheel
-        speeds that exert no net torque on the base are regulated too. With False, no wheel speed
-        is regulated. With the default weights, wheel speeds converge at a tenth of the bandwidth.
+        Whether to regulate the wheel speeds to their values at the point. By default, wheel
+        speeds are regulated if inputs other than the wheels can change them. With True,
+        combinations of wheel speeds without net torque on the base are also regulated. With
+        False, no wheel speed is regulated. With the default weights, wheel speeds converge at a
+        tenth of the bandwidth.
 
     Returns
     -------
@@ -101,7 +102,8 @@ def lqr(
     EquilibriumError
         If the point is not a fixed point; the message lists the nonzero rows of f0.
     StabilizabilityError
-        If the inputs cannot stabilise a mode that does not decay by itself; the message names it.
+        If the inputs cannot stabilise a mode that does not decay by itself; the message names the
+        mode.
     InputError
         If a weight has a wrong size, is not positive (semi)definite, or is zero for a mode that
         does not decay by itself.
@@ -133,7 +135,9 @@ def lqr(
     if Q is None and R is None and N is None:
         Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
     elif weights is not None or Q is None or R is None:
-        raise InputError("give both Q and R, or neither and weights='urdf' or 'identity'")
+        raise InputError(
+            "only one of Q and R is given; give both, or leave both out for default weights"
+        )
     Q, R, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:
@@ -149,17 +153,17 @@ def acceleration_lqr(
     r"""Return the linear quadratic regulator with weighted accelerations, in closed form.
 
     Let the accelerations :math:`a = L u` be the inputs, where L is the lower block of B. A model
-    at rest then has one double integrator per coordinate, :math:`\ddot q_i = s_i a_i`, with
-    s = 1/2 for attitude and s = 1 otherwise. Diagonal weights decouple the coordinates. By (10.2)
-    of docs/derivation.md, the regulator is
+    at rest then has one double integrator per coordinate, :math:`\ddot q_i = s_i a_i`, with s =
+    1/2 for attitude coordinates and s = 1 for all others. Diagonal weights decouple the
+    coordinates. By (10.2) of docs/derivation.md, the regulator is
 
     .. math:: k_p = \sqrt{q_p/r_a},\quad k_d = \sqrt{q_v/r_a + 2 s k_p},\quad
               u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
 
     and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. The speed of a reaction
     wheel whose angle is not regulated is a single integrator with k_p = 0. The weight on u is
-    :math:`L^T R_a L`. The gain is computed without this product, so an ill-conditioned inertia does
-    not reduce its accuracy.
+    :math:`L^T R_a L`. The gain is computed without the product :math:`L^T R_a L`, so that an
+    ill-conditioned inertia does not reduce the accuracy of the gain.
 
     Parameters
     ----------
@@ -168,16 +172,16 @@ def acceleration_lqr(
         `lqr` regulates must be actuated. `sampled_cost` converts the weights Q and R of the
         returned gain for a sampled regulator.
     Qp, Qv, Ra : array_like (6 + n,) or float, or mapping
-        Diagonal weights on the positions (q_b, r_b, q_m), the velocities and the accelerations. In
-        a mapping {name: weight}, `Qp` takes names of positions; `Qv` and `Ra` take names of
-        velocities.
+        Diagonal weights on the positions (q_b, r_b, q_m), the velocities and the accelerations.
+        In a mapping {name: weight}, the names are positions for `Qp`, and velocities for `Qv` and
+        `Ra`.
     wheel_speeds : bool, optional
         As in `lqr`.
 
     Returns
     -------
     Gain
-        Its residual refers to the Riccati equation with the accelerations as inputs.
+        The residual of the gain refers to the Riccati equation with the accelerations as inputs.
 
     Raises
     ------
@@ -238,8 +242,7 @@ def acceleration_lqr(
             sound = False
     if not sound:
         raise InputError(
-            "the solution overflows with these weights; scale Qp, Qv and Ra so that they differ "
-            "less"
+            "the solution overflows with these weights; give Qp, Qv and Ra with similar magnitudes"
         )
     R = L.T @ (ra[:, None] * L)
     solution = Solution(P, K, poles, residual, "closed form")
@@ -255,8 +258,8 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
     expected[: len(double), p:] = double
     if len(double) != p or not np.array_equal(lin.A, expected) or lin.B[:p].any():
         raise InputError(
-            "the model has other dynamics than double integrators, expected a model at rest "
-            "without gravity, orbit, springs or dampers; use lqr"
+            "the model is not a set of double integrators, expected a model at rest without "
+            "gravity, orbit, springs or dampers; use lqr for this model"
         )
     sizes = np.abs(L).max(axis=1, keepdims=True)
     if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < len(s):
@@ -273,7 +276,8 @@ def _diagonal(
     """Return the diagonal of a weight on `kept`, given by values or names for all `names`."""
     if not isinstance(value, Mapping) and dimension(what, value) == 2:
         raise InputError(
-            f"{what} is a matrix, expected its diagonal; for a full weight matrix use lqr"
+            f"{what} is a matrix, expected the diagonal of a weight; for a full weight matrix use "
+            "lqr"
         )
     whole = weight(what, value, names, definite=definite and len(kept) == len(names))
     diagonal = whole.diagonal()[[names.index(name) for name in kept]]
@@ -296,7 +300,7 @@ def require_fixed_point(lin: LinearModel) -> None:
     raise EquilibriumError(
         f"the point is not a fixed point: {shown}{more}; "
         + (
-            "the reference does not move steadily; use fflin.tvlqr along its trajectory"
+            "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
             if lin.moving
             else "linearise about a fixed point, with the q and u of fflin.equilibrium, or about "
             "a steady motion with moving=True"
@@ -311,13 +315,13 @@ def _difference(a: Array, b: Array, c: Array) -> Array:
     return np.where(np.abs(difference) > rounding, difference, 0.0)
 
 
-def _near_boundary(poles: Any, dt: float) -> bool:
+def _near_boundary(poles: Values, dt: float) -> bool:
     """Whether a pole of a stable loop is close to the boundary of stability."""
     decay = 1.0 - np.abs(poles) if dt else -poles.real
     return decay.min() < _NEAR_BOUNDARY * np.abs(poles - 1.0 if dt else poles).max()
 
 
-def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
+def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
     structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
     if structured is not None and not _near_boundary(structured.poles, lin.dt):
         return structured

@@ -1,12 +1,18 @@
 """Stability margins at the inputs of a loop: all inputs together, or one at a time."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 
 ACCURACY = 1e-5
 
@@ -71,7 +77,9 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
         found = best
 
 
-def gain_crossings(A: Array, B: Array, C: Array, D: Array, bound: float) -> tuple[Any, Any]:
+def gain_crossings(
+    A: Array, B: Array, C: Array, D: Array, bound: float
+) -> tuple[Values, NDArray[np.bool_]]:
     """Return eigenvalues (.., 2 nx), and which are imaginary: there the gain crosses the bound.
 
     A superfluous crossing costs only one more evaluation of the response.
@@ -105,14 +113,14 @@ class Loop(NamedTuple):
         return low, min((each for each in factors if each > 1.0), default=math.inf)
 
 
-def input_loops(gain: Any) -> tuple[Array, Any, list[Loop]]:
+def input_loops(gain: Any) -> tuple[Array, Values, list[Loop]]:
     """Return frequencies (k,) [rad/s], responses (k, nu) of a Gain's loops, and what each bears."""
     # With T = K (s E - A + B K)^-1 B the loop of input i is T_ii / (1 - T_ii), of a sampled model
     # at s = e^(j w h).
     fed = [gain.state_names.index(name) for name in gain.regulated or gain.state_names]
     F, B, K, dt = gain.closed_loop[np.ix_(fed, fed)], gain.B[fed], gain.K[:, fed], gain.dt
 
-    def response(w: float) -> Any:
+    def response(w: float) -> Values:
         s = np.exp(1j * w * dt) if dt else 1j * w
         T = np.einsum("ij,ji->i", K, np.linalg.solve(s * np.eye(len(F)) - F, B))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -123,7 +131,9 @@ def input_loops(gain: Any) -> tuple[Array, Any, list[Loop]]:
     grid = np.geomspace(min(float(rates.min()), end) / 100.0, end, _POINTS)
     values = np.array([response(w) for w in grid])
 
-    def changes(value: Callable[[Any], Any], i: int, among: Any) -> list[tuple[float, complex]]:
+    def changes(
+        value: Callable[[Values], Array], i: int, among: NDArray[np.bool_]
+    ) -> list[tuple[float, complex]]:
         """Return where a function of response i changes its sign, and the response there."""
         from scipy.optimize import brentq
 

@@ -28,6 +28,7 @@ from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import range_of
 from fflin.robot.limits import chosen_limits
+from fflin.robot.robot import Robot
 
 # Most entries of the matrices that map inputs to states and limits: 160 MB.
 _MOST = 20_000_000
@@ -47,23 +48,23 @@ def mpc(
 ) -> Mpc | TrajectoryMpc:
     r"""Return the model predictive controller about a fixed point or along a trajectory.
 
-    At each sample it computes the inputs of the next N samples that respect the limits and
-    minimise
+    At each sample, the controller computes the inputs of the next N samples that respect the
+    limits and minimise
 
-    .. math:: e_N^T Q_f\,e_N + \int_0^{N h} e^T Q\,e + \delta u^T R\,\delta u\;dt,
+    .. math:: e_N^T Q_f\,e_N + \int_0^{N h} e^T Q\,e + \delta u^T R\,\delta u\;dt.
 
-    and applies the first input. If no limit is active over the horizon, this is the regulator of
-    `lqr` or `tvlqr`.
+    The controller applies the first of these inputs. If no limit is active over the horizon, the
+    controller is the regulator of `lqr` or `tvlqr`.
 
-    - Input limits are hard: inputs never exceed them.
-    - Limits of states and outputs are soft. They apply to the values that the linear model predicts
-      at the samples. If the program is infeasible, they are exceeded slightly; the motion's `notes`
-      report it.
-    - If the solver finds no plan, the regulator's command is applied, saturated at the input
-      limits, and a warning is issued.
+    - Input limits are hard: inputs never exceed these limits.
+    - Limits of states and outputs are soft. Soft limits apply to the values that the linear model
+      predicts at the samples. If the quadratic program is infeasible, soft limits are exceeded
+      slightly, as the motion's `notes` report.
+    - If the solver finds no solution, the LQR command is applied, saturated at the input limits,
+      and a warning is issued.
 
-    DAQP solves the quadratic program (docs/guide/mpc.md; ``pip install 'fflin[mpc]'``). It starts
-    from the limits that were active at the previous sample.
+    DAQP solves the quadratic program (docs/guide/mpc.md; ``pip install 'fflin[mpc]'``). The
+    solver starts from the limits that were active at the previous sample.
 
     Parameters
     ----------
@@ -77,12 +78,12 @@ def mpc(
         Sampling time h [s].
     limits : "urdf", float, mapping or list of them, optional
         Limits as in `simulate`, for inputs, states and outputs: {name, group or pattern: magnitude,
-        or (least, largest)}. They bound the values of these signals, except that limits of q_b and
-        r_b along a trajectory bound the error. With None there are no limits, except that thrusters
-        cannot pull.
+        or (least, largest)}. The limits bound the values of these signals; along a trajectory,
+        limits of q_b and r_b bound the error. With None, the only limit is that thrusters cannot
+        pull.
     Qf : "steady", or as Q
-        Weight on the error after N samples, or at the end of a trajectory. "steady" is the cost to
-        go of the regulator from that time on.
+        Weight on the error after N samples, or at the end of a trajectory. "steady" is the cost
+        to go of the regulator from the end of the horizon on.
     weights : {"urdf", "identity"}, optional
         Rule for the weights, instead of Q and R, as in `lqr`.
 
@@ -126,7 +127,7 @@ def mpc(
     source = lin if isinstance(lin, LinearTrajectory) else lin.generator
     if source is None or source.dt or dt != (lin.dt or dt):
         raise InputError(
-            "lin is sampled with another dt, or its continuous model is not known; give the "
+            "lin is sampled with another dt, or the model before sampling is not known; give the "
             "continuous model and dt="
         )
     names, at, rows, ranges = _limits(source, limits)
@@ -180,7 +181,7 @@ class Mpc(_Shown, Feedback):
         """Return the quadratic program at the deviation e = x - x0 (nx,), by default zero."""
         return self.horizon.matrices(e, 0.0)
 
-    def bind(self, robot: Any) -> Policy:
+    def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot with the model's states and inputs."""
         lin, state = self.lin, self.state_map(robot)
         fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
@@ -210,7 +211,7 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
         plans = Receding(self.horizon)
         return lambda t, e: self.commanded(t)[2] + plans.step(t, e)
 
-    def bind(self, robot: Any) -> Policy:
+    def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot with the trajectory's states and inputs."""
         return Receding(self.horizon, self.deviation(robot))
 

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, input_keys
@@ -51,26 +51,26 @@ def plan(
     r"""Plan a low-effort trajectory to a goal within limits, such as a slew or detumbling.
 
     The plan minimises :math:`\int u^T R\,u\;dt`. Inputs, joints and wheels stay within their
-    limits. The method is multiple shooting: the start of each interval is a variable. Sequential
-    quadratic programming searches for a local minimum in at most 50 iterations. The quadratic
-    programs are built from the linear models along the motion and solved by PIQP
-    (``pip install 'fflin[mpc]'``).
+    limits. The method is multiple shooting: the state at the start of each interval is a
+    variable. Sequential quadratic programming searches for a local minimum in at most 50
+    iterations. The quadratic programs are built from the linear models along the motion and
+    solved by PIQP (``pip install 'fflin[mpc]'``).
 
-    The base may rotate by any angle. It makes whole turns if the angular rates at both ends require
-    them. Continuous joints take the shorter direction.
+    The base may rotate by any angle. The base makes full turns if the angular rates at both ends
+    require full turns. Continuous joints take the shorter direction.
 
-    Limits of joints and wheels are met at the knots; between knots, they may be exceeded, by up to
-    1 %. Where the motion between knots would exceed a limit, the quadratic program also contains
-    the limit at points within the interval. If limits cannot be kept between knots, they are kept
-    at the knots, and a warning is issued. Printing the trajectory shows the largest excess, its
-    limit and its time.
+    Limits of joints and wheels are satisfied at the knots, and may be exceeded by up to 1 %
+    between knots. If the motion between knots exceeds a limit, the quadratic program includes
+    this limit at points within the interval. If limits cannot be satisfied between knots, they
+    are satisfied at the knots only, and a warning is issued. Printing the trajectory shows the
+    largest excess, its limit and its time.
 
     Parameters
     ----------
     robot : Robot
     goal : LinearModel, (q, v) or array_like (nx,)
-        End of the motion: a model, for its operating point; a configuration and velocity in
-        Pinocchio's order; or a state of `StateMap` in frame "hybrid". In (q, v), None means
+        End of the motion: the operating point of a model, a configuration and velocity in
+        Pinocchio's order, or a state of `StateMap` in frame "hybrid". In (q, v), None means
         neutral or at rest. Wheels may end at any angle.
     duration : float
         Duration of the motion [s].
@@ -82,8 +82,8 @@ def plan(
     hold : {"previous", "linear"}
         Inputs between knots: held at the value of the previous knot, or linearly interpolated.
     limits : "urdf", float, mapping or list of them, optional
-        Limits of inputs and states, as in `simulate`. With None there are no limits, except that
-        thrusters cannot pull.
+        Limits of inputs and states, as in `simulate`. With None, the only limit is that thrusters
+        cannot pull.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
         Diagonal weight on the inputs, as in `lqr`. By default 1/limit^2, or 1 for an input without
         a limit.
@@ -94,15 +94,15 @@ def plan(
     Returns
     -------
     Trajectory
-        Planned motion and its inputs. Torques and forces on the base are in base axes, and are held
-        in these axes between knots.
+        Planned motion and its inputs. Torques and forces on the base are in base axes, and are
+        constant in base axes between knots if held.
 
     Raises
     ------
     InputError
         If an argument has a wrong size or value, the start or goal is outside a limit, or no
-        motion to the goal within the limits is found. The message states by how much the last
-        trial misses the goal or exceeds a limit. A feasible motion may still exist.
+        motion to the goal within the limits is found. The message gives the largest error of the
+        last trial, in its end state or its limits. A feasible motion may still exist.
     MissingPackageError
         If PIQP is not installed.
     UnknownNameError
@@ -224,7 +224,9 @@ def _least(search: Search, guess: tuple[Array, Array, Array], size: Array) -> _M
     return best
 
 
-def _require_within(state: StateMap, bounds: Array, what: str, point: Point, which: Any) -> None:
+def _require_within(
+    state: StateMap, bounds: Array, what: str, point: Point, which: slice | NDArray[np.bool_]
+) -> None:
     """Raise `InputError` if a point is outside the limits of some states."""
     values = limited_values(state, *point)
     asked = np.zeros(state.nx, dtype=bool)
@@ -241,7 +243,7 @@ def _require_within(state: StateMap, bounds: Array, what: str, point: Point, whi
 
 def _note(shooting: Shooting, made: _Made, size: Array) -> str:
     """Say which limit of a state (nx,) the integrated motion exceeds most, by what and when."""
-    most = "exceeds no limit of a state"
+    most = "exceeds no state limit"
     if made.most > 0.0:
         k, part, i = np.unravel_index((made.beyond / size).argmax(), made.beyond.shape)
         at = (k + (part + 1) / _PARTS) * shooting.h[0]

@@ -1,7 +1,5 @@
 """Differences between a simulated robot and the robot that a controller was designed for."""
 
-from typing import Any
-
 import numpy as np
 
 from fflin.base.validation import Array
@@ -17,7 +15,7 @@ _ROUNDING = 1e-9
 _LEAST = 1e-2
 
 
-def notes_of(policy: Any, robot: Robot) -> tuple[str, ...]:
+def notes_of(policy: object, robot: Robot) -> tuple[str, ...]:
     """Return a note on how a robot differs from a policy's design; none if they are the same."""
     design = getattr(policy, "design", None)  # of an allocation
     along = getattr(policy, "trajectory", None)

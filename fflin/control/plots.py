@@ -11,7 +11,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing, letters_of, logarithmic
-from fflin.base.validation import Array, instance, number, refuse_masked
+from fflin.base.validation import Array, Values, instance, number, refuse_masked
 from fflin.control.gain import Gain
 from fflin.control.margins import Loop, input_loops
 from fflin.linear.model import LinearModel
@@ -24,7 +24,7 @@ _LINE = "#888888"
 
 
 def plot_poles(
-    poles: Any, path: str | Path | None = None, *, dt: float = 0.0, title: str = "poles"
+    poles: object, path: str | Path | None = None, *, dt: float = 0.0, title: str = "poles"
 ) -> Figure:
     """Plot a pole map.
 
@@ -33,9 +33,9 @@ def plot_poles(
     Parameters
     ----------
     poles : array_like or Gain or LinearModel
-        Poles [1/s], or an object that has poles. Give several sets as {label: poles}.
+        Poles [1/s], an object with poles, or several sets {label: poles}.
     path : str or Path, optional
-        File to write, .png, .pdf or .svg. Errors are as in `plot_motion`.
+        File to write, .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
     dt : float
         Sampling time [s] of poles given as numbers. If not 0, the unit circle is drawn.
     title : str
@@ -64,13 +64,13 @@ def plot_poles(
 
 
 def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
-    """Plot the loop at each input, with the other loops closed: Bode plot, margins and poles.
+    """Plot the loop gain at each input with the other loops closed: Bode plot, margins and poles.
 
     Parameters
     ----------
     gain : Gain
     path : str or Path, optional
-        File to write, .png, .pdf or .svg. Errors are as in `plot_motion`.
+        File to write, .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
 
     Returns
     -------
@@ -113,7 +113,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def _bode(sizes: Axes, phases: Axes, w: Array, response: Any, loops: Sequence[Loop]) -> None:
+def _bode(sizes: Axes, phases: Axes, w: Array, response: Values, loops: Sequence[Loop]) -> None:
     colors = cycle(len(loops))
     sizes.set_prop_cycle(color=colors)
     sizes.loglog(w, np.abs(response), lw=1.0)
@@ -138,7 +138,7 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Any, loops: Sequence[Lo
         axes.set(xlabel="frequency [rad/s]", xlim=(w[0], w[-1]))
 
 
-def _pole_map(axes: Axes, sets: dict[str, Any], dt: float) -> None:
+def _pole_map(axes: Axes, sets: dict[str, Values], dt: float) -> None:
     for place, (label, values) in enumerate(sets.items()):
         axes.plot(
             values.real,
@@ -161,7 +161,7 @@ def _pole_map(axes: Axes, sets: dict[str, Any], dt: float) -> None:
     axes.set(xlabel=f"real part{of}", ylabel=f"imaginary part{of}")
 
 
-def _poles_of(given: Any) -> tuple[Any, float]:
+def _poles_of(given: object) -> tuple[Values, float]:
     if isinstance(given, LinearModel):
         return np.linalg.eigvals(given.A), given.dt
     if hasattr(given, "poles"):
@@ -174,7 +174,8 @@ def _poles_of(given: Any) -> tuple[Any, float]:
     right = poles.dtype.kind in "fiuc" and poles.ndim == 1 and poles.size
     if not right or not np.isfinite(poles).all():
         raise InputError(
-            f"poles is a {type(given).__name__} of shape {poles.shape}, expected finite numbers "
+            f"poles has type {type(given).__name__} of shape {poles.shape}, expected finite "
+            "numbers "
             "(k,), a Gain, a LinearModel or {label: poles}"
         )
     return poles, 0.0

@@ -53,13 +53,13 @@ class Feedback:
 class StateFeedback(Feedback):
     """State feedback ``u = u0 - K (x - x0)`` about the point of a linear model.
 
-    The angle of a continuous joint is unwrapped to within half a turn of x0.
+    The angle of a continuous joint is unwrapped to differ from x0 by at most half a turn.
 
     Parameters
     ----------
     lin : LinearModel
-        Model that K was designed for. With a reduced model, only the states of that model are
-        fed back.
+        Model that K was designed for. With a reduced model, only the states of the reduced model
+        are fed back.
     K : array_like (nu, nx)
         Gain.
 
@@ -126,8 +126,8 @@ class StateFeedback(Feedback):
 class Allocation:
     """Allocation of a policy's commands to thrusters and motors within their limits.
 
-    The policy commands the inputs of the robot `design`, such as torque and force on the base. The
-    thrusters and motors of the simulated robot then produce the generalised force that is closest
+    The policy commands the inputs of the robot `design`, such as torque and force on the base.
+    The thrusters and motors of the simulated robot produce the generalised force that is closest
     to the commanded force. The distance between two forces is the sum of squared differences
     between the accelerations that they cause. No thrust is negative, and no input exceeds its
     limit.
@@ -136,7 +136,7 @@ class Allocation:
     ----------
     policy : policy or StateFeedback
     design : Robot
-        The same robot with the inputs that the policy commands.
+        The simulated robot, but with the inputs that the policy commands.
 
     Examples
     --------
@@ -227,12 +227,12 @@ class Clock:
         self._last = t
 
 
-def decider(policy: Any) -> Any:
+def decider(policy: object) -> object:
     """Return the policy that computes the commands: for an allocation, its inner policy."""
     return policy.policy if isinstance(policy, Allocation) else policy
 
 
-def axes_of(policy: Any) -> tuple[Frame | None, pin.SE3 | None]:
+def axes_of(policy: object) -> tuple[Frame | None, pin.SE3 | None]:
     """Return the frame and reference that a policy's state and inputs are in, if they are known."""
     lin, _ = feedback_of(policy)
     if lin is not None:
@@ -241,24 +241,24 @@ def axes_of(policy: Any) -> tuple[Frame | None, pin.SE3 | None]:
     return getattr(by, "frame", None), getattr(by, "origin", None)
 
 
-def bound(policy: Any, robot: Robot) -> Policy:
+def bound(policy: object, robot: Robot) -> Policy:
     """Return a policy for a robot, or raise `InputError` if the object is not a policy."""
     result = policy.bind(robot) if hasattr(policy, "bind") else policy
     if not callable(result):
         raise InputError(
-            f"policy is a {type(policy).__name__}, expected policy(t, q, v) -> u, such as "
+            f"policy has type {type(policy).__name__}, expected policy(t, q, v) -> u, such as "
             "StateFeedback(lin, gain.K)"
         )
     return result
 
 
-def feedback_of(policy: Any) -> tuple[LinearModel | None, Array | None]:
+def feedback_of(policy: object) -> tuple[LinearModel | None, Array | None]:
     """Return the model that a policy was made for, and its K, where it has them."""
     lin = getattr(policy, "lin", None)
     return (lin if isinstance(lin, LinearModel) else None), getattr(decider(policy), "K", None)
 
 
-def fed_back(policy: Any) -> tuple[str, ...]:
+def fed_back(policy: object) -> tuple[str, ...]:
     """Return the names of the states that a policy feeds back, as far as that is known."""
     (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
     if schedule is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -110,8 +111,9 @@ def _read(path: Path) -> System:
     if any(each is None for each in (A, B, C)):
         if D is None or A is not None:
             raise FileError(
-                f"{path}: it has {listed(sorted(found)) or 'no arrays'}, expected A, B, C, D, "
-                "and Ts if sampled, or D alone; in MATLAB, write it by [A, B, C, D] = ssdata(K); "
+                f"{path}: the file contains {listed(sorted(found)) or 'no arrays'}, expected A, B, "
+                "C, D (and Ts if sampled) or D alone; in MATLAB, save the controller K by [A, B, "
+                "C, D] = ssdata(K); "
                 "Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
             )
         A = B = C = ()
@@ -131,7 +133,9 @@ def fitted(system: System, lin: LinearModel) -> System:
     return System(system.A, B, C, D, system.dt, lin.output_names, lin.input_names)
 
 
-def _indices(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -> list[int]:
+def _indices(
+    kind: str, names: tuple[str, ...], size: int, of: str, known: Sequence[str]
+) -> list[int]:
     """Return the indices of a controller's signals among the signals of a model."""
     named = not all(map(_NUMBERED.fullmatch, names))
     if size != len(names if named else known):

@@ -40,9 +40,9 @@ class TrajectoryFeedback(Feedback):
     """Trajectory tracking ``u = u*(t) - K(t) e`` with the error e relative to a trajectory.
 
     The error is defined as in `linearize_trajectory`. Torques and forces on the base are in base
-    axes, and t is the time since the first knot. After the end, the target is the last
-    configuration at rest. The command is then the sum of the inputs that hold the robot there and
-    the feedback of the regulator with the same weights.
+    axes, and t is the time since the first knot. After the end of the trajectory, the target is
+    the last configuration at rest. The command is then the sum of the holding inputs at this
+    target and the feedback of a regulator with the same weights.
 
     Parameters
     ----------
@@ -51,8 +51,7 @@ class TrajectoryFeedback(Feedback):
         Result of `tvlqr`.
     held : bool
         Whether commands are held between samples; commands of a sampled schedule are always held.
-        With held commands, the command at the last knot already contains the inputs that hold the
-        robot there.
+        With held commands, the command at the last knot already contains the holding inputs.
 
     Examples
     --------
@@ -121,7 +120,7 @@ class TrajectoryFeedback(Feedback):
 
     @property
     def ahead(self) -> float:
-        """Time [s] into a sample at which a changing input is closest to the sample mean."""
+        """Time [s] after a sample at which a changing input is closest to its mean."""
         return 0.5 * self.schedule.dt if self.trajectory.hold == "linear" else 0.0
 
     def commanded(self, t: float) -> tuple[Array, Array, Array]:
@@ -143,8 +142,8 @@ class TrajectoryFeedback(Feedback):
         Parameters
         ----------
         offset : mapping
-            {name, group or pattern of states: error, in the base axes at the start}. The angles
-            roll, pitch, yaw [deg] may be given instead of q_b.
+            {name, group or pattern of states: error, in the base axes at the start}. The names
+            ``roll``, ``pitch`` and ``yaw`` [deg] can replace q_b.
 
         Raises
         ------
@@ -240,13 +239,13 @@ def followed(policy: Any, robot: Robot, held: float = 0.0) -> Any:
     return policy
 
 
-def reference_of(policy: Any) -> Reference | None:
+def reference_of(policy: object) -> Reference | None:
     """Return the reference of a policy that follows a motion, else None."""
     found = getattr(decider(policy), "reference", None)
     return found if callable(found) else None
 
 
-def tracking_of(policy: Any) -> TrajectoryFeedback | None:
+def tracking_of(policy: object) -> TrajectoryFeedback | None:
     """Return the feedback along a trajectory that a policy is or allocates."""
     decides = decider(policy)
     return decides if isinstance(decides, TrajectoryFeedback) else None
@@ -269,10 +268,10 @@ def largest_rate(schedule: GainSchedule) -> float:
 class TrajectoryOutputFeedback(TrajectoryFeedback):
     r"""Feedback ``u = u*(t) - K(t) eh`` of the estimated error relative to a trajectory.
 
-    At each sample, u is applied. Then y is measured, and the filter advances the estimate eh to
+    At each sample, u is applied and y is measured. The filter then advances the estimate eh to
     the next sample, as in `OutputFeedback`. Positions and attitudes are measured relative to the
-    base pose of the trajectory. The policy that `bind` returns has an attribute ``estimate``
-    (nx,): the estimate for the next sample.
+    base pose of the trajectory. The policy returned by `bind` has an attribute ``estimate``
+    (nx,), the estimate of the error at the next sample.
 
     Parameters
     ----------

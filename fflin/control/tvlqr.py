@@ -43,7 +43,7 @@ def tvlqr(
 ) -> GainSchedule:
     r"""Return the time-varying linear quadratic regulator along a trajectory.
 
-    From any time t to the end T, it minimises the finite-horizon cost
+    From any time t to the end T, the regulator minimises the finite-horizon cost
 
     .. math:: e(T)^T Q_f\,e(T) + \int_t^T e^T Q\,e + \delta u^T R\,\delta u\;d\tau.
 
@@ -51,13 +51,12 @@ def tvlqr(
     :math:`P(T) = Q_f`. It is solved backwards from knot to knot by maps
     :math:`P_0 = W + T^T P_1 (I + G P_1)^{-1} T` with positive semidefinite W and G. Each map is
     computed from a short matrix exponential by doubling, so P stays positive semidefinite over any
-    horizon. The method is of fourth order along a changing trajectory and exact along a constant
-    one. Knots are added until the estimated errors of the steps and of the interpolation of P are
-    below 1e-7.
+    horizon. The method has order four in general, and is exact if A and B are constant. Knots are
+    added until the estimated errors of the steps and of the interpolation of P are below 1e-7.
 
-    With `sample`, the regulator is sampled: a computer measures e at the samples and holds
-    :math:`\delta u` between them. The cost remains the integral above, evaluated by (10.1) and
-    (10.3) along the motion.
+    With `sample`, the regulator is sampled: e is measured at the samples, and :math:`\delta u` is
+    held between samples. The cost is still the integral over continuous time, evaluated by (10.1)
+    and (10.3) along the motion.
 
     Parameters
     ----------
@@ -67,16 +66,16 @@ def tvlqr(
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
         Weight on the inputs, positive definite.
     Qf : "steady", or as Q
-        Weight on the error at the end. "steady" is the infinite-horizon cost of `lqr` about the end
-        point: the last configuration at rest, or in its final motion if that motion is steady. It
-        omits the states that the inputs cannot stabilise, see `momentum_reduction`.
+        Weight on the error at the end. "steady" is the infinite-horizon cost of `lqr` about the
+        end point. The end point is the last configuration at rest, or in its final motion if this
+        motion is steady. States that the inputs cannot stabilise have zero weight in Qf, see
+        `momentum_reduction`.
     sample : float, optional
         Sampling time [s]. It must divide the duration.
     weights : {"urdf", "identity"}, optional
-        Rule that chooses the weights if Q and R are omitted. It is the rule of `lqr` for the linear
-        model at the last point of the trajectory, for displacements a tenth as large as those of
-        `lqr`. The loop is fast enough for errors to decay within the
-        duration of the trajectory.
+        Rule for the weights if Q and R are omitted. The rule of `lqr` is applied to the linear
+        model at the last point of the trajectory, with displacements a tenth as large as in
+        `lqr`. With these weights, errors decay within the duration of the trajectory.
     rule : str
         Description of the rule that made Q and R.
 
@@ -114,7 +113,9 @@ def tvlqr(
     steady = asks_steady(Qf)
     given, by_rule = list[Any]((Q, R)), Q is None and R is None
     if not by_rule and (weights is not None or Q is None or R is None):
-        raise InputError("give both Q and R, or neither and weights='urdf' or 'identity'")
+        raise InputError(
+            "only one of Q and R is given; give both, or leave both out for default weights"
+        )
     end: Any = steady_end(traj) if steady or by_rule else None
     if by_rule:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
@@ -168,7 +169,7 @@ def require_continuous(traj: LinearTrajectory) -> None:
     """Raise `InputError` if traj is not a LinearTrajectory in continuous time."""
     if not isinstance(traj, LinearTrajectory):
         raise InputError(
-            f"traj is a {type(traj).__name__}, expected a LinearTrajectory; "
+            f"traj has type {type(traj).__name__}, expected a LinearTrajectory; "
             "fflin.linearize_trajectory returns one"
         )
     if traj.dt:
@@ -234,12 +235,12 @@ def tvkalman(
 
     .. math:: \dot P = A P + P A^T - P C^T V^{-1} C P + W,\qquad L = P C^T V^{-1}.
 
-    In reversed time this is the equation of `tvlqr` with :math:`A, B, Q, R` replaced by
-    :math:`A^T, C^T, W, V`. It is solved in the same way.
+    In reversed time, the equation is the Riccati equation of `tvlqr` with :math:`A, B, Q, R`
+    replaced by :math:`A^T, C^T, W, V`. The solution method is the same.
 
-    With `sample`, the filter is sampled, (10.4): a computer measures y at the samples and holds
-    :math:`\delta u` between them. V is then the noise covariance per sample. W remains the
-    intensity of the continuous disturbance.
+    With `sample`, the filter is sampled (10.4): y is measured at the samples, and :math:`\delta
+    u` is held between samples. V is then the noise covariance per sample. W remains the intensity
+    of the continuous disturbance.
 
     Parameters
     ----------
@@ -251,11 +252,12 @@ def tvkalman(
         Intensity of the measurement noise, positive definite.
     G : array_like (nx, nw) or (N, nx, nw), optional
         Input matrix of the disturbance, linear between the knots; W is then (nw, nw). With
-        ``G=traj.B`` the disturbance acts at the inputs; if W is a mapping, its keys are then names
-        of inputs.
+        ``G=traj.B``, the disturbance acts at the inputs, and the keys of a mapping W are names of
+        inputs.
     P0 : "steady", or as W
-        Covariance at the start. "steady" is the covariance of `kalman` about the start point: the
-        first configuration at rest, or in its initial motion if that motion is steady.
+        Covariance at the start. "steady" is the covariance of `kalman` about the start point. The
+        start point is the first configuration at rest, or in its initial motion if this motion is
+        steady.
     sample : float, optional
         Sampling time [s]. It must divide the duration.
 
@@ -271,8 +273,8 @@ def tvkalman(
     UnknownNameError
         If a name does not exist.
     EquilibriumError, DetectabilityError
-        If P0 is "steady" and no inputs can hold the robot at the start point, or if the model
-        there is not detectable.
+        If P0 is "steady", and no inputs can hold the robot at the start point or the model at
+        this point is not detectable.
 
     References
     ----------

@@ -22,7 +22,7 @@ _ROUNDING = 1e-9
 def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) -> Array:
     r"""Return the diagonal of a weight by Bryson's rule: :math:`1/\text{largest}^2` per entry.
 
-    The largest acceptable deviation then costs 1, whatever its unit.
+    The largest acceptable deviation of each signal then contributes 1 to the cost.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     return _diagonal("largest", values, names, complete=of_inputs)
 
 
-def is_input(kind: str, key: str, lin: Any) -> bool:
+def is_input(kind: str, key: str, lin: LinearModel | LinearTrajectory) -> bool:
     """Whether a name, group or pattern is of inputs and not of states."""
     found = matching(kind, key, (*lin.state_names, *input_keys(lin)))
     sides = {index >= len(lin.state_names) for index in found}
@@ -154,7 +154,7 @@ def cost_weights(
     return Q, R, cross
 
 
-def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool) -> Array:
+def _checked_matrix(what: str, value: ArrayLike, names: Sequence[str], definite: bool) -> Array:
     size = len(names)
     matrix = cross_weight(what, value, size, size)
     skew = np.abs(matrix - matrix.T)
@@ -189,17 +189,17 @@ class SampledCost(NamedTuple):
 def sampled_cost(
     lin: LinearModel, dt: float, Q: Weight, R: Weight, N: ArrayLike | None = None
 ) -> SampledCost:
-    r"""Return discrete-time weights for which the cost summed over samples equals an integral cost.
+    r"""Return discrete-time weights that sum up to a continuous-time cost.
 
-    The inputs are held between samples (zero-order hold).
+    For inputs with zero-order hold, the cost summed over samples equals the integral cost.
 
-    The weights are, by (10.1) of docs/derivation.md,
+    By (10.1) of docs/derivation.md, the weights are
 
     .. math:: \begin{bmatrix} Q_d & N_d \\ N_d^T & R_d \end{bmatrix} = \int_0^h e^{F^T t}
               \begin{bmatrix} Q & N \\ N^T & R \end{bmatrix} e^{F t}\,dt,\qquad
               F = \begin{bmatrix} A & B \\ 0 & 0 \end{bmatrix}
 
-    At rest F^3 = 0, and the integral is an exact polynomial in h. Otherwise the integral is
+    At rest F^3 = 0, and the integral is an exact polynomial in h. In motion, the integral is
     computed over a short step (van Loan), which is then doubled repeatedly.
 
     Parameters

@@ -22,12 +22,12 @@ from fflin.robot.welding import joined, welded
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Impact(FrozenArrays):
-    """Robot just after an instantaneous impact; pass it to `Motion.then` to continue a motion.
+    """Robot just after an instantaneous impact; `Motion.then` appends the impact to a motion.
 
     Attributes
     ----------
     robot : Robot
-        The robot after the impact, to be linearised, controlled and simulated like any other.
+        The robot after the impact, which can be linearised, controlled and simulated.
     q, v : ndarray (nq,), (nv,)
         Configuration and velocity of this robot just after the impact.
     impulse : ndarray (k,)
@@ -87,21 +87,21 @@ def jam(
 
     The other joints are free during the impact. Immediately after the impact, the velocity
     satisfies :math:`M_+ \nu_+ = G^T M \nu` (13.1), where G is the Jacobian of the robot with the
-    jammed joints fixed. Linear and angular momentum are conserved. If a motor fails but its joint
-    still moves freely, use ``robot.replace(passive=[joint])`` instead; there is then no impact.
+    jammed joints fixed. Linear and angular momentum are conserved. For a failed motor whose joint
+    still moves freely, use ``robot.replace(passive=[joint])`` instead of `jam`.
 
     Parameters
     ----------
     robot : Robot
     joints : str or sequence of str
-        Names or patterns of joints; the mimic joints of a joint stop with it.
+        Names or patterns of joints. The mimic joints of a jammed joint are also jammed.
     q, v : array_like (nq,), (nv,), optional
         Configuration and velocity just before the impact; neutral and at rest by default.
 
     Returns
     -------
     Impact
-        Result of the impact. In its robot, these joints are welded and have no inputs.
+        Result of the impact. The jammed joints are welded in `robot` and have no inputs.
 
     Raises
     ------
@@ -203,8 +203,8 @@ class Capture(Impact):
     Attributes
     ----------
     impulse : ndarray (6,)
-        Impulse on the robot, about the origin of the payload's frame and in its axes: linear [N s],
-        then angular [N m s].
+        Impulse on the robot about the origin of the payload's frame, in the axes of this frame:
+        linear [N s], then angular [N m s].
     payload : Robot
         The grasped payload as a robot. Its configuration and velocity just before the impact are
         ``payload_q`` (nq,) and ``payload_v`` (nv,).
@@ -251,10 +251,10 @@ def capture(
     r"""Grasp a payload rigidly, instantly and permanently.
 
     The joints are free during the impact, because motors give only finite torques. The velocity
-    just after the impact solves :math:`M_+ \nu_+ = G^T \mathrm{diag}(M, M_p) (\nu_-, V_p)`. Here G
-    is the Jacobian of the velocities of robot and payload with respect to the velocity of the
-    combined robot. The solution is the M-orthogonal projection onto the motions that the weld
-    allows. It conserves linear and angular momentum.
+    just after the impact solves :math:`M_+ \nu_+ = G^T \mathrm{diag}(M, M_p) (\nu_-, V_p)`. G is
+    the Jacobian of the velocities of robot and payload with respect to the velocity of the
+    combined robot. The solution is the M-orthogonal projection onto the motions that the rigid
+    grasp permits. The impact conserves linear and angular momentum.
 
     Parameters
     ----------
@@ -262,15 +262,16 @@ def capture(
     frame : str
         Name of the grasping frame.
     payload : pin.Inertia or Robot
-        A rigid body, in its own frame, or a robot, grasped at its base. The joints of a payload
-        robot keep their springs and dampers and lose their motors.
+        A rigid body with its inertia in its own frame, or a robot that is grasped at its base.
+        The joints of a payload robot keep their springs and dampers and lose their motors.
     q, v : array_like (nq,), (nv,), optional
         Configuration and velocity of the robot just before the impact; neutral and at rest by
         default.
     placement : pin.SE3, optional
         Placement of the payload's frame in the grasping frame; the identity by default.
     payload_q : array_like (nq,), optional
-        Configuration of a payload with joints, neutral by default. Its base pose is ignored.
+        Configuration of a payload with joints, neutral by default. The base pose in `payload_q`
+        is ignored.
     payload_v : array_like (6,) or (nv,), optional
         Twist of the payload's frame in its own axes (Pinocchio's LOCAL), linear [m/s], then
         angular [rad/s], followed by the joint rates; at rest by default.
@@ -326,8 +327,8 @@ def capture(
             )
     if other.stored_momentum:
         raise InputError(
-            "a wheel of the payload has momentum but no inertia, so its momentum would be lost; "
-            "give the wheel an inertia, and its speed in payload_v"
+            "a wheel of the payload has a momentum but no inertia, so that its momentum would be "
+            "lost; give the wheel an inertia, and its speed in payload_v"
         )
     at = pin.SE3.Identity() if placement is None else checked_placement("placement", placement)
     q = robot.neutral() if q is None else robot.checked_configuration(q)

@@ -107,10 +107,12 @@ class Inertia:
         name, allowed = self._state.robot.name, self._in_order
         worst = int((inertias / allowed).argmin())
         warnings.warn(
-            f"M of '{name}': {coordinate_names(self._state.robot)[worst]} has an inertia of only "
-            f"{inertias[worst]:.1e}; mass and position of its links allow up to "
-            f"{allowed[worst]:.1e}. B has entries of {1.0 / inertias[worst]:.1e}. Give the links "
-            "their inertia, check that joints are placed in metres, or lock the joint",
+            f"the mass matrix of '{name}': {coordinate_names(self._state.robot)[worst]} has an "
+            "inertia of only "
+            f"{inertias[worst]:.1e} in SI units; the mass and position of its links suggest up to "
+            f"{allowed[worst]:.1e}. As a result, B has entries of {1.0 / inertias[worst]:.1e}. "
+            "Give the links their inertia, check that joint positions are in metres, or lock the "
+            "joint",
             FflinWarning,
             stacklevel=6,
         )
@@ -132,14 +134,14 @@ class Inertia:
         involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
         if lost:
             raise SingularInertiaError(
-                f"M of '{name}' is singular at this configuration: a motion of {involved} moves "
-                "no mass; choose another configuration, give the links an inertia, or "
-                "lock one of the joints"
+                f"the mass matrix of '{name}' is singular at this configuration: a motion of "
+                f"{involved} moves no mass; choose another configuration, give the links an "
+                "inertia, or lock one of the joints"
             )
         warnings.warn(
-            f"M of '{name}' is ill-conditioned: A and B have a relative error of about "
-            f"{coupling * _EPS:.0e}; {involved} move hardly any mass relative to each other; "
-            "check the inertias of their links",
+            f"the mass matrix of '{name}' is ill-conditioned, so that A and B have a relative "
+            f"error of about {coupling * _EPS:.0e}: {involved} move almost no mass relative to "
+            "each other; check the inertias of the links",
             FflinWarning,
             stacklevel=6,
         )

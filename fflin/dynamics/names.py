@@ -50,8 +50,8 @@ def refuse_orbit(robot: Any, what: str) -> None:
     """Raise `InputError` if a robot is in orbit, which `what` does not support."""
     if getattr(robot, "orbit", None):
         raise InputError(
-            f"{what} are defined only without an orbit, but '{robot.name}' is in orbit; use "
-            "robot.replace(orbit=None)"
+            f"{what} are defined only without an orbit, but '{robot.name}' is in orbit; remove the "
+            "orbit with robot.replace(orbit=None)"
         )
 
 

@@ -28,8 +28,8 @@ def configuration(
     ----------
     robot : Robot
     joints : mapping, optional
-        {joint: value [rad|m]} of independent joints; all others are at neutral. A name may be
-        a pattern, ``hinge_*``.
+        {joint: value [rad|m]} of independent joints; all other joints are at their neutral
+        positions. A name may be a pattern, ``hinge_*``.
     base : pin.SE3, optional
         Placement of the base in the world; the identity by default.
 
@@ -42,7 +42,7 @@ def configuration(
     UnknownNameError
         If there is no such joint.
     InputError
-        If a value is not a finite number, or a named joint mimics another.
+        If a value is not a finite number, or a named joint is a mimic joint.
 
     Examples
     --------
@@ -53,7 +53,7 @@ def configuration(
            0.38941834, 1.        , 0.        ])
     """
     if not isinstance(robot, Robot):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+        raise InputError(f"robot has type {type(robot).__name__}, expected a fflin.Robot")
     q = pin.neutral(robot.model)
     if base is not None:
         root = robot.model.jointPlacements[ROOT]
@@ -110,8 +110,8 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     robot : Robot
     values : mapping
         {name: rate}, with joint names [rad/s|m/s], and omega_b.x, .y, .z [rad/s] and v_b.x, .y, .z
-        [m/s] of the base in base axes. All others are zero. A name may be a pattern, ``hinge_*``,
-        or a group, ``qdot_m``.
+        [m/s] of the base in base axes. All other rates are zero. A name may be a pattern,
+        ``hinge_*``, or a group, ``qdot_m``.
 
     Returns
     -------
@@ -146,7 +146,7 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     ----------
     robot : Robot
     values : mapping
-        {name of an input, group or pattern, such as ``tau_m``: value}; all others are zero.
+        {name of an input, group or pattern, such as ``tau_m``: value}; all other inputs are zero.
 
     Returns
     -------

@@ -24,22 +24,22 @@ class StateMap:
 
     The state is :math:`X = (q_b, r_b, q_m, \omega_b, v_b, \dot q_m)` of dimension 12 + 2n. Let
     :math:`{}^{ref}M_b = {}^oM_{ref}^{-1}\,{}^oM_b` be the base placement relative to the reference.
-    Then r_b is its translation, and q_b is the vector part of its quaternion, with the sign for
-    which the scalar part is not negative.
+    r_b is the translation of this placement. q_b is the vector part of its quaternion, with the
+    sign for which the scalar part is at least 0.
 
     Parameters
     ----------
     robot : Robot
     reference : pin.SE3, optional
-        Placement oMref that the attitude and position are relative to; identity by default.
+        Placement oMref to which attitude and position are relative; the identity by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
         Axes of the base velocities omega_b and v_b, both at the base origin:
 
         - hybrid (default): omega_b in base axes, v_b = d r_b/dt in reference axes;
         - local: both in base axes;
         - world: both in reference axes;
-        - lvlh (default in orbit) or hill, only for a robot in orbit: Pinocchio's world is this
-          orbital frame. The axes of omega_b and v_b are as in hybrid.
+        - lvlh (default in orbit) or hill, only for a robot in orbit: the world of Pinocchio is
+          the orbital frame. The axes of omega_b and v_b are as in hybrid.
 
     Attributes
     ----------
@@ -62,8 +62,8 @@ class StateMap:
         Attitude of `origin` as a quaternion x, y, z, w.
     orbit : tuple of ndarray (3,), (3, 3), or None
         For a robot in orbit: the angular velocity of the reference frame, and the matrix from the
-        position of a point at rest in this frame to its acceleration. Both are in the axes of the
-        frame.
+        position of a point at rest in this frame to its acceleration. The vector and the matrix
+        are in the axes of the reference frame.
 
     Raises
     ------
@@ -90,7 +90,8 @@ class StateMap:
     ) -> None:
         if not isinstance(robot, Robot):
             raise InputError(
-                f"robot is a {type(robot).__name__}, expected a fflin.Robot; fflin.load makes one"
+                f"robot has type {type(robot).__name__}, expected a fflin.Robot; fflin.load makes "
+                "one"
             )
         robot.require_unchanged()
         n, self.robot = robot.n, robot
@@ -134,7 +135,7 @@ class StateMap:
         self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
 
     def about(self, reference: pin.SE3) -> "StateMap":
-        """Return the same map relative to another placement, with the same velocity frame."""
+        """Return a map with another reference placement and the same velocity frame."""
         other = copy(self)
         other._refer(reference)
         return other
@@ -194,7 +195,7 @@ class StateMap:
         return rotated
 
     def scalar(self, q: Array) -> float:
-        """Return the quaternion's scalar part q0 at a valid q, with the sign it has in q."""
+        """Return the quaternion's scalar part q0 at a valid q, with the sign of q0 in q."""
         return float(turning.quaternion_product(self.origin_quaternion, q[3:7])[3])
 
     def to_state(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
@@ -207,9 +208,9 @@ class StateMap:
         v : array_like (nv,)
             Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
         near : array_like (nx,), optional
-            State near which the angles of continuous joints are unwrapped: each angle is shifted by
-            the multiple of 2 pi that brings it closest to its value in this state. By default
-            angles are in (-pi, pi].
+            State near which the angles of continuous joints are unwrapped: each angle is shifted
+            by a multiple of 2 pi to be closest to its value in `near`. By default, angles are in
+            (-pi, pi].
 
         Returns
         -------

@@ -42,7 +42,7 @@ class CLaw:
     folder : path
         Folder that `write_c` wrote.
     name : str, optional
-        Name that `write_c` was given. Necessary only if the folder contains several laws.
+        The `name` given to `write_c`. It is necessary only if the folder contains several laws.
     compiler : str
         Command of the C compiler.
 
@@ -51,16 +51,16 @@ class CLaw:
     name : str
         Name of the code, see `write_c`.
     dt : float
-        Sampling time [s]; 0 for a law without one.
+        Sampling time [s]; 0 for a law that is not sampled.
     frame : str
         Axes of the inputs, as in `LinearModel`.
     origin : pin.SE3 or None
-        Reference of the state, which the axes of the inputs are relative to.
+        Reference of the state and of the axes of the inputs.
 
     Raises
     ------
     FileError
-        If the folder does not contain the files of one law, or they were edited.
+        If the folder does not contain the files of one law, or the files were edited.
     MissingPackageError
         If there is no C compiler.
     InputError
@@ -88,8 +88,8 @@ class CLaw:
         ]
         if len(found) != 1:
             raise FileError(
-                f"{source}: holds {len(found)} pairs of .json and .c, expected the files that "
-                "fflin.write_c wrote; give name= if there are several laws"
+                f"{source}: contains {len(found)} pairs of .json and .c, expected one pair that "
+                "fflin.write_c wrote; if there are several laws, choose one with name="
             )
         [self.name] = found
         about, header, code = (source / f"{self.name}.{end}" for end in ("json", "h", "c"))
@@ -108,8 +108,8 @@ class CLaw:
         self.origin = None if placement is None else pin.XYZQUATToSE3(np.array(placement))
         if self._about["kind"] == "output" and placement is None:
             raise InputError(
-                "the C code was written from a Compensator alone, without the model about which "
-                "outputs are measured; write it from an OutputFeedback"
+                "the C code was written from a Compensator, which does not contain the model and "
+                "its outputs; write the C code from an OutputFeedback"
             )
         self._real = ctypes.c_double if self._about["real"] == "double" else ctypes.c_float
         self._step = getattr(_compiled(code, compiler), f"{self.name}_step")
@@ -160,7 +160,7 @@ class CLaw:
         return policy
 
     def output_step(self, z: Array, y: Array, t: float) -> tuple[Array, Array]:
-        """Return u and the next z of a step with outputs y."""
+        """Return u and the next controller state z of one step with the outputs y."""
         real = self._real
         memory = (real * max(len(z), 1))(*z.tolist())
         u = (real * len(self._about["u0"]))()

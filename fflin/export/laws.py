@@ -209,7 +209,7 @@ def law_of(given: Any, robot: Any, limits: Any) -> StateLaw | OutputLaw:
     """Return the tables of a policy or design; `limits` as in `simulate`."""
     if not isinstance(given, _KINDS) or isinstance(given, TrajectoryOutputFeedback):
         raise InputError(
-            f"law is a {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
+            f"law has type {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
             "LinearController, Compensator, GainSchedule, TrajectoryFeedback or ScheduledFeedback"
         )
     lin: Any = given._lin if isinstance(given, Gain) else getattr(given, "lin", None)
@@ -218,8 +218,8 @@ def law_of(given: Any, robot: Any, limits: Any) -> StateLaw | OutputLaw:
         return _output_law(given, lin, robot, limits)
     if robot is None:
         raise InputError(
-            f"the robot of this {type(given).__name__} is not known, so that continuous joints "
-            "cannot be told from others; give robot= (--robot)"
+            f"the robot of this {type(given).__name__} is not known, so that its continuous joints "
+            "are not known; give the robot with robot= (--robot)"
         )
     if isinstance(given, GainSchedule):
         given = TrajectoryFeedback(given.trajectory(robot), given)
@@ -262,8 +262,8 @@ def _model_of(gain: Gain, robot: Robot) -> LinearModel:
     """Return the model about the point of a gain from a file, relative to its reference."""
     if not gain.placement.size:
         raise InputError(
-            "the file of the gain does not contain the reference pose, since an older version "
-            "wrote it; design the gain again"
+            "the file of the gain does not contain the reference pose, because the file was "
+            "written by an older version; design the gain again"
         )
     if gain.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
@@ -306,7 +306,7 @@ def _common(
 def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: Any) -> StateLaw:
     if not policy.schedule.dt:
         raise InputError(
-            "the gains are continuous in time, expected gains at samples; design them with "
+            "the gains are continuous in time, expected sampled gains; design sampled gains with "
             "tvlqr(..., sample=dt) (fflin tvlqr --sample)"
         )
     dt, state = policy.schedule.dt, policy.state_map(robot)

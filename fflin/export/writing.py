@@ -40,13 +40,17 @@ def write_c(
     r"""Write a control law as C99, with a test program.
 
     The folder then contains ``NAME.h``, ``NAME.c``, the test program ``NAME_test.c`` and
-    ``NAME.json``, which `CLaw` reads. The code needs no library except ``sqrt``. It allocates no
-    memory and has no global variables. The header describes each entry of the arguments.
+    ``NAME.json``, which `CLaw` reads. The code needs no library except ``sqrt``. The code
+    allocates no memory and has no global variables. The header describes each entry of the
+    arguments.
 
-    - For a state feedback, ``NAME_step`` takes the measured attitude, position, joint angles and
-      velocities. It computes the state as `StateMap` does, and then the inputs.
-    - For an output feedback, ``NAME_step`` takes the outputs y, and a memory that the caller owns.
-    - For gains along a trajectory, ``NAME_step`` also takes the number of the sample.
+    - For a state feedback, the arguments of ``NAME_step`` are the measured attitude, position,
+      joint angles and velocities. ``NAME_step`` computes the state as `StateMap` does, and from
+      the state the
+      inputs.
+    - For an output feedback, the arguments of ``NAME_step`` are the outputs y and a memory that
+      the caller owns.
+    - For gains along a trajectory, the number of the sample is another argument of ``NAME_step``.
 
     Parameters
     ----------
@@ -54,11 +58,11 @@ def write_c(
         Or a `Compensator` or `TrajectoryFeedback`. Controllers and gains along a trajectory must be
         sampled.
     folder : path
-        Folder of the files; it is made if necessary. Files of the same name are replaced if they
-        are of the same type of law and the same robot.
+        Folder for the files; a missing folder is created. Existing files of the same name are
+        replaced only if they were written for the same type of law and the same robot.
     robot : Robot, optional
-        Robot of the law. Necessary only if the law is from a file, and the name of its robot is not
-        the name of a robot that `load` takes.
+        Robot of the law. The robot is necessary only for a law from a file whose robot name is
+        not known to `load`.
     limits : "urdf", float, mapping or list, optional
         Limits of the inputs as in `simulate`. By default the inputs are not limited.
     name : str
@@ -74,8 +78,8 @@ def write_c(
     Raises
     ------
     InputError
-        If the law cannot be written in C, its robot is not known, the folder contains other files
-        of this name, or an argument is invalid.
+        If the law cannot be written in C, its robot is not known, other files have the same
+        names, or an argument is invalid.
     FileError
         If a file cannot be written.
 

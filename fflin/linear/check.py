@@ -152,13 +152,13 @@ class Check:
         if failures := self.failures:
             names = [f"{row.block} ({row.test})" for row in failures[:6]]
             names += ["..."] * (len(failures) > 6)
-            said = f"{len(failures)} of {len(self.rows)} figures FAILED: {', '.join(names)}"
-            verdict = f"A and B do not hold: {said}"
+            said = f"{len(failures)} of {len(self.rows)} errors FAILED: {', '.join(names)}"
+            verdict = f"A and B are not verified: {said}"
         else:
             largest = max(self.rows, key=lambda row: row.error)
             said = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
-            verdict = f"A and B hold: largest error {said}"
-        title = f"{self.title}, {len(self.rows)} figures"
+            verdict = f"A and B are verified: largest error {said}"
+        title = f"{self.title}, {len(self.rows)} errors"
         blocks = [row for row in self.rows if row.test in _ROUTES]
         parts = [folded([verdict]), folded([title]), _block_table(blocks)]
         rest, exact = [["figure", "error", "allowed"]], list[str]()
@@ -181,17 +181,16 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 
     - Pinocchio's ABA derivatives, mapped into the chart (tolerance 1e-9, relative);
     - sixth-order central differences of the nonlinear model :math:`\dot x = f(x, u)` in the same
-      chart (tolerance 1e-8). The function f itself is verified against motions that are integrated
-      with it.
+      chart (tolerance 1e-8). The function f is itself verified by integrated motions.
 
-    Tolerances grow with the condition number of M, as round-off errors do.
+    Tolerances are proportional to round-off errors, which grow with the condition number of M.
 
     Parameters
     ----------
     robot : Robot
         Robot that the model should describe.
     lin : LinearModel
-        Model in continuous time: just linearised, loaded from a file, or made by another tool.
+        Model in continuous time, from `linearize`, a file or another tool.
     tolerance : float, optional
         Relative tolerance that replaces the tolerance of every error, such as 1e-5 if another tool
         computed A and B by finite differences.

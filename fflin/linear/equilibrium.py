@@ -36,10 +36,10 @@ class Equilibrium(FrozenArrays):
     Attributes
     ----------
     q : ndarray (nq,)
-        Equilibrium configuration: the given one, except that passive joints sag on their springs.
-        Pass it to `linearize` as q.
+        Equilibrium configuration, the argument q of `linearize`. It differs from the given
+        configuration by the spring deflections of passive joints.
     u : ndarray (nu,)
-        Minimum-norm inputs. Pass them to `linearize` as u.
+        Minimum-norm inputs, the argument u of `linearize`.
     sag : ndarray (n,)
         Deflection of each joint from its given position [rad | m].
     residual : ndarray (6 + n,)
@@ -94,20 +94,22 @@ def equilibrium(
     r"""Compute the minimum-norm inputs that balance all forces on a robot, with spring deflections.
 
     The forces are the same as in `linearize`: springs, gravity, dampers, and the inertial forces of
-    a steady motion. In orbit they include the gravity gradient and the inertial forces of the
-    rotating orbit frame, in which the base rests. `relative_equilibria` finds attitudes that need
-    no torque on the base. With f the generalised forces without u, the inputs solve
+    a steady motion. In orbit, the forces include the gravity gradient and the inertial forces of
+    the rotating orbital frame, in which the base is at rest. `relative_equilibria` finds
+    attitudes in which no torque on the base is necessary. With f the generalised forces without
+    u, the inputs solve
 
     .. math::
         \min \|u\|_2 \quad \text{subject to} \quad B(q)\,u = -f(q, v), \qquad
         u_k \ge 0 \text{ for every thruster } k.
 
-    The norm is computed from the numbers in u, each in its own unit. The rows of the force balance,
-    in N m and N, are scaled by :math:`\sqrt{(M^{-1})_{ii}}` to make the rows
+    The norm of u is the norm of its numerical values in SI units. The rows of the force balance,
+    in N m and N, are scaled by :math:`\sqrt{(M^{-1})_{ii}}`, so that different units become
     comparable. The weighted residual must not exceed 1e-9 of the balanced forces.
 
-    A joint with a spring and without a `JointTorque` sags if no input holds it. Newton's method
-    then finds its position, with the Jacobian :math:`M\,\partial\dot\nu/\partial q_m`.
+    A joint with a spring and without a `JointTorque` deflects if no input holds the joint.
+    Newton's method finds the deflected position, with the Jacobian
+    :math:`M\,\partial\dot\nu/\partial q_m`.
 
     Parameters
     ----------
@@ -122,13 +124,13 @@ def equilibrium(
         Axes of the inputs on the base, as in `linearize`.
     reference : pin.SE3, optional
         Placement whose axes are the reference axes, as in `linearize`. The default is the base
-        placement; the inputs on the base are then in base axes, whichever `frame` is given. For a
-        robot in orbit, the default is the orbit's frame.
+        placement, with inputs on the base in base axes for any `frame`. For a robot in orbit, the
+        default is the orbital frame.
 
     Returns
     -------
     Equilibrium
-        Pass it on as ``linearize(robot, result.q, v, u=result.u)``, with the same frame and
+        Equilibrium for ``linearize(robot, result.q, v, u=result.u)`` with the same frame and
         reference.
 
     Raises
@@ -146,8 +148,9 @@ def equilibrium(
 
     Notes
     -----
-    With the bounds of thrusters, this is a least-distance problem. Non-negative least squares solve
-    it exactly (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    With the bounds of thrusters, the minimisation is a least-distance problem, which non-negative
+    least squares solve exactly (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974,
+    chapter 23).
 
     Examples
     --------

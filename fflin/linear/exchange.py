@@ -27,8 +27,8 @@ _ROUNDING = 1e-12  # of the largest entry, by which another route to a matrix ma
 class ToolModel(StateSpace, Design):
     r"""Linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
-    The state x holds q and v of the tool. If q is on a manifold (mujoco, pinocchio, spart), x holds
-    a displacement instead of q: the tangent vector from the point, in the order of v.
+    The state x consists of q and v of the tool. If q is on a manifold (mujoco, pinocchio, spart),
+    x contains a tangent vector from the operating point instead of q, in the order of v.
 
     Attributes
     ----------
@@ -39,11 +39,11 @@ class ToolModel(StateSpace, Design):
     T : ndarray (nx, 12 + 2n)
         Matrix from state deviations of the `LinearModel` to deviations of x.
     T_left : ndarray (12 + 2n, nx)
-        Inverse of T. If x contains a whole quaternion or mimic joints, it is a left inverse and not
-        a right inverse.
+        Inverse of T. If x contains a whole quaternion or mimic joints, `T_left` is a left inverse
+        only.
     T_u : ndarray (nu, nu)
-        Matrix from input deviations of the `LinearModel` to the tool's. A gain K of the
-        `LinearModel` becomes ``T_u K T_left`` for the tool.
+        Matrix from input deviations of the `LinearModel` to the tool's. The tool's gain is ``T_u
+        K T_left`` for a gain K of the `LinearModel`.
     q, v : ndarray
         Configuration and velocity of the point in the tool's coordinates.
     reference : str
@@ -80,20 +80,21 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
 
     .. math:: A' = (T A + \dot T)\,T^+ + \ldots, \qquad B' = T B\,T_u^{-1}
 
-    The omitted terms come from inputs in other axes and from the length of a quaternion: see (15.1)
-    to (15.6) of docs/derivation.md. docs/guide/tools.md compares the conventions of the tools.
+    The omitted terms are due to inputs in other axes and to the length of a quaternion, see
+    (15.1) to (15.6) of docs/derivation.md. docs/guide/tools.md compares the conventions of the
+    tools.
 
     Parameters
     ----------
     robot : Robot
     lin : LinearModel
-        Model of this robot, about any point. A sampled model gives a sampled model of the tool.
+        Model of this robot, about any point. The result of a sampled model is also sampled.
     tool : {"drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"}
         Name of the tool, or of the attitude coordinates.
     dt : float, optional
-        Only for "mujoco": its time step [s]. A and B are then the matrices that
-        ``mjd_transitionFD`` returns with the Euler integrator. For a robot with dampers, this
-        requires ``eulerdamp`` to be disabled.
+        Time step [s] of MuJoCo, only for "mujoco". A and B are then the matrices of
+        ``mjd_transitionFD`` with the Euler integrator. For a robot with dampers, ``eulerdamp``
+        must be disabled in MuJoCo.
 
     Returns
     -------
@@ -156,8 +157,8 @@ class ToolGain(Design):
     Attributes
     ----------
     K : ndarray (nu, nx)
-        Gain. If the tool's q is on a manifold (mujoco, pinocchio), ``x - x0`` is the tool's own
-        difference of q and `q`, followed by the difference of the velocities.
+        Gain. If the tool's q is on a manifold (mujoco, pinocchio), ``x - x0`` consists of the
+        tool's own difference of configurations, and the difference of velocities.
     model : ToolModel
         The model in the tool's coordinates: names, x0, u0, and the reference `q` and `v`.
 
@@ -214,14 +215,14 @@ def from_tool(
     u : array_like (nu,), optional
         Inputs of the robot in the tool's order and axes; zero by default.
     A, B : array_like, optional
-        Matrices of the tool at this point, see `ToolModel`; by default fflin computes them.
+        Matrices of the tool at this point, see `ToolModel`; by default fflin computes A and B.
     frame, reference, moving
         Options of the returned model, see `linearize`.
 
     Returns
     -------
     LinearModel
-        Model whose ``q``, ``v`` and ``u0`` hold the operating point in the order of fflin. `check`
+        Model whose ``q``, ``v`` and ``u0`` are the operating point in the order of fflin. `check`
         and ``certificate`` show how accurate A and B are.
 
     Raises

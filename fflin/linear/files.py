@@ -9,13 +9,18 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from fflin.base import record
 from fflin.base.record import Record, figure, figures, text, texts
 from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from fflin.base.validation import Array
 
 # Of what the rows and columns of each matrix are, and the entries of each vector.
 _MATRICES = {
@@ -124,7 +129,7 @@ def _weights(written: str) -> dict[str, Any]:
     return found
 
 
-def _numbers(key: str, raw: Any) -> Any:
+def _numbers(key: str, raw: ArrayLike) -> Array:
     array = np.array(raw, dtype=float)
     if not np.isfinite(array).all():
         raise ValueError(f"{key} has entries that are not finite")

@@ -63,28 +63,34 @@ def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signal
         said = f"has its {kind}s in another order"
     else:
         return
+    subject = made.partition(" was ")[0]
     raise InputError(
-        f"{made} and does not fit the given robot '{robot.name}', which {said}; make it "
-        "again for the given robot, or give this robot the same joints, inputs and outputs "
-        "(Robot.replace)"
+        f"{made}, but {_given(made, robot)} {said}; make {subject} again for the given robot, or "
+        "use Robot.replace to give the robot the same joints, inputs and outputs"
     )
+
+
+def _given(made: str, robot: Robot) -> str:
+    """Name the given robot; its name alone does not tell it from a robot of the same name."""
+    same = f"'{robot.name}'" in made
+    return "the given robot of the same name" if same else f"the given robot '{robot.name}'"
 
 
 def require_turns(made: str, size: int, robot: Robot) -> None:
     """Raise `InputError` if a configuration has another size than the robot's."""
     if size != robot.nq:
         raise InputError(
-            f"{made} and does not fit the given robot '{robot.name}', whose configuration has "
-            f"{robot.nq} entries, not {size}, because other joints are continuous; make it "
-            "again for the given robot"
+            f"{made}, but {_given(made, robot)} has other continuous joints, so that its "
+            f"configuration has {robot.nq} entries instead of {size}; make "
+            f"{made.partition(' was ')[0]} again for the given robot"
         )
 
 
 def line_up(gain: Any, lin: LinearModel) -> Array:
     """Return the K of a gain for another model, with states and inputs matched by name.
 
-    A robot keeps most of its states if it captures a payload or a joint jams. K gets a
-    zero column for each state that the gain lacks, and a zero row for each input that it lacks.
+    A robot keeps most of its states when the robot captures a payload or a joint jams. Columns of
+    K for states that the gain lacks are zero, and so are rows for inputs that the gain lacks.
     States and inputs that the model lacks are dropped.
 
     Parameters
@@ -101,8 +107,8 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
     Raises
     ------
     InputError
-        If gain and model have different frames or sampling times, or if each has states, or
-        inputs, that the other lacks; they then belong to different robots.
+        If gain and model have different frames or sampling times, or belong to different robots:
+        each has states, or inputs, that the other lacks.
 
     Examples
     --------
@@ -113,7 +119,7 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
     (8, 16)
     """
     if not hasattr(gain, "K") or not hasattr(gain, "state_names"):
-        raise InputError(f"gain is a {type(gain).__name__}, expected a Gain or GainBatch")
+        raise InputError(f"gain has type {type(gain).__name__}, expected a Gain or GainBatch")
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     for key in ("frame", "dt"):
         own, other = getattr(gain, key, lin.dt), getattr(lin, key)

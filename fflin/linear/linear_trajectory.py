@@ -32,17 +32,17 @@ class LinearTrajectory(Trajectory):
     r"""Error dynamics along a motion, ``d(dx)/dt = A(t) dx + B(t) du``, ``dy = C dx + D du``.
 
     The error dx is in the moving base's own axes, see `Linearizer` (``moving=True``). Torques and
-    forces on the base in du are in base axes. If ``dt`` is positive, the left side is the error at
-    the next knot instead. ``along[k]`` is the linear model at knot k.
+    forces on the base in du are in base axes. If ``dt`` is positive, the left side is the error
+    at the next knot. ``along[k]`` is the linear model at knot k.
 
     Attributes
     ----------
     A : ndarray (N, nx, nx)
-        State matrices at the knots. If ``dt`` is positive, N - 1 matrices, each from one knot to
-        the next.
+        State matrices at the knots. If ``dt`` is positive, there are N - 1 transition matrices
+        from one knot to the next.
     B : ndarray (N, nx, nu)
-        Input matrices at the knots. If ``dt`` is positive, N - 1 matrices, each from one knot to
-        the next.
+        Input matrices at the knots. If ``dt`` is positive, there are N - 1 transition matrices
+        from one knot to the next.
     C : ndarray (N, ny, nx)
         Output matrices at the knots.
     D : ndarray (N, ny, nu)
@@ -119,7 +119,7 @@ class LinearTrajectory(Trajectory):
         return lin.A, lin.B
 
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
-        """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), as `matrices` does at one."""
+        """Return A (k, nx, nx) and B (k, nx, nu) at the times (k,), see `matrices`."""
         placements = [interval_of(self.t, t) for t in times.tolist()]
         knot = np.array([k + (share == 1.0) for k, share in placements])
         inside = np.array([0.0 < share < 1.0 for _, share in placements])
@@ -154,7 +154,7 @@ class LinearTrajectory(Trajectory):
         Parameters
         ----------
         dt : float
-            Sampling time [s]; the duration must be a multiple of it.
+            Sampling time [s]. The duration must be a multiple of dt.
 
         Raises
         ------
@@ -194,8 +194,8 @@ def linearize_trajectory(
     t : Trajectory or array_like (N,)
         The motion as a `Trajectory`, or the times of its knots [s].
     q, v, u : array_like, optional
-        Configurations, velocities and inputs at the knots, as `Trajectory` takes them. Give them if
-        t contains times.
+        Configurations, velocities and inputs at the knots, see `Trajectory`; required if t
+        contains times.
     strict : bool
         Whether to refuse knots that violate the robot's dynamics with a residual above 1e-2.
     **options
@@ -208,7 +208,7 @@ def linearize_trajectory(
     Raises
     ------
     InputError
-        If the arrays are not valid for `Trajectory`. If `strict` is true and the residual of the
+        If the arrays are not valid for `Trajectory`, or `strict` is true and the residual of the
         motion exceeds 1e-2.
 
     Warns
@@ -273,7 +273,7 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
         duration = traj.t[-1] - traj.t[0]
         raise InputError(
             f"dt is {dt:g} s, but the duration of the trajectory, {duration:g} s, is not a "
-            "multiple of it; give a dt that divides the duration"
+            "multiple of dt; give a dt that divides the duration"
         )
     cuts = []
     for start, end in pairwise(times.tolist()):

@@ -70,7 +70,9 @@ class Prepared:
 
         tree, reason = batch_tree(self.robot), self.not_compilable
         if tree is None or reason:
-            raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
+            raise InputError(
+                f"engine='compiled' is not possible, because {reason}; leave engine out"
+            )
         return RowAccelerations(self.map, self.actuation, tree)
 
     @property
@@ -203,25 +205,25 @@ class Linearizer:
     At other points :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
     :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`, then transformed to the chart and the
     velocity frame. The dynamics do not depend on the position and linear velocity of the base
-    (Galilean invariance). The evaluation leaves out both, so no accuracy is lost if the base is far
-    from the origin. docs/derivation.md has the equations. Section 14 covers a robot in orbit, whose
-    rates are relative to the orbit's frame.
+    (Galilean invariance). The evaluation sets both to zero, so that a large distance from the
+    origin does not reduce the accuracy. The equations are in docs/derivation.md. Section 14 of
+    this document is about a robot in orbit, whose rates are relative to the orbital frame.
 
     Parameters
     ----------
     robot : Robot
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
-        Axes of the base velocities and wrenches, see `StateMap`. The default is "hybrid". A robot
-        in orbit needs "lvlh" (its default) or "hill".
+        Axes of the base velocities and wrenches, see `StateMap`. The default is "hybrid". For a
+        robot in orbit, the frames are "lvlh" (default) and "hill".
     reference : pin.SE3, optional
-        Placement that attitude and position are relative to. The default is the base placement at
-        each point, so that q_b and r_b are zero there. For a robot in orbit, it is the orbit's
-        frame.
+        Placement to which attitude and position are relative. The default is the base placement
+        at each point, so that q_b and r_b are zero at the point. For a robot in orbit, the
+        default is the orbital frame.
     moving : bool
-        Whether to return the error dynamics about a moving reference. This reference passes through
-        the point and obeys the dynamics of the robot. The error is q_b = vec(q*^-1 q), r_b = R*^T
-        (p - p*), the frame is "local", and f0 is zero. Use it for trajectories, and for relative
-        equilibria such as a steady spin.
+        Whether to return the error dynamics about a moving reference, which passes through the
+        point and obeys the dynamics of the robot. The error is q_b = vec(q*^-1 q), r_b = R*^T (p
+        - p*), the frame is "local", and f0 is zero. Trajectories, and relative equilibria such as
+          a steady spin, require a moving reference.
     engine : {"python", "compiled"}, optional
         Engine for the accelerations of points with velocity, springs or forces: Python by
         default, or the compiled kernel of sweeps. Both engines agree to machine precision.
@@ -364,7 +366,7 @@ class Linearizer:
     def along(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
         """Return A, B, C, D and y (N, ..) about rows of valid points, with u in base axes.
 
-        Only for models relative to the placement of the base itself.
+        The models must be relative to the placement of the base at each point.
         """
         ready, lower, count = self.prepared, self._lower, len(q)
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Certificate of a linear model: its residuals, which should be of the order of round-off.
+    """Certificate of a linear model: residuals, which should be of the order of round-off errors.
 
     Attributes
     ----------
     condition : float
-        Condition number of M scaled to a unit diagonal. Residuals of about this number times
-        machine precision are expected.
+        Condition number of M scaled to a unit diagonal. The expected residuals are about the
+        condition number times machine precision.
     inertia_residual : float
         Largest entry of M M^-1 - I, with M scaled as for `condition`.
     route_A, route_B : float
@@ -81,7 +81,7 @@ class LinearModel(StateSpace):
     r"""Linear model about a point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The output is ``y = y0 + C (x - x0) + D (u - u0)``. If ``dt > 0``, the left side is ``x - x0``
-    at the next sample instead, and f0 is the constant term of each step. Arrays are read-only.
+    at the next sample, and f0 is the constant term of each step. Arrays are read-only.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class LinearModel(StateSpace):
         True for a model computed in this session, or read from a file with a valid SHA-256 digest.
         False for a model read from a file without a digest, and for every result derived from it.
     weights : mapping
-        Default weights of `lqr`, as `Robot.replace` takes them.
+        Default weights of `lqr`, in the form of `Robot.replace`.
     mean_motion : float
         Mean motion of the robot's orbit [rad/s]; 0 without an orbit.
 
@@ -189,7 +189,7 @@ class LinearModel(StateSpace):
 
     @property
     def reference(self) -> pin.SE3:
-        """Placement oMref that attitude and position are relative to."""
+        """Placement oMref to which attitude and position are relative."""
         import pinocchio as pin
 
         return pin.XYZQUATToSE3(self.placement)
@@ -201,9 +201,10 @@ class LinearModel(StateSpace):
 
     @property
     def drift(self) -> Array | None:
-        """State derivative (nx,) of the reference if it moves (f0 is then zero); otherwise None.
+        """State derivative (nx,) of a moving reference, or None if the reference is fixed.
 
-        Its attitude rate excludes rotation about the direction of gravity, which has no effect.
+        The attitude rate excludes rotation about the direction of gravity, which has no effect.
+        If the reference moves, f0 is zero.
         """
         return self._drift
 
@@ -237,8 +238,7 @@ class LinearModel(StateSpace):
     def generator(self) -> LinearModel | None:
         """Continuous-time model from which this model was sampled, or the model itself.
 
-        None if it is not known, because the sampled model is from a file or its matrices were
-        changed.
+        The value is None if the sampled model is from a file or its matrices were changed.
         """
         if not self.dt:
             return self
@@ -254,7 +254,7 @@ class LinearModel(StateSpace):
     def ignorable(self) -> tuple[str, ...]:
         """Names of the states on which the dynamics do not depend, derived from the robot.
 
-        These are:
+        The ignorable states are:
 
         - the base position, except in orbit;
         - the angles of rotors (joints whose link is symmetric about the axis and carries no link);
@@ -274,11 +274,12 @@ class LinearModel(StateSpace):
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
         """Return whether the point is a fixed point or a relative equilibrium.
 
-        At a relative equilibrium, ignorable coordinates move at constant rates and all others are
-        at rest: a rotor spins, or the base moves at constant velocity. In both cases A and B are
-        constant in time. With ``moving=True`` the motion of the reference is tested instead of f0:
+        At a relative equilibrium, ignorable coordinates move at constant rates, and all other
+        coordinates are at rest. Examples are a spinning rotor and a base with constant velocity.
+        At fixed points and relative equilibria, A and B are constant in time. With
+        ``moving=True`` the motion of the reference is tested instead of f0:
 
-        - its velocities in base axes must be constant;
+        - the velocities of the reference in base axes must be constant;
         - no joint except rotors may move;
         - under gravity, the base may rotate only about the vertical.
 
@@ -302,8 +303,8 @@ class LinearModel(StateSpace):
         .. math::
             A_d = e^{A h}, \quad [B_d, f_d] = \int_0^h e^{A s}\,ds\,[B, f_0]
 
-        At rest A^2 = 0 and the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B h^2/2`,
-        (2.2) of docs/derivation.md. E is the identity.
+        At rest A^2 = 0, so that the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B
+        h^2/2`, (2.2) of docs/derivation.md. E is the identity.
 
         Parameters
         ----------
@@ -380,8 +381,8 @@ class LinearModel(StateSpace):
         Parameters
         ----------
         path : str or Path
-            Path that ends in .npz, .mat, .json or .csv. A .csv path gives one file for each
-            matrix, NAME.A.csv and so on.
+            Path that ends in .npz, .mat, .json or .csv. For .csv, each matrix is written to its
+            own file, NAME.A.csv and so on.
 
         Raises
         ------
@@ -402,7 +403,7 @@ class LinearModel(StateSpace):
         Raises
         ------
         FileError
-            If the file cannot be read, is damaged or does not hold a linear model.
+            If the file cannot be read, is damaged or does not contain a linear model.
         """
         from fflin.base.writing import as_path
         from fflin.linear.files import given, read_model

@@ -127,9 +127,9 @@ def outputs(
 
     - Attitudes are in the model's chart, with q0 >= 0.
     - Rotations of frames are relative to the point of linearisation.
-    - Angles of continuous joints are unwrapped to be nearest to that point.
+    - Angles of continuous joints are unwrapped to be nearest to the point of linearisation.
 
-    The input of a controller designed for the model is therefore ``y - lin.y0``.
+    The input of a controller designed for the linear model is ``y - lin.y0``.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def outputs(
     q, v : array_like (nq,), (nv,)
         Configuration and velocity in Pinocchio's order; v is zero by default.
     u : array_like (nu,), optional
-        Inputs; u0 by default. They affect no outputs except accelerometers.
+        Inputs; u0 by default. Only accelerometer outputs depend on u.
 
     Returns
     -------

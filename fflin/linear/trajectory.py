@@ -50,15 +50,15 @@ class Trajectory(Design):
     v : array_like (N, nv)
         Velocities in Pinocchio's order.
     u : array_like (N, nu) or (N - 1, nu)
-        Inputs at the knots. If there are N - 1 rows, each row acts over one interval between knots.
+        Inputs at the knots. With N - 1 rows, each row applies to one interval between knots.
     hold : {"linear", "previous"}, optional
         Inputs between the knots: "linear" interpolates, "previous" holds the value of the previous
         knot, like a digital controller. The default is "linear", or "previous" if u has N - 1
         rows.
     frame : {"local", "hybrid", "world"}
-        Axes in which the force and torque on the base are expressed, and constant between knots if
-        they are held. local: base axes. hybrid: force in
-        world axes, torque in base axes. world: both in world axes.
+        Axes of the force and torque on the base. Held forces and torques are constant in these
+        axes. local: base axes. hybrid: force in world axes, torque in base axes. world: force and
+        torque in world axes.
     verified : bool
         False for data from a file without a SHA-256 digest. Damage to such a file cannot be
         detected.
@@ -102,8 +102,7 @@ class Trajectory(Design):
         if (back := np.flatnonzero(np.diff(times) <= 0.0)).size:
             late, early = times[back[0] : back[0] + 2]
             raise InputError(
-                f"t[{back[0] + 1}] is {early:.9g} s, after {late:.9g} s; expected each time later "
-                "than the one before"
+                f"t[{back[0] + 1}] is {early:.9g} s, after {late:.9g} s; expected increasing times"
             )
         if self.hold is not None and str(self.hold) not in ("linear", "previous"):
             raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
@@ -210,8 +209,9 @@ class Trajectory(Design):
     def require(self, *, strict: bool = False) -> None:
         """Warn if the residual of the motion exceeds 1e-2, or raise `InputError` if `strict`.
 
-        The message names the interval with the largest error, the error, and the number of
-        intervals that exceed 1e-2. If the motion overflows, `InputError` is raised in either case.
+        The message gives the interval with the largest error, this error, and the number of
+        intervals with errors above 1e-2. If the motion overflows, `InputError` is raised in
+        either case.
         """
         fault = self._fault
         if fault and (strict or self.flow.residual.max() == np.inf):
@@ -242,7 +242,7 @@ class Trajectory(Design):
         if turns[k] > _FARTHEST_TURN:
             return (
                 f"the base rotates by {turns[k]:.2g} rad from t = {self.t[k]:g} to "
-                f"{self.t[k + 1]:g} s, which two knots cannot represent; give knots at most "
+                f"{self.t[k + 1]:g} s, which is too far for one interval; give knots at most "
                 f"{_FARTHEST_TURN:g} rad apart"
             )
         return ""
@@ -282,15 +282,15 @@ class Trajectory(Design):
         path : str or Path
         robot : Robot
         hold, frame : str, optional
-            Options of `Trajectory`; by default they are taken from the file. If the file holds x,
-            `frame` also gives the axes of its velocities.
+            Options of `Trajectory`; by default as in the file. If the file contains x, `frame` is
+            also the frame of the velocities in x.
 
         Raises
         ------
         FileError
-            If the file cannot be read, is damaged, or lacks these entries.
+            If the file cannot be read, is damaged, or lacks a required entry.
         InputError
-            If its entries are not a valid trajectory of this robot.
+            If the entries of the file are not a valid trajectory of this robot.
         """
         from fflin.linear.trajectory_files import read
 

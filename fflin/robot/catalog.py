@@ -70,7 +70,7 @@ def list_robots() -> tuple[str, ...]:
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
     """Find a robot by a bundled name, a path from the folder or a name of example-robot-data."""
     if not isinstance(robot, str | os.PathLike):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a robot name or a path")
+        raise InputError(f"robot has type {type(robot).__name__}, expected a robot name or a path")
     if isinstance(robot, str) and robot in _bundled():
         return _bundled()[robot]
     path, text = Path(folder, robot), str(robot)

@@ -54,7 +54,7 @@ def checked_inputs(
 ) -> tuple[Input, ...]:
     """Return the inputs as a robot holds them."""
     if isinstance(value, str) or not isinstance(value, Sequence):
-        raise InputError(f"inputs is a {type(value).__name__}, expected a sequence of inputs")
+        raise InputError(f"inputs has type {type(value).__name__}, expected a sequence of inputs")
     if not value:
         raise InputError("inputs is empty; give at least one input")
     for item in value:
@@ -73,7 +73,7 @@ def checked_inputs(
     told += [replace(item, min=None, max=None) for item in value if item not in named]
     for each in told:
         if told.count(each) > 1:
-            raise InputError(f"input {each} is given twice; remove one")
+            raise InputError(f"input {each} is given twice; remove one of the two")
     return tuple(value)
 
 
@@ -83,7 +83,10 @@ def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[st
         return [item]
     found = by_joint({str(item.joint): None}, joints, find)
     if item.joint in found and item.joint in passive:
-        raise InputError(f"joint '{item.joint}' is passive but has a joint torque; remove one")
+        raise InputError(
+            f"joint '{item.joint}' is passive, but a joint torque acts on it; remove the joint "
+            "from passive, or the torque from the inputs"
+        )
     return [replace(item, joint=name) for name in found if name not in passive]
 
 
@@ -127,7 +130,7 @@ def _outputs(value: Any, _: Scope) -> tuple[Output, ...]:
 
 def _rest(value: Any, scope: Scope) -> dict[str, float]:
     if not isinstance(value, Mapping):
-        raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
+        raise InputError(f"rest is {value!r}, expected {{joint: rest position}}")
     return by_joint(numbers("rest", value, "joint", "rest of joint"), scope.own, scope.find)
 
 
@@ -146,7 +149,7 @@ def _damping(value: Any, scope: Scope) -> dict[str, float]:
     if not isinstance(value, str):
         return _stiffness(value, scope, "damping")
     if value != "urdf":
-        raise InputError(f"damping is '{value}', expected 'urdf', a number or a mapping")
+        raise InputError(f"damping is '{value}', expected 'urdf', a number or {{joint: damping}}")
     return dict(scope.urdf_damping)
 
 
@@ -159,7 +162,8 @@ def range_of(name: str, value: Any) -> Range:
         least = -largest
     if least > largest:
         raise InputError(
-            f"limit of '{name}' is {value}, expected a magnitude of 0 or more, or (least, largest)"
+            f"limit of '{name}' is {value}, expected a largest magnitude of at least 0, or bounds "
+            "(least, largest)"
         )
     return least, largest
 
@@ -216,7 +220,9 @@ def _weights(value: Any, scope: Scope) -> dict[str, Any]:
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
     for key in weights["bryson"]:
         if key in weights["q"] or key in weights["r"]:
-            raise InputError(f"'{key}' has both a weight and a largest value; give only one")
+            raise InputError(
+                f"'{key}' has both a weight and a largest value; give only one of the two"
+            )
     return {part: value for part, value in weights.items() if value}
 
 
@@ -229,14 +235,17 @@ def checked_passive(
         raise InputError(f"passive is {value!r}, expected names of joints")
     for key in keys:
         if any(each.rpartition("=")[0] == key for each in locked):
-            raise InputError(f"joint '{key}' is both locked and passive; remove one")
+            raise InputError(
+                f"joint '{key}' is both locked and passive; remove the joint from one of the two "
+                "lists"
+            )
     found = by_joint(dict.fromkeys(keys), joints, find)
     return tuple(name for name in joints if name in found)
 
 
 def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
     if not isinstance(value, Mapping):
-        raise InputError(f"{what} is {value!r}, expected a mapping of {', '.join(known)}")
+        raise InputError(f"{what} is {value!r}, expected a table with the keys {', '.join(known)}")
     for name in value:
         if name not in known:
             raise unknown(f"part of {what}", name, known)
@@ -254,17 +263,34 @@ class Field(NamedTuple):
     merged: bool = False  # whether the entries of a call are added to the entries of a file
 
 
+def _number(expected: str) -> Kind:
+    return NUMBER._replace(expected=expected)
+
+
 # In the order in which a file applies them: the names of inputs are known after the inputs.
 FIELDS = {
     "passive": Field(kind=NAME, table=None),
     "inputs": Field(),
     "appendages": Field(),
     "outputs": Field(_outputs, kind=NAME, table=None),
-    "stiffness": Field(_stiffness, merged=True),
-    "damping": Field(_damping, word="", merged=True),
-    "rest": Field(_rest, merged=True),
-    "gravity": Field(lambda value, _: three_numbers("gravity", value)),
-    "orbit": Field(lambda value, _: checked_orbit(value), word="body"),
+    "stiffness": Field(
+        _stiffness, _number("a finite number [N m/rad|N/m], or a table [stiffness]"), merged=True
+    ),
+    "damping": Field(
+        _damping,
+        _number("a finite number [N m s/rad|N s/m], or a table [damping]"),
+        word="",
+        merged=True,
+    ),
+    "rest": Field(_rest, _number("a table [rest] of joint positions [rad|m]"), merged=True),
+    "gravity": Field(
+        lambda value, _: three_numbers("gravity", value), _number("three finite numbers [m/s^2]")
+    ),
+    "orbit": Field(
+        lambda value, _: checked_orbit(value),
+        _number("an altitude [m] as a finite number, or a table [orbit]"),
+        word="body",
+    ),
     "limits": Field(
         lambda value, scope: given_limits(scope.inputs, scope.joints, value), merged=True
     ),

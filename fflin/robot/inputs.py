@@ -128,7 +128,7 @@ class JointTorque(Input):
     Parameters
     ----------
     joint : str
-        Name of an independent joint. Its mimic joints are driven with it.
+        Name of an independent joint. The motor also drives the mimic joints of this joint.
     max, min : float, optional
         Limits [N m | N], which replace the effort limit of the URDF; keyword only.
 
@@ -165,12 +165,12 @@ class Thruster(WrenchInput):
         Limits [N], at least 0: a thruster never pulls. Keyword only, like all parameters that
         follow.
     on_off : bool
-        Whether the thruster can only fire with `max` or be off. `simulate` then turns the command
-        of each sample into one pulse of `max`, a whole number of steps long. The remaining
-        impulse is carried over to the next sample, so that the mean impulse is correct.
+        Whether the thruster can only fire with `max` or be off. `simulate` then replaces the
+        command of each sample by one pulse of `max`, whose length is a whole number of steps. The
+        remaining impulse is added to the next sample, so that the mean impulse is correct.
     least_impulse : float, optional
         Smallest impulse of a sample [N s]. If the commanded impulse is smaller, the thruster does
-        not fire, and this impulse is carried over to the next sample.
+        not fire, and the impulse is added to the next sample.
 
     Examples
     --------
@@ -217,9 +217,9 @@ class Thruster(WrenchInput):
 class ReactionWheel(WrenchInput):
     r"""Motor torque [N m] of a balanced reaction wheel, whose axis is fixed on a link.
 
-    The torque u acts on the wheel along the axis a, and -u on the link that carries the wheel. The
-    power is u times the speed of the wheel relative to this link. Mass and inertia of the carrier
-    in the URDF must include the wheel, as if it were welded.
+    The torque u acts on the wheel along the axis a, and the torque -u acts on the link that
+    carries the wheel. The motor's power is u times the speed of the wheel relative to this link.
+    Mass and inertia of the carrier in the URDF must include the wheel, as if it were welded.
 
     With an ``inertia`` J, the speed of the wheel is a state. The robot gets one more joint: a
     continuous joint with the wheel's name. In the state vector, it comes after all joints that the
@@ -228,8 +228,8 @@ class ReactionWheel(WrenchInput):
 
     If ``inertia`` is omitted, the wheel is modelled only by the torques on its carrier: the
     reaction -u a, and the gyroscopic torque :math:`-\omega \times h a` of the wheel's ``momentum``
-    h. This is the limit of a small and fast wheel: h is constant even if u is not zero, and J
-    remains part of the carrier's inertia.
+    h. This model is the limit of a small and fast wheel: h is constant even if u is nonzero, and
+    J is part of the carrier's inertia.
 
     Parameters
     ----------
@@ -238,7 +238,8 @@ class ReactionWheel(WrenchInput):
     frame : str, optional
         Frame of the model, on the base or on any link; the base's root frame by default.
     inertia : float, optional
-        J [kg m^2] about the axis. The carrier's inertia about it must be larger.
+        Moment of inertia J [kg m^2] about the axis. The carrier must have a larger inertia about
+        the same axis.
     name : str, optional
         Name of the input, and of the joint if there is one; wheel_1, wheel_2, ... by default.
     momentum : float

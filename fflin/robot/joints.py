@@ -244,7 +244,7 @@ class Coordinates:
                 raise InputError(
                     f"joint '{joint.name}' is at {joint.value(q):.9g}, but it mimics "
                     f"'{leader.name}', which puts it at {joint.value(placed):.9g}; "
-                    "fflin.configuration places mimic joints"
+                    "use fflin.configuration, which sets mimic joints"
                 )
         return placed
 
@@ -270,8 +270,7 @@ class Coordinates:
         if size > _DATA_LIMIT:
             raise ModelError(
                 f"'{self.name}' has {self.n} joints, for which Pinocchio's Data takes about "
-                f"{size / 2**30:.1f} GiB, more than the limit of 1 GiB; lock joints that do not "
-                "matter"
+                f"{size / 2**30:.1f} GiB, more than the limit of 1 GiB; lock unimportant joints"
             )
 
 

@@ -47,15 +47,15 @@ def load(
         No mesh is loaded.
     lock : mapping or iterable of str, optional
         Joints to weld: {joint: value [rad|m]} (None: at neutral), or their names. A name may be a
-        pattern, ``hinge_*``. The mimic joints of a locked joint are welded with it.
+        pattern, ``hinge_*``. The mimic joints of a locked joint are also welded.
     package_dirs : sequence of path
-        Folders to search for ``package://`` meshes when the robot is drawn; they are searched
-        before the folders that contain the URDF.
+        Folders to search for ``package://`` meshes when the robot is drawn. These folders are
+        searched before the folders that contain the URDF.
     **fields
         inputs, outputs, stiffness, damping, rest, gravity, orbit, limits, passive, weights, start:
         see `Robot.replace`. Fields given here take precedence over the robot file. Locks, limits,
-        springs and dampers given here are added to the robot file's, and replace entries of the
-        same name.
+        springs and dampers given here are added to the entries of the robot file, and replace
+        entries of the same name.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def load(
     Warns
     -----
     FflinWarning
-        About parts of the file that the model does not contain, and about likely errors in it.
+        If the model does not contain a part of the file, or the file contains likely errors.
 
     Examples
     --------
@@ -158,7 +158,7 @@ def _load(
 def from_model(
     model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: Any
 ) -> Robot:
-    """Make a robot from a Pinocchio model that was built by other means (MJCF, SDF, code).
+    """Make a robot from a Pinocchio model that was built from MJCF, SDF or code.
 
     Parameters
     ----------
@@ -193,9 +193,9 @@ def from_model(
     26
     """
     if not isinstance(model, pin.Model):
-        raise ModelError(f"the model is a {type(model).__name__}, expected a pin.Model")
+        raise ModelError(f"the model has type {type(model).__name__}, expected a pin.Model")
     if name is not None and not isinstance(name, str):
-        raise InputError(f"name is a {type(name).__name__}, expected a string")
+        raise InputError(f"name has type {type(name).__name__}, expected a string")
     copy = model.copy()
     copy.gravity.setZero()
     name = name or model.name or "model"

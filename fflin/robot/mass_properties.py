@@ -63,7 +63,7 @@ def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
         value = {"mass": value.mass, "com": value.lever, "inertia": value.inertia}
     if not isinstance(value, Mapping):
         raise InputError(
-            f"'{name}' is a {type(value).__name__}, expected {{'mass': m, 'com': (3,), "
+            f"'{name}' has type {type(value).__name__}, expected {{'mass': m, 'com': (3,), "
             "'inertia': (3, 3)} or a pin.Inertia"
         )
     for key in value:

@@ -98,13 +98,13 @@ def _of_joint(model: pin.Model, index: int) -> Iterator[str]:
     if not is_rotation(placement.rotation):
         yield "has a placement whose matrix R is not a rotation: R^T R must be I and det R 1"
     if not (np.isfinite(body.mass) and body.mass >= 0.0):
-        yield f"carries a mass of {body.mass:g} kg, expected 0 or more"
+        yield f"has a link with a mass of {body.mass:g} kg, expected 0 or more"
     if not (np.isfinite(body.lever).all() and np.isfinite(body.inertia).all()):
-        yield "carries a body whose inertia or centre of mass is not finite"
+        yield "has a link whose inertia or centre of mass is not finite"
     moments = np.linalg.eigvalsh(body.inertia).tolist()
     if is_impossible(body.mass, moments):
         shown = ", ".join(f"{moment:.3g}" for moment in moments)
-        yield f"carries a body of principal moments {shown} kg m^2, expected 0 or more"
+        yield f"has a link with principal moments of inertia of {shown} kg m^2, expected 0 or more"
     joint = model.joints[index]
     for value in model.armature[joint.idx_v : joint.idx_v + joint.nv].tolist():
         if not (np.isfinite(value) and value >= 0.0):
@@ -161,8 +161,8 @@ def massless_note(robot: Robot) -> str:
     """Return the message about coordinates that can move without moving mass."""
     idle = listed(idle_coordinates(robot))
     return (
-        f"M of '{robot.name}' cannot be inverted at any configuration: {idle} can move without "
-        "moving mass; give their links an inertia, or lock the joints"
+        f"the mass matrix of '{robot.name}' is singular at every configuration: {idle} can move "
+        "without moving mass; give the links of these joints an inertia, or lock the joints"
     )
 
 

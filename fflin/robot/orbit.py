@@ -40,10 +40,11 @@ class CircularOrbit:
     - ``lvlh``: x along the orbit, y opposite to the orbit normal, z towards the central body;
     - ``hill``: x away from the central body, y along the orbit, z along the orbit normal.
 
-    Pinocchio's world is this frame, and velocities are relative to it. The gravity gradient is
-    linear in the position x relative to the origin: the force per mass is :math:`n^2 (3 r r^T - E)
-    x`, with the unit vector r away from the central body and the identity E. The relative error of
-    this linearisation is of the order of ``|x|`` divided by the orbit's radius.
+    This rotating frame is Pinocchio's world, and velocities are relative to this frame. The
+    gravity gradient is linear in the position x relative to the origin: the force per mass is
+    :math:`n^2 (3 r r^T - E) x`, with the unit vector r away from the central body and the
+    identity E. The relative error of this linearisation is of the order of ``|x|`` divided by the
+    orbit's radius.
 
     Parameters
     ----------
@@ -53,15 +54,15 @@ class CircularOrbit:
     mean_motion : float, optional
         Mean motion n [rad/s], instead of the altitude.
     body : str
-        "earth", "moon", "mars", "venus", "mercury", "jupiter" or "saturn"; any other name needs
-        `mu` and `body_radius`.
+        "earth", "moon", "mars", "venus", "mercury", "jupiter" or "saturn"; any other name
+        requires `mu` and `body_radius`.
     mu, body_radius : float, optional
         Gravitational parameter [m^3/s^2] and radius [m] of the central body.
 
     Attributes
     ----------
     altitude, mean_motion, body, mu, body_radius
-        The parameters; omitted ones are computed from the others.
+        The parameters; omitted parameters are computed from the others.
     radius : float
         Radius of the orbit [m].
     period : float
@@ -70,8 +71,8 @@ class CircularOrbit:
     Raises
     ------
     InputError
-        If both or neither of altitude and mean motion are given, a value is not positive, or the
-        orbit is below the surface.
+        If altitude and mean motion are both given or both omitted, a value is not positive, or
+        the orbit is below the surface.
     UnknownNameError
         If the central body is unknown.
 
@@ -97,7 +98,9 @@ class CircularOrbit:
         if not isinstance(self.body, str):
             raise InputError(f"body is {self.body!r}, expected a name such as 'earth'")
         if (self.mu is None) != (self.body_radius is None):
-            raise InputError("only one of mu and body_radius is given; give both or neither")
+            raise InputError(
+                "only one of mu and body_radius is given; give both values, or leave both out"
+            )
         if self.mu is None and self.body not in BODIES:
             raise unknown("central body", self.body, BODIES)
         given = [value for value in (self.altitude, self.mean_motion) if value is not None]
@@ -105,7 +108,7 @@ class CircularOrbit:
             said = "both are" if given else "neither is"
             raise InputError(
                 f"an orbit needs an altitude [m] or a mean motion [rad/s], but {said} given; give "
-                "exactly one"
+                "exactly one of the two"
             )
         size = self.mu, self.body_radius
         mu, ground = (

@@ -127,7 +127,7 @@ class FramePose(FrameOutput):
 
     - Position (3,) [m] of the frame's origin relative to the reference, in reference axes.
     - Rotation vector (3,) [rad], log(R*^T R), from the frame's attitude R* at the point of
-      linearisation, in the frame's own axes. It is zero at that point.
+      linearisation, in the frame's own axes. The vector is zero at this point.
 
     Parameters
     ----------
@@ -151,8 +151,8 @@ class FrameVelocity(FrameOutput):
     - Angular velocity (3,) [rad/s], in the frame's own axes.
     - Velocity (3,) [m/s] of the frame's origin, in reference axes.
 
-    At the point of linearisation, both are the time derivatives of `FramePose`, whichever velocity
-    frame the state uses.
+    At the point of linearisation, both velocities are the time derivatives of `FramePose`, for
+    any velocity frame of the state.
 
     Parameters
     ----------
@@ -177,14 +177,14 @@ class RelativePose(FrameOutput):
     - Position (3,) [m] of the origin of `frame` relative to the origin of `to`, in the axes of
       `to`.
     - Rotation vector (3,) [rad], log(R*^T R), from the relative attitude R* at the point of
-      linearisation, in the axes of `frame`. It is zero at that point.
+      linearisation, in the axes of `frame`. The vector is zero at this point.
 
     Parameters
     ----------
     frame : str
         Name of the measured frame.
     to : str
-        Name of the frame from which it is measured.
+        Name of the frame relative to which `frame` is measured.
 
     Examples
     --------
@@ -251,8 +251,8 @@ class Gyroscope(FrameOutput):
 class Accelerometer(FrameOutput):
     """Output of an accelerometer: specific force (3,) [m/s^2] of a frame, in its own axes.
 
-    The specific force is the acceleration of the frame's origin minus gravity. It is zero in free
-    fall without rotation and thrust. At rest under gravity, it is +g upwards.
+    The specific force is the acceleration of the frame's origin minus gravity. The specific force
+    is zero in free fall without rotation and thrust. At rest under gravity, it is +g upwards.
 
     Parameters
     ----------
@@ -289,12 +289,14 @@ def parse_output(text: str) -> tuple[Output, ...]:
         return (kind((rest,)),)
     if not issubclass(kind, FrameOutput):
         if colon:
-            raise InputError(f"output '{text}' names a frame, but {word} takes none; write {word}")
+            raise InputError(
+                f"output '{text}' names a frame, but the output {word} has no frame; write {word}"
+            )
         return (kind(),)
     wanted = [item.name for item in fields(kind)]
     names = rest.split(":", len(wanted) - 1)
     if len(names) != len(wanted) or not all(names):
         form = ":".join((word, "NAME", *(name.upper() for name in wanted[1:])))
-        missing = "no frame" if len(wanted) == 1 else "fewer than two frames"
+        missing = "no frame" if len(wanted) == 1 else "only one of its two frames"
         raise InputError(f"output '{text}' names {missing}; write {form}")
     return tuple(kind(*names) for kind in kinds[word])

@@ -51,15 +51,15 @@ class Robot(Coordinates):
     Attributes
     ----------
     model : pin.Model
-        Pinocchio model with a free-flyer root joint and zero gravity. In it, mimic joints and
-        reaction wheels with an inertia are ordinary joints. Do not change the model: fflin refuses
-        a robot whose model was changed. Make a new robot with `from_model` instead.
+        Pinocchio model with a free-flyer root joint and zero gravity. Mimic joints and reaction
+        wheels with an inertia are ordinary joints of `model`. The model must not be changed; use
+        `from_model` to make a robot from another model.
     name : str
         Name or file stem by which the robot was loaded.
     urdf : Path or None
         File from which the robot was read.
     urdf_sha256 : str
-        Hash of this file, and of the masses if they were changed; empty if there is no file.
+        Hash of the URDF, and of the masses if they were changed; empty if there is no URDF.
     joints : tuple of Joint
         The n independent joints in state order, which is Pinocchio's order.
     followers : tuple of Follower
@@ -70,7 +70,7 @@ class Robot(Coordinates):
         "joint=value" [rad|m] of each welded joint.
     urdf_damping : mapping
         {joint: viscous damping [N m s/rad | N s/m]} from the file, including the damping of the
-        joint's mimic joints. It is part of the model only if `damping` is "urdf".
+        joint's mimic joints. The damping is part of the model only if `damping` is "urdf".
     inputs : tuple of Input
         Inputs of the robot; by default torque and force on the base and the torque of every joint.
     outputs : tuple of Output
@@ -88,15 +88,16 @@ class Robot(Coordinates):
     passive : tuple of str
         Joints without a motor.
     weights : mapping
-        Default weights of `lqr`, which replace the weights of its rule: see `replace`.
+        Default weights of `lqr`, which replace the weights of the rule "urdf" or "identity", see
+        `replace`.
     point : mapping
         Operating point of the commands, see `replace`.
     target : mapping
-        State to which the commands `simulate` and `montecarlo` bring the robot: see `replace`.
+        Target state of the commands `simulate` and `montecarlo`, see `replace`.
     start : mapping
-        Default initial state of `simulate` and `visualize`: see `replace`.
+        Default initial state of `simulate` and `visualize`, see `replace`.
     limits : mapping
-        {name of an input or state: (least, largest)}, which replaces the limits of the URDF and
+        Limits {name of an input or state: (least, largest)}, which replace limits of the URDF and
         of the inputs.
     links : mapping
         {link: LinkMass}: mass properties of all links with mass, as given in the URDF.
@@ -168,13 +169,13 @@ class Robot(Coordinates):
             robot; previous wheels that are not among the new inputs are removed. The joint of a
             `JointTorque` may be a pattern, ``*``, for all matching joints that have a motor.
         appendages : sequence of FlexibleAppendage and Slosh
-            Flexible appendages and slosh of the robot, whose modes become passive joints. They
-            replace all previous ones.
+            Flexible appendages and slosh of the robot, whose modes become passive joints.
+            Previous appendages are removed.
         outputs : sequence of Output
             Measured outputs of the robot, in the order of y.
         stiffness : mapping or float
-            {joint: K [N m/rad | N/m]}, or one value for all joints except wheels. A name may be
-            a pattern, ``hinge_*``, here and below.
+            {joint: K [N m/rad | N/m]}, or one value for all joints except wheels. In all
+            mappings, a name may be a pattern, ``hinge_*``.
         damping : mapping, float or "urdf"
             {joint: D [N m s/rad | N s/m]}, one value for all joints except wheels, or "urdf" for
             the damping of the URDF.
@@ -193,17 +194,17 @@ class Robot(Coordinates):
         point : mapping
             Operating point of the commands `linearize`, `check`, `lqr` and others: ``joints``
             {joint: position [rad|m]}, ``rpy`` (3,) [deg] about fixed axes, ``position`` (3,) [m]
-            of the base, ``velocity`` {joint or state: rate}, as `fflin.velocity` takes it.
-            Functions take their operating point from their arguments alone.
+            of the base, ``velocity`` {joint or state: rate}, as in `fflin.velocity`. Functions
+            ignore `point`; their arguments define the operating point.
         target : mapping
-            State to which the commands `simulate` and `montecarlo` bring the robot, given like
-            `point`, from which omitted parts are taken.
+            Target state of the commands `simulate` and `montecarlo`, with the keys of `point`.
+            Omitted parts are as in `point`.
         start : mapping
-            Default initial state of `simulate`, given like `point`, from which omitted parts are
-            taken.
+            Default initial state of `simulate`, with the keys of `point`. Omitted parts are as in
+            `point`.
         limits : mapping
-            {name, group or pattern of inputs or states: largest magnitude, or (least, largest)},
-            which replaces the limits of the URDF and of the inputs.
+            {name, group or pattern of inputs or states: largest magnitude, or (least, largest)}.
+            These limits replace the limits of the URDF and of the inputs.
 
         Returns
         -------
@@ -215,7 +216,7 @@ class Robot(Coordinates):
             If one of these holds:
 
             - a value is negative or not a number;
-            - a wheel has more inertia than its carrier;
+            - a wheel has a larger inertia than the link that carries it;
             - both gravity and an orbit are given.
         UnknownNameError
             If a field, a joint, a frame of an input or output, or a name in `limits` does not
@@ -259,12 +260,12 @@ class Robot(Coordinates):
             {body: {"mass": m [kg], "com": (3,) [m], "inertia": (3, 3) [kg m^2] about the centre of
             mass} or pin.Inertia}, in the axes of the body's joint.
 
-            A body is named by its joint, by ``base``, by a pattern, or by its link if no other link
-            is fixed to it. Links that are fixed to each other form one body. Give the properties of
-            the whole body, including its wheels.
+            The name of a body is its joint, ``base``, a pattern, or its link if the body has only
+            one link. Links that are fixed to each other form one body. Give the properties of the
+            whole body, including its wheels.
 
-            Omitted properties are unchanged, except that a mass given without an inertia scales the
-            inertia in proportion, like a change of density.
+            Omitted properties are unchanged. A mass without an inertia scales the inertia in
+            proportion, like a change of density.
 
         Returns
         -------
@@ -288,11 +289,11 @@ class Robot(Coordinates):
 
         A number d is drawn uniformly from [-1, 1], independently for each body and axis:
 
-        - The mass is multiplied by 1 + d `mass`, with the argument `mass`.
-        - The second moments per mass along the axes of the body's frame are multiplied by
-          1 + `inertia` d.
-        - The centre of mass is shifted along each axis by `com` d times the root mean square
-          distance of the mass from the centre along that axis.
+        - The mass is multiplied by ``1 + mass * d``.
+        - The second moments per mass along the axes of the body's frame are multiplied by ``1 +
+          inertia * d``.
+        - The centre of mass is shifted along each axis by ``com * d`` times the root-mean-square
+          distance of the mass from the centre of mass along this axis.
 
         Parameters
         ----------
@@ -304,13 +305,13 @@ class Robot(Coordinates):
         Returns
         -------
         Robot
-            As from `with_mass_properties`.
+            Robot as returned by `with_mass_properties`.
         """
         spreads = {"mass": mass, "com": com, "inertia": inertia}
         return self.with_bodies(random_bodies(self._bare.model, seed, **spreads))
 
     def with_bodies(self, bodies: Mapping[int, pin.Inertia]) -> Robot:
-        """Return the robot with other {joint: body}, wheels included, and a hash of its own."""
+        """Return the robot with other bodies {joint: body}, including wheels."""
         self.require_unchanged()
         bare = self._bare
         model = bare.model.copy()
@@ -351,7 +352,7 @@ class Robot(Coordinates):
 
     @property
     def link_of(self) -> dict[str, str]:
-        """{body: link} of the bodies of one link, which both names stand for."""
+        """{body: link} of the bodies with one link; both names mean the same body."""
         return self._links_and_bodies[1]
 
     @cached_property
@@ -372,7 +373,7 @@ class Robot(Coordinates):
 
     @cached_property
     def stored_momentum(self) -> tuple[tuple[int, Array], ...]:
-        """Momentum of wheels without inertia: (joint index, vector (3,) [N m s] in its axes)."""
+        """Momentum of wheels without inertia: (joint index, vector (3,) [N m s] in joint axes)."""
         return stored_momentum(self.model, self.inputs)
 
     @cached_property
@@ -433,5 +434,7 @@ class Robot(Coordinates):
         joints = checked_passive(passive, bare.joint, bare.joint_names, self.locked)
         inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
         if not inputs:
-            raise InputError("passive removes all inputs; a model needs at least one")
+            raise InputError(
+                "all inputs are torques of passive joints; a model needs at least one input"
+            )
         return replace(self, passive=joints, inputs=inputs)

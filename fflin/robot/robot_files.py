@@ -51,8 +51,8 @@ class RobotToml:
         check_keys(document)
         if "urdf" not in document.record:
             raise InputError(
-                f'{path}: the file holds inputs only; add urdf = "my.urdf" above them, or pass the '
-                "file to a robot with --inputs or fflin.load_inputs"
+                f'{path}: the file contains only inputs; add urdf = "my.urdf" above the inputs, or '
+                "pass the file with --inputs or fflin.load_inputs"
             )
         tables = {key for keys in _TABLES.values() for key in keys}
         given = {key: self._checked(key) for key in document.record if key not in tables}
@@ -101,7 +101,10 @@ class RobotToml:
         for name in names if isinstance(names, list | dict) else ():
             if name in self.lock:
                 line = self._document.line("lock")
-                raise InputError(f"joint '{name}' is also locked in line {line}; remove one")
+                raise InputError(
+                    f"joint '{name}' is also locked in line {line}; remove the joint in one of the "
+                    "two places"
+                )
 
     def _checked(self, name: str) -> Any:
         """Return the value of a key, with flat tables: names in them may have dots."""
@@ -229,7 +232,7 @@ def check_keys(document: TomlFile) -> None:
     for key in document.record:
         if key not in known:
             if not whole and key in KEYS:
-                missing = 'has no key `urdf`; a robot file needs it: add urdf = "my.urdf"'
+                missing = 'the key `urdf` of a robot file is missing; add urdf = "my.urdf"'
                 raise InputError(f"{document.path}: {missing}")
             problem = unknown("key of a robot file" if whole else "table", key, known)
             raise document.error(UnknownNameError(f"{problem}{hint}"), key)
@@ -239,7 +242,7 @@ def read_inputs(document: TomlFile) -> tuple[Input, ...]:
     """Return the inputs of a file, as `load_inputs` does."""
     tables = _tables(document, "input")
     if not tables:
-        message = "the file holds no inputs; write [[input]] and its type below"
+        message = "the file contains no inputs; add a table [[input]] with its type"
         raise InputError(f"{document.path}: {message}")
     inputs: list[Input] = []
     seen: dict[Input | str | None, int] = {}
@@ -249,7 +252,10 @@ def read_inputs(document: TomlFile) -> tuple[Input, ...]:
         if what is not None and what in seen:
             shown = f"the name '{what}'" if isinstance(what, str) else what
             first = document.line("input", seen[what])
-            message = f"input {index + 1}: {shown} is already given in line {first}; remove one"
+            message = (
+                f"input {index + 1}: {shown} is already given in line {first}; remove one of the "
+                "two"
+            )
             raise document.error(message, "input", index, "name")
         seen[what] = index
         inputs.append(item)
@@ -310,7 +316,7 @@ def _built(
             raise document.error(unknown(what, name, dict.fromkeys(known)), *place, name)
     for name, needed in required.items():
         if needed and name not in values:
-            raise document.error(f"{of}needs the key '{name}'; add it", *place)
+            raise document.error(f"{of}the key '{name}' is missing; add this key", *place)
     try:
         return build(**values)
     except FflinError as error:
@@ -322,8 +328,8 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
     kind, of, place = table.get("type"), f"input {index + 1}: ", ("input", index)
     if kind is None:
         near = [key for key in table if key.lower() == "type"]
-        hint = f", but has '{near[0]}'" if near else ""
-        message = f"{of}has no key 'type'{hint}; set it to one of {', '.join(_TYPES)}"
+        hint = f", but there is a key '{near[0]}'" if near else ""
+        message = f"{of}the key 'type' is missing{hint}; set 'type' to one of {', '.join(_TYPES)}"
         raise document.error(message, *place)
     if not isinstance(kind, str) or kind not in _TYPES:
         shown = kind if isinstance(kind, str) else reprlib.repr(kind)

@@ -18,7 +18,7 @@ from fflin.robot.joints import ROOT
 from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
-_LIMITS = "limits in rad, N m and rad/s; for prismatic joints in m, N and m/s"
+_LIMITS = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
 _STATE = {"rpy": "[deg]", "position": "[m]", "joints": "[rad | m]", "velocity": "[rad/s | m/s]"}
 
 _LOOKS = {
@@ -39,7 +39,7 @@ def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
         else:
             rows.append([name, str(robot.n), f"{robot.mass:.6g}", origin])
     notes = [textwrap.fill(line, width(), subsequent_indent="  ") for line in refused]
-    head = f"{len(rows) - 1} robots load by name, {len(refused)} cannot be loaded"
+    head = f"{len(rows) - 1} robots can be loaded by name, {len(refused)} cannot be loaded"
     return "\n\n".join((head, grid(rows, "lrrl"), *notes))
 
 

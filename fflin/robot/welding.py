@@ -42,7 +42,7 @@ def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
     ]
     if not inputs:
         raise InputError(
-            f"without {', '.join(values)} the robot has no input; a model needs at least one"
+            f"without {', '.join(values)} the robot has no input; a model needs at least one input"
         )
     outputs = [
         replace(each, joints=tuple(x for x in each.joints if x not in gone))
@@ -120,7 +120,7 @@ def _asked(lock: Any) -> dict[str, float | None]:
         names = [None]
     if not all(isinstance(name, str) for name in names):
         raise InputError(
-            f"lock is a {type(lock).__name__}, expected {{joint: value}} or names of joints"
+            f"lock has type {type(lock).__name__}, expected {{joint: value}} or names of joints"
         )
     return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(names)
 

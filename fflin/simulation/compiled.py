@@ -6,24 +6,20 @@ import logging
 import time
 from typing import Any
 
-import numpy as np
-
 from fflin.base.errors import InputError
-from fflin.base.process import Progress
 from fflin.control.linear_controller import LinearController, OutputFeedback, measured_at
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.kernel.compiled import checked_engine, is_kept, numba_is_there
-from fflin.kernel.tree import LANES, batch_tree
+from fflin.kernel.tree import batch_tree
 from fflin.robot.joints import ROOT
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
-from fflin.simulation.run import Recording, ending_of, go, stop_conditions
+from fflin.simulation.run import Recording, go
 
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
-_SLICE, _FIRST_SLICE = 0.05, 16  # [s] and steps between looks at the clock and at Ctrl-C
 # Steps beyond which a single run goes by the compiled loop, if its machine code is there.
 LONG = 20_000
 # A run in Python of more than so many seconds is followed by a line on the compiled loop, which
@@ -44,7 +40,9 @@ def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> s
     reason = _reason(plan, plant)
     if engine == "compiled":
         if reason:
-            raise InputError(f"engine='compiled' cannot run this: {reason}; leave engine out")
+            raise InputError(
+                f"engine='compiled' is not possible, because {reason}; leave engine out"
+            )
         return "compiled"
     wanted = many or (plan.times.steps > LONG and is_kept("loop", "advance"))
     return "compiled" if wanted and not reason else "python"
@@ -91,7 +89,9 @@ def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
 def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> Recording:
     """Run a plan to its end by an engine; `plant` and `conserved` are of the robot that moves."""
     if engine == "compiled":
-        return _fly(plan, plant, conserved)
+        from fflin.simulation.lanes import recorded
+
+        return recorded(plan, plant)
     began = time.perf_counter()
     run = go(plan, plant, conserved)
     spent = time.perf_counter() - began
@@ -105,52 +105,3 @@ def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> 
             once,
         )
     return run
-
-
-def _fly(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
-    """Run a plan by the compiled loop, slice by slice, as the first of eight equal runs."""
-    from fflin.simulation.packing import SLOTS, CompiledLoop, kept_at, noise_of, noises, packed
-
-    tree, state, times, every = batch_tree(plant.robot), plant.state, plan.times, plan.times.every
-    assert tree is not None
-    loop = CompiledLoop(packed(plan, plant, conserved, tree))
-    law, point, stages = loop.parts.law, loop.parts.point, loop.parts.stages
-    noise, clock = noise_of(plan), np.zeros(1, dtype=np.intp)
-    rows, space = np.empty((times.rows, loop.width)), loop.rows(times.rows)
-    room = len(space) // loop.width * every  # in steps
-    ending, bar = ending_of(plan, stop_conditions(plan)), Progress(plan.progress)
-    stopped, length = "", _FIRST_SLICE
-    try:
-        while not stopped and clock[0] < times.steps:
-            began, step = time.perf_counter(), int(clock[0])
-            first = -(-step // every)
-            last = min(times.steps, step + length, first * every + room)
-            if noise:
-                last = min(last, (step // times.sample + SLOTS) * times.sample)
-                at, values = noises(noise, times, len(law.y), step, last)
-                law.added.reshape(SLOTS, -1, LANES)[at % SLOTS] = values[..., None]
-            loop.advance(clock, last, every, space)
-            done = -(-int(clock[0]) // every)
-            taken = space[: (done - first) * loop.width, 0]
-            rows[first:done] = taken.reshape(-1, loop.width)
-            stopped = ending(clock[0] * times.dt, point.q[:, 0], state.spread(point.nu[:, 0]))
-            bar.update(int(clock[0]), times.steps)
-            spent = max(time.perf_counter() - began, 1e-6)
-            length = max(_FIRST_SLICE, int(length * min(8.0, _SLICE / spent)))
-    except KeyboardInterrupt:
-        if not clock[0]:
-            raise
-        stopped = f"interrupted at t = {clock[0] * times.dt:g} s"
-    finally:
-        bar.close()
-    if not np.isfinite(stages.u).all():
-        return go(plan, plant, conserved)  # which says whose command was no number
-    count, end = -(-int(clock[0]) // every), clock[0] * times.dt
-    t = np.append(every * np.arange(count) * times.dt, end)
-    momentum, center = kept_at(loop.parts, end)
-    ended = point.q[:, 0], point.nu[:, 0], stages.u[:, 0], momentum, center
-    rows[count] = np.concatenate(ended)
-    count += not stopped.startswith(("diverged", "interrupted"))
-    q, nu, u, momentum, center = (rows[:count, part] for part in loop.columns)
-    v, steps = state.spread(nu), int(clock[0])
-    return Recording(t[:count], q, v, u, momentum, center, steps, stopped, "compiled")

@@ -45,65 +45,65 @@ class Motion(Design):
         State in the chart of `reference` and `frame`. The angles of continuous joints grow beyond
         a full turn.
     u : ndarray (N, nu)
-        Inputs that act from time t on, in the axes of `frame`. The last row repeats the row before
-        it.
+        Inputs that act from time t on, in the axes of `frame`. The last two rows are equal.
     target : ndarray (nx,) or (N, nx)
-        Target state; if the policy follows a trajectory, the state of the trajectory at each time.
-        Empty if no target is known.
+        Target state, or the state of the followed trajectory at each time. The array is empty if
+        no target is known.
     prediction : ndarray (N, nx)
         State that the linear model predicts under the same control law. The array has no rows if
         there is no prediction.
     energy : ndarray (N,)
-        Kinetic energy, plus the potential energy of gravity and springs [J]. In orbit, it is the
-        Jacobi integral: kinetic energy relative to the frame, plus the potentials of the gravity
-        gradient, the frame's rotation and the springs.
+        Kinetic energy, plus the potential energy of gravity and springs [J]. In orbit, `energy`
+        is the Jacobi integral: kinetic energy relative to the orbital frame, plus the potentials
+        of the gravity gradient, the frame's rotation and the springs.
     momentum : ndarray (N, 6)
         Angular momentum about the centre of mass [N m s], then linear momentum [N s], in world
-        axes. In orbit, it is the momentum of the motion relative to the orbital frame.
+        axes. In orbit, `momentum` is the momentum of the motion relative to the orbital frame.
     momentum_drift : ndarray (N,)
         Difference between the momentum and its expected value: the initial momentum plus the
-        impulse since then. It is divided by the largest momentum that the kinetic energy allows,
-        (11.5) of docs/derivation.md:
+        impulse since then. The difference is divided by the largest momentum that the kinetic
+        energy permits, see (11.5) of docs/derivation.md:
 
-        - Linear part: the mass times the rms speed of the mass elements in the fastest row.
-        - Angular part: that speed times the mass times the radius of gyration about the initial
-          base position, plus the momentum stored in wheels.
+        - Linear part: the mass times the root-mean-square speed of the mass elements in the
+          fastest row.
+        - Angular part: the linear part times the radius of gyration about the initial base
+          position, plus the momentum stored in wheels.
 
-        Momentum is not conserved in orbit. There the drift is the difference between `energy` and
-        its expected value, the initial energy plus the work since then, relative to the largest
-        terms of the energy.
+        Momentum is not conserved in orbit. In orbit, the drift is the difference between `energy`
+        and its expected value, relative to the largest terms of the energy. The expected value is
+        the initial energy plus the work since then.
     com_drift : ndarray (N,)
         Distance [m] of the centre of mass from the position predicted by its initial velocity and
-        the impulse since. Empty in orbit, or if the file lacks it.
+        the impulse since then. The array is empty in orbit, or if the file lacks these data.
     state_names, input_names, state_units, input_units : tuple of str
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
     robot, urdf_sha256 : str
     stopped : str
-        Reason why the run ended early; empty if it reached its end.
+        Reason why the run ended early; empty if the run was completed.
     wheels : tuple of str
         Joints that are reaction wheels. Their angles are not included in the errors.
     wheel_inertias : ndarray (k,)
-        Inertias of the wheels about their axes [kg m^2]; empty if the file lacks them.
+        Inertias of the wheels about their axes [kg m^2]; empty if the file lacks the inertias.
     modes : tuple of str
-        Joints that are modes of flexible appendages or slosh. The report lists them apart from the
-        joints.
+        Joints that are modes of flexible appendages or slosh. The report lists modes apart from
+        the joints.
     mode_rotations : ndarray (k,)
-        Rotation [rad] that a unit of each mode's amplitude stands for; 0 if it stands for none. A
-        mode of a flexible appendage moves like a ball, which turns by w per unit of the amplitude,
-        and is displaced by v at the distance c from the appendage's frame: the rotation is
-        :math:`|w| + |v| / |c|`. The second term is left out if c is below 5 % of the radius of
-        gyration of the carrying body.
+        Rotation [rad] of the structure per unit of each mode's amplitude; 0 if a mode causes no
+        rotation. A mode of a flexible appendage rotates the appendage's mass by w and displaces
+        it by v, at the distance c from the appendage's frame. The rotation is :math:`|w| + |v| /
+        |c|`. The second term is omitted if c is below 5 % of the radius of gyration of the
+        carrying body.
     steered : tuple of str
-        States that the policy feeds back; empty if they are not known.
+        States that the policy feeds back; empty if these states are not known.
     notes : tuple of str
-        Remarks on the run, as the report shows them.
+        Remarks on the run, which the report shows.
     limit_names : tuple of str
         States and inputs that have limits.
     engine : str
-        Engine that ran the loop, "compiled" or "python"; empty if the file lacks it.
+        Engine that ran the loop, "compiled" or "python"; empty if the engine is not known.
     limits : ndarray (k, 2)
-        Lower and upper limits of `limit_names`; infinite if there is no limit on that side. They
-        are listed whether or not the simulation enforces them.
+        Lower and upper limits of `limit_names`; infinite if there is no limit on that side. All
+        limits are listed, also limits that the simulation does not enforce.
     phases, starts : tuple of str, ndarray (k,)
         Names and start times [s] of the phases of a motion that `then` joined.
 
@@ -216,7 +216,7 @@ class Motion(Design):
 
     @property
     def tracked(self) -> bool:
-        """Whether the target moves: `target` then has one state per row."""
+        """Whether the target moves, so that `target` has one state per row."""
         return self.target.ndim == 2 and self.target.size > 0
 
     @property
@@ -237,13 +237,13 @@ class Motion(Design):
         -------
         Motion
             Joined motion on one time axis, in the states and the chart of this motion. A jammed
-            joint stands still. In each phase, energy and momentum are computed for the robot of
+            joint is at rest. In each phase, energy and momentum are computed for the robot of
             that phase.
 
         Raises
         ------
         InputError
-            If a phase does not begin where the phase before it ended, has another frame or more
+            If a phase does not begin at the end of the phase before it, has another frame or more
             inputs, or was read from a file.
         """
         from fflin.simulation.phases import carried_on
@@ -253,9 +253,9 @@ class Motion(Design):
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion as a trajectory whose inputs are held or interpolated linearly.
 
-        Inputs are held or interpolated between rows, whichever fits the dynamics better. If inputs
-        change continuously, the input at the last row is extrapolated, because it is not recorded.
-        A motion that was read from a file needs the `robot`.
+        The interpolation of inputs between rows (held or linear) is the one that fits the
+        dynamics better. If inputs change continuously, the input at the last row is extrapolated,
+        because it is not recorded. A motion that was read from a file needs the `robot`.
         """
         from fflin.linear.trajectory import along
 
@@ -313,11 +313,11 @@ def plot_motion(
     Parameters
     ----------
     motion : Motion
-        Motion to draw. If it has a prediction, each group of states shows the nonlinear robot as
-        solid lines and the linear model as dashed lines; the panel below shows their difference.
-        Along a trajectory, each group shows the robot and, in pale colours, the reference; the
-        panel below shows the error, as dashed lines for the linear model. A dotted line marks the
-        time at which the reference comes to rest.
+        Motion to draw. If the motion has a prediction, solid lines show the nonlinear robot and
+        dashed lines the linear model. The panel below each group of states shows the difference.
+        Along a trajectory, pale lines show the reference, and the panel below each group shows
+        the error, with dashed lines for the linear model. A dotted line marks the time at which
+        the reference comes to rest.
     path : str or Path, optional
         File to save to: .png, .pdf or .svg.
     show : sequence of str, optional

@@ -2,38 +2,36 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrix
-from fflin.base.validation import Array, vector
+from fflin.base.validation import Array
 from fflin.control.channel import channel_of
 from fflin.control.linear_controller import LinearController, measured_at
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, conservation, forward, loop, policies
-from fflin.kernel.arguments import empty, laid_out, words_of
-from fflin.kernel.compiled import kernel
-from fflin.kernel.tree import LANES, Tree, batch_tree, layout_of, loads_of, work_space
+from fflin.kernel.arguments import empty
+from fflin.kernel.tree import Tree, batch_tree, layout_of, loads_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.limits import limits_of
-from fflin.simulation.conservation import Conserved, MomentumReference
+from fflin.simulation.conservation import MomentumReference, conserved_by
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant, triads
 from fflin.simulation.run import stop_conditions
-from fflin.simulation.times import Times
 
 SLOTS = 128  # samples whose noise is there at a time, and steps of a campaign
-_MEMORY = 2**22  # [bytes] of rows that are there at a time
 
 
-def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.Arguments:
+def packed(plan: Plan, plant: Plant) -> loop.Arguments:
     """Return what `kernel.loop.advance` reads of a plan whose policy and method it knows."""
     h, state, method = plan.times.dt, plant.state, plan.method
+    tree, conserved = batch_tree(plant.robot), conserved_by(plant.robot, plan.q, plant.field)
+    assert tree is not None
     size, (shift, speed) = 6 + state.robot.n, method.shares(h)
     start = MomentumReference(conserved, method, h, plan.q, plan.v)
     stop = stop_conditions(plan)
@@ -80,45 +78,6 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> loop.A
             u=plan.initial,
         ),
     )
-
-
-class CompiledLoop:
-    """The compiled loop of eight runs, with arrays of its own: not to be shared by threads.
-
-    `parts` are its arguments, in lanes, and `fresh` the arrays in lanes, each with a column of its
-    values as they were. `columns` are those of a row: q, nu, u, momentum and centre of mass.
-    """
-
-    def __init__(self, parts: loop.Arguments) -> None:
-        self.fresh: list[tuple[Array, Array]] = []
-        self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self.fresh.append(pair))
-        self._words = words_of(self.parts, loop.ARGUMENTS)
-        self._work = work_space(self.parts.robot.layout.size)
-        self._advance = kernel("loop", "advance", "the loop of eight runs at a time")
-        point = self.parts.point
-        ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3]).tolist()
-        self.width = ends[-1]
-        self.columns = [slice(first, end) for first, end in pairwise([0, *ends])]
-
-    def rows(self, most: int) -> Array:
-        """Return room for so many rows or for fewer, that do not fill the memory."""
-        return work_space(max(1, min(most, _MEMORY // (8 * LANES * self.width))) * self.width)
-
-    def advance(self, clock: Any, last: int, every: int, rows: Array) -> None:
-        """Go on up to a step, see `kernel.loop.advance`."""
-        self._advance(self._words, clock, last, every, rows, self._work)
-
-    def split(self, rows: Array) -> list[Array]:
-        """Return what rows hold, each (rows, LANES, size)."""
-        by_row = rows.reshape(-1, self.width, LANES).transpose(0, 2, 1)
-        return [by_row[..., part] for part in self.columns]
-
-
-def kept_at(parts: loop.Arguments, t: float) -> list[Array]:
-    """Return the momentum (6,) and the centre of mass (3,) that the first run is to have."""
-    start, sums = parts.reference.start[:, 0], parts.reference.sums[:, 0]
-    momentum, center = np.split(start[:9] + sums[:9], [6])
-    return [momentum, center + t * parts.reference.per_mass[0, 0] * start[:3]]
 
 
 def mechanics_of(plant: Plant, tree: Tree) -> forward.Mechanics:
@@ -191,16 +150,6 @@ def noise_of(plan: Plan) -> Any:
     policy = plan.policy.policy if isinstance(plan.policy, Allocation) else plan.policy
     known = isinstance(policy, LinearController | TrajectoryOutputFeedback)
     return policy.noise if known else None
-
-
-def noises(noise: Any, times: Times, size: int, step: int, last: int) -> tuple[Any, Array]:
-    """Return the samples (k,) from a step up to another, and noise(t) (k, size) at each."""
-    at = np.arange(-(-step // times.sample), -(-last // times.sample))
-    rows = np.zeros((len(at), size))
-    for row, t in zip(rows, (at * times.sample * times.dt).tolist(), strict=True):
-        if noise:
-            row[:] = vector("noise(t)", noise(t), size, "one value for each output")
-    return at, rows
 
 
 def _between(law: policies.Law, policy: Gridded, state: StateMap) -> policies.Law:

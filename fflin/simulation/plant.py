@@ -47,7 +47,8 @@ class Plant:
         self.actuation = self._aba.actuation
         if disturbance is not None and not callable(disturbance):
             raise InputError(
-                f"disturbance is a {type(disturbance).__name__}, expected a function of (t, q, v)"
+                f"disturbance has type {type(disturbance).__name__}, expected a function of (t, q, "
+                "v)"
             )
         self.disturbance = disturbance
         self._model, self._data = robot.model, robot.create_data()
@@ -114,7 +115,7 @@ class Plant:
         finite = np.isfinite(force).all() or not np.abs(v).max() < _DIVERGED
         if force.shape != (self.robot.nv,) or not finite:
             raise InputError(
-                f"disturbance(t, q, v) gave shape {force.shape} at t = {t:g} s, expected "
+                f"disturbance(t, q, v) returned shape {force.shape} at t = {t:g} s, expected "
                 f"({self.robot.nv},) finite numbers: a generalised force in Pinocchio's order"
             )
         return force

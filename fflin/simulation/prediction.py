@@ -43,8 +43,8 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryF
         if linear is None or linear is True:
             return policy
         raise InputError(
-            "linear= is given with a TrajectoryFeedback, which is linear along a trajectory, not "
-            "about one point; leave linear= out"
+            "linear= is a model about one point, but a TrajectoryFeedback is linear along a "
+            "trajectory; leave linear= out"
         )
     own: Any = getattr(policy, "lin", None)
     if not (linear is None or linear is True):
@@ -57,10 +57,10 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryF
         return None
     why = _WHY_NOT.get(type(policy), f"a {type(policy).__name__} is not known to be linear")
     if law is not None:
-        why = "this policy's model is reduced: give the full model as linear="
+        why = "this policy's model is reduced, so that linear= must be the full model"
     raise InputError(
-        "linear= needs a StateFeedback, an OutputFeedback, a LinearController or no policy; "
-        f"{why}; leave linear= out"
+        f"linear= is given, but {why}; leave linear= out, or use a StateFeedback, an "
+        "OutputFeedback, a LinearController or no policy"
     )
 
 

@@ -324,9 +324,9 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
     ]
     moved = [kind for kind in judged if kind.size.max() > THERE]
     if motion.tracked and not motion.phases:
-        said = f"tracking error at the end: {_and([kind.last for kind in judged])}"
+        said = f"tracking errors at the end: {_and([kind.last for kind in judged])}"
     elif failed := [kind.last for kind in moved if kind.late]:
-        said = f"not settled: {_and(failed)} at the end"
+        said = f"not settled: the errors at the end are {_and(failed)}"
     elif moved:
         when = motion.t[max(kind.settled for kind in moved)]
         said = f"settled after {when:.3g}\u00a0s to within {100.0 * SETTLED:g}\u00a0%"
@@ -335,7 +335,7 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
     aside = {k.title: k.last for k in places if k.late and not k.steered}
     loose = not pushed(motion) and aside.pop("position", "")
     if aside:
-        said += f"; not controlled: {_and([*aside.values()])}"
+        said += f"; errors that are not controlled: {_and([*aside.values()])}"
     if loose:
         said += "; position is not controlled"
     return f"{said}; saturated inputs: {_full(motion)}"
@@ -372,8 +372,8 @@ def _largest_modes(motion: Any) -> str:
     if not far:
         return table
     said = (
-        "warning: the model is linear in modal amplitudes, which here stand for more than "
-        f"{_LINEAR:g} deg: {_and(far)}; the motion is not accurate"
+        "warning: the motion is not accurate: the model is linear in the modal amplitudes, and "
+        f"some of these bend the structure by more than {_LINEAR:g} deg: {_and(far)}"
     )
     return f"{table}\n{folded([said])}"
 

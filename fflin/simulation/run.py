@@ -20,6 +20,8 @@ from fflin.simulation.times import LARGEST_TURN
 # Take one step from (t, q, v) under u as it begins; return q and v at its end.
 Advance: TypeAlias = Callable[[float, Array, Array, Array], tuple[Array, Array]]
 
+STOPS = ("", "diverged", "left the chart", "stopped")
+
 _LOOK = 16  # steps between looks at the clock
 _LARGEST_SAID = 1e3  # [rad] per step, beyond which the number says no more
 
@@ -146,9 +148,9 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
         if goes_on(stop, origin, place, rates):
             return _event(plan, t, q, v)
         if goes_on(anywhere, origin, place, rates):
-            return f"left the chart at t = {t:g} s: the base turned by 180 deg from the reference"
+            return f"left the chart at t = {t:g} s: the base rotated by 180 deg from the reference"
         dt, turn = plan.times.dt, float(np.abs(v[plan.turning]).max()) * plan.times.dt
-        detail = f": a joint or the base turns by {turn:.2g} rad per step"
+        detail = f": a joint or the base rotates by {turn:.2g} rad per step"
         known = LARGEST_TURN <= turn <= _LARGEST_SAID
         return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}"
 
@@ -164,7 +166,13 @@ def _event(plan: Plan, t: float, q: Array, v: Array) -> str:
         except (TypeError, ValueError):
             margin = math.nan
         if math.isnan(margin):
-            raise InputError(f"an event gave {value!r} at t = {t:g} s, expected a number")
+            raise InputError(f"an event returned {value!r} at t = {t:g} s, expected a number")
         if margin <= 0.0:
             return f"{getattr(event, '__name__', 'event')} at t = {t:g} s"
     return ""
+
+
+def stop_of(message: str) -> int:
+    """Return the index into STOPS of the message with which a run ended."""
+    found = (at for at, word in enumerate(STOPS) if word and message.startswith(word))
+    return next(found, len(STOPS) - 1) if message else 0

@@ -64,14 +64,15 @@ def simulate(
     The integrator takes steps of fixed size on the manifold, by default with the commutator-free
     method CF4 of order 4. After each step a projection restores two conserved quantities:
 
-    - The base is shifted so that the centre of mass lies where momentum and impulse take it.
+    - The base is shifted so that the centre of mass has the position determined by momentum and
+      impulse.
     - The base velocity is set to :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`. The momentum H
       is integrated from the external impulse with the weights of the method.
 
     Thrusters never pull: a negative thrust is saturated at zero.
 
-    In orbit, q and v are relative to the orbital frame; policies receive these values. Momentum is
-    not conserved there, and the projection is off.
+    In orbit, q and v are relative to the orbital frame, also in the arguments of policies.
+    Momentum is not conserved in orbit, so that the projection is off.
 
     Parameters
     ----------
@@ -84,28 +85,29 @@ def simulate(
         Initial state in the chart of the policy's model, or of `frame` and `reference`.
     q0 : array_like (nq,), optional
     v0 : array_like (nv,), optional
-        Initial configuration and velocity in Pinocchio's order, instead of `x0`. If only one is
-        given, the other is neutral or at rest. If none of the three is given, the motion starts at
-        the start of the followed trajectory, or else at the robot's `start`.
+        Initial configuration and velocity in Pinocchio's order, instead of `x0`. If only one of
+        q0 and v0 is given, the other is neutral or zero. Without x0, q0 and v0, the motion starts
+        at the start of the followed trajectory or at the robot's `start`.
     duration : float, optional
         Simulated time [s]; by default the duration of the followed trajectory.
     dt : float, optional
         Step [s]; by default 0.01, or less if the loop's fastest pole or the samples require it. If
         the default step diverges, the simulation is repeated with a quarter of it, up to three
-        times, and `Motion.notes` report this. A simulation with an event, a callback, a disturbance
-        or a custom Python policy is not repeated, because these may keep an internal state. If the
-        input is neither sampled nor delayed, the step is adjusted to divide the duration.
+        times, and `Motion.notes` report this. A simulation with an event, a callback, a
+        disturbance or a custom Python policy is not repeated, because such a function may have an
+        internal state. If the input is neither sampled nor delayed, the step is adjusted to
+        divide the duration.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
-        Whether the projection above restores momentum and centre of mass.
+        Whether the projection after each step restores momentum and centre of mass.
     sample : float, optional
         Sample time [s] of the policy, a multiple of dt; u is held between samples. By default the
-        sample time of the policy's model. If that model is continuous, the policy is evaluated at
+        sample time of the policy's model. With a continuous model, the policy is evaluated at
         every stage of every step.
     delay : float
-        Time [s] from a sample to its effect, a multiple of dt. Before the first command arrives, u0
-        of the policy's model acts, or zero without a model. If `delay` is given without `sample`,
-        the policy is sampled every dt.
+        Time [s] from a sample to the effect of its command, a multiple of dt. Until the first
+        command takes effect, the input is u0 of the policy's model, or zero without a model. If
+        `delay` is given without `sample`, the policy is sampled every dt.
     limits : "urdf", float, mapping or list of them, optional
         Limits at which the inputs saturate; by default none:
 
@@ -131,29 +133,29 @@ def simulate(
     target : LinearModel or array_like (nx,), optional
         Target state from which errors are measured, or a model whose operating point is the
         target. By default the operating point of the policy's own model, or the followed
-        trajectory's state at each time. A policy without either has no target.
+        trajectory's state at each time. Other policies have no target.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
     reference : pin.SE3, optional
-        Frame and reference placement of x and u. By default those of the policy. Without a policy,
-        the frame is "hybrid" ("lvlh" in orbit), and the reference is the identity.
+        Frame and reference placement of x and u. The default is the frame and reference of the
+        policy. Without a policy, the frame is "hybrid" ("lvlh" in orbit), and the reference is
+        the identity.
     every : int, optional
-        Number of steps from one recorded row to the next; by default 1. If this would give more
-        than 100,000 rows, the default is increased to record about 10,000 rows, and the motion's
-        `notes` report this.
+        Number of steps from one recorded row to the next; by default 1. The default is larger for
+        more than 100,000 steps, so that about 10,000 rows are recorded, as the motion's `notes`
+        report.
     progress : bool, optional
         Whether to show a progress bar on stderr; by default on a terminal, for long runs.
     engine : {"python", "compiled"}, optional
         Engine that runs the loop. The default is Python, except that a run of more than 20,000
         steps uses the compiled engine if it has already been compiled. The compiled engine needs
-        numba. It does not support orbits, or policies, events, callbacks and disturbances written
-        in Python. Both engines agree to machine precision.
+        numba. The compiled engine supports no orbits, and no policies, events, callbacks or
+        disturbances written in Python. Both engines agree to machine precision.
 
     Returns
     -------
     Motion
-        Simulated motion. If it ended early, ``stopped`` gives the reason: an event, an interrupt
-        (Ctrl-C), or a loop that left the chart or diverged. If it diverged, the reason states the
-        step size.
+        Simulated motion. If the motion ended early, ``stopped`` gives the reason: an event, an
+        interrupt (Ctrl-C), or a loop that left the chart or diverged (with the step size).
 
     Raises
     ------

@@ -46,11 +46,14 @@ class Times(NamedTuple):
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks on the recorded rows, for the report."""
-        said = f"one in {self.every} of {self.steps:,} steps is recorded; every=1 (--every 1) "
-        notes: tuple[str, ...] = (f"{said}records all",) if self.thinned else ()
+        said = f"one of {self.every} steps is recorded; every=1 (--every 1) "
+        notes: tuple[str, ...] = (
+            (f"{said}records all steps {self.steps:,} steps",) if self.thinned else ()
+        )
         if self.sample and self.every % self.sample and self.sample % self.every:
             aside = (
-                f"rows every {self.every} steps miss some samples every {self.sample} steps; the "
+                f"a row is recorded every {self.every} steps, but the controller samples every "
+                f"{self.sample} steps; the "
             )
             notes += (f"{aside}rows are not a valid trajectory",)
         return notes
@@ -69,15 +72,15 @@ class Times(NamedTuple):
             raise InputError(
                 f"{self.steps * self.dt:g} s in steps of {self.dt:g} s"
                 f"{asked if forced else ''} are "
-                f"{self.steps:.3g} steps and {self.rows:.3g} rows, too many; take a larger dt or "
-                f"`every`"
+                f"{self.steps:.3g} steps and {self.rows:.3g} rows, which is too many; use a larger "
+                "dt or `every`"
                 f"{self._moving if forced else ''}"
             )
         if forced and self.steps > _MANY_STEPS:
             warnings.warn(
-                f"the loop's fastest pole at {self.fastest:.3g} 1/s requires steps of "
-                f"{self.dt:.3g} s, {self.steps:,} in all, which take long; give dt=, sample= or a "
-                f"slower gain"
+                f"the simulation takes long: the loop's fastest pole at {self.fastest:.3g} 1/s "
+                f"requires {self.steps:,} steps of {self.dt:.3g} s; give dt=, sample= or a slower "
+                "gain"
                 f"{self._moving}",
                 FflinWarning,
                 stacklevel=3,
@@ -85,7 +88,11 @@ class Times(NamedTuple):
 
     @property
     def _moving(self) -> str:
-        return f"; the state {self.mode} moves most at this pole" if self.mode else ""
+        return (
+            f"; {self.mode} is the largest state in the eigenvector of this pole"
+            if self.mode
+            else ""
+        )
 
 
 def times_of(
@@ -106,7 +113,7 @@ def times_of(
         sample = getattr(follows.schedule if follows else made, "dt", None) or None
     fastest, mode = (0.0, "") if sample else _fastest_pole(policy, follows)
     if duration is None and follows is None:
-        raise InputError("duration is missing; give duration= in seconds")
+        raise InputError("the duration is missing; give duration= in s")
     duration = _positive("duration", follows.duration if follows and duration is None else duration)
     delay = number("delay", delay)
     if not 0.0 <= delay < duration:

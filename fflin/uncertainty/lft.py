@@ -27,8 +27,8 @@ class LFT(Design):
     .. math:: \dot x = A x + B_1 w + B_2 u,\quad z = C_1 x + D_{11} w + D_{12} u,\quad
               y = C_2 x + D_{21} w + D_{22} u,\quad w = \Delta z
 
-    :math:`\Delta` is diagonal. It contains every delta, a number between -1 and 1, one or more
-    times. Printing the model lists its blocks.
+    :math:`\Delta` is diagonal. :math:`\Delta` contains every delta, a number between -1 and 1,
+    one or more times. Printing the model lists its blocks.
 
     Attributes
     ----------
@@ -44,8 +44,8 @@ class LFT(Design):
     repeats : ndarray (k,)
         Number of times that each delta is repeated in :math:`\Delta`.
     middle, half : ndarray (k,)
-        A parameter is ``middle + half * delta``. For tied parameters, this expression is their
-        common value, or the common factor on their nominal values.
+        A parameter is ``middle + half * delta``. For tied parameters, ``middle + half * delta``
+        is their common value, or the common factor on their nominal values.
     units : tuple of str
         Units of the parameters; "1" for a factor.
     state_names, input_names, output_names : tuple of str

@@ -60,20 +60,22 @@ class Derivatives(FrozenArrays):
 class Sensitivity:
     """Derivatives of a linear model with respect to each robot parameter: ``S["arm.mass"].dA``.
 
-    Links have their names in the URDF. A body is a group of links fixed to each other, named
-    after its joint or ``base``. The parameters of a link or body are:
+    The name of a link is its name in the URDF. A body is a group of links fixed to each other,
+    and has the name of its joint or ``base``. The parameters of a link or body are:
 
-    - ``LINK.mass`` [kg], with constant centre of mass and inertia about it;
+    - ``LINK.mass`` [kg], with constant centre of mass and constant inertia about the centre of
+      mass;
     - ``LINK.com.x`` [m] in the link's axes, with constant mass and inertia about the centre of
       mass;
     - ``LINK.inertia.xx`` .. ``.yz`` [kg m^2] about the centre of mass, in the axes of the URDF's
       <inertial>; for a body, in the axes of its joint;
     - ``LINK.density``, a relative factor on mass and inertia.
 
-    A pattern stands for links, and for bodies only where it matches no link.
+    A pattern selects links. A pattern that matches no link selects bodies.
 
     Modes of flexible appendages and slosh have ``MODE.frequency`` [Hz] and ``MODE.damping``, the
-    damping ratio, both with the link clamped; the damping ratio stays when the frequency changes.
+    damping ratio, both with the link clamped. A change of the frequency does not change the
+    damping ratio.
 
     Other parameters are ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
     ``THRUSTER.direction.x`` (a change of its length has no effect) and ``WHEEL.inertia``. The
@@ -197,7 +199,7 @@ class Sensitivity:
     def check(self, names: Sequence[str] | None = None) -> dict[str, float]:
         """Compare the derivatives of A and B with finite differences.
 
-        Each parameter is changed in small steps. At each step, A and B are computed independently,
+        Each parameter is changed in small steps. At each step, A and B are computed independently
         from the derivatives of ABA.
 
         Parameters
@@ -208,8 +210,8 @@ class Sensitivity:
         Returns
         -------
         dict
-            {parameter: largest difference, relative to the derivatives}. About 1e-9 is expected,
-            the accuracy of the finite differences.
+            {parameter: largest difference, relative to the derivatives}. The expected difference
+            is about 1e-9, the accuracy of the finite differences.
         """
         if names is None:
             names = [name for name, one in self.parameters.items() if one.bodies]
@@ -224,15 +226,16 @@ class Sensitivity:
     def table(self, top: int = 15, only: str | None = None) -> str:
         """Return a table of the parameters with the largest effect on A and B.
 
-        Each parameter is changed by 10 %, positions and centres of mass by 1 cm.
+        The effect is the change of A and B if a parameter changes by 10 %, or a position or
+        centre of mass by 1 cm.
 
         Parameters
         ----------
         top : int
             Number of rows.
         only : str, optional
-            Restriction to a kind, link or pattern: ``mass``, ``link_3``, ``*.density``. If the
-            links of a body are listed, the body is not.
+            Restriction to a kind, link or pattern: ``mass``, ``link_3``, ``*.density``. Bodies
+            whose links are listed are omitted.
         """
         shown = self.parameters.ranked(only)
         lin, sizes = self.lin, [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
@@ -292,8 +295,8 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     Parameters
     ----------
     lin : LinearModel
-        Result of `linearize` in this session, about any point and in any frame. If `discretize`
-        sampled it, the sampled A, B and f0 are differentiated.
+        Result of `linearize` in this session, about any point and in any frame. For a model
+        sampled by `discretize`, the sampled A, B and f0 are differentiated.
 
     Returns
     -------

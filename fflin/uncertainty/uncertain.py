@@ -15,6 +15,7 @@ from fflin.base.validation import Array, instance, number, numbers, untied, vect
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import linearize, prepare
+from fflin.linear.model import LinearModel
 from fflin.robot.mass_properties import Piece
 from fflin.robot.robot import Robot
 from fflin.uncertainty.derivatives import WEIGH
@@ -36,8 +37,8 @@ class Uncertain:
     robot : Robot
         The nominal robot.
     blocks : tuple of Block
-        Blocks of the uncertainty. One delta varies each block: a parameter, or several tied
-        parameters.
+        Blocks of the uncertainty. A block is a parameter or several tied parameters, and has one
+        delta.
 
     Examples
     --------
@@ -100,9 +101,9 @@ class Uncertain:
             pulls = "gravity" if any(robot.gravity) else "a spring that is not at its rest position"
             pulls = "an orbit" if robot.orbit else pulls
             raise InputError(
-                f"there is {'stored momentum' if robot.stored_momentum else pulls}, with which the "
-                "point is an equilibrium only for some values of the parameters; give a robot "
-                "without it that is at rest, or linearise each robot of samples(n)"
+                f"because of {'stored momentum' if robot.stored_momentum else pulls}, the point is "
+                "an equilibrium only for some values of the parameters; remove this effect from "
+                "the robot, or linearise each robot of samples(n)"
             )
         return _lft(self, lin)
 
@@ -115,7 +116,7 @@ class Uncertain:
         Raises
         ------
         InputError
-            If the inertia of a body is then not physically realisable.
+            If the inertia of a body with these parameters is not physically realisable.
         """
         return self._variants.robot(self._each(numbers("values", values, "parameter", "value")))
 
@@ -160,7 +161,7 @@ class Uncertain:
         return np.array(found), lost
 
     def values(self, delta: Array) -> dict[str, float]:
-        """Return {name: value} for deltas (k,), in the form that `at` takes."""
+        """Return {name: value} for deltas (k,), the argument of `at`."""
         pairs = zip(self.blocks, delta, strict=True)
         return {each.name: float(each.middle + each.half * d) for each, d in pairs}
 
@@ -192,9 +193,9 @@ class Uncertain:
     ) -> Worst:
         """Search the uncertainty set for the worst closed loop u = -K x, and bound the stable set.
 
-        The result is at least as bad as every corner and draw that was tried; its gains are
-        accurate to five digits. With the same seed and more samples, the search first repeats the
-        smaller search. Its result is therefore at least as bad as the result of the smaller search.
+        The result is at least as bad as every corner and draw that was tried. Its gains are
+        accurate to five digits. With more samples and the same seed, the result is at least as
+        bad as with fewer samples, because the search first repeats the smaller search.
 
         Parameters
         ----------
@@ -215,8 +216,8 @@ class Uncertain:
         Raises
         ------
         InputError
-            If K has a wrong size, or the loop at the middle of the ranges is unstable; otherwise
-            as in `lft`.
+            If K has a wrong size, or the loop at the middle of the ranges is unstable, or `lft`
+            raises the error.
         """
         return searched(self, self.lft(q), gain, whole("samples", samples, 1), seed)
 
@@ -232,12 +233,12 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
 
         - a number: the relative half width, such as 0.2 for 20 %;
         - a pair: the least and the largest value;
-        - ``{"range": 0.2, "tied": True}``, for a pattern: its parameters are tied.
+        - ``{"range": 0.2, "tied": True}`` for a pattern whose parameters are tied.
 
         Several parameters of a link may be given as ``{link: {"mass": .., "inertia.xx": ..}}``. By
         default, each parameter of a pattern varies independently, with a separate delta. Tied
-        parameters share one delta. With a relative range they are multiplied by a common factor;
-        with a pair they have a common value.
+        parameters share one delta. Tied parameters with a relative range are multiplied by a
+        common factor. Tied parameters with a pair have a common value.
 
     Returns
     -------
@@ -312,7 +313,8 @@ def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> N
 def _range(one: Parameter, value: Any) -> Range:
     if one.part[:9] == "direction":
         said = (
-            "turns a unit vector, on which the model depends in no rational form; use sensitivity"
+            "rotates a unit vector, so that the model is not a rational function of it; use "
+            "fflin.sensitivity for this parameter"
         )
         raise InputError(f"'{one.name}' {said}")
     if isinstance(value, tuple | list):
@@ -321,7 +323,8 @@ def _range(one: Parameter, value: Any) -> Range:
         relative = number(f"range of '{one.name}'", value)
         if not one.value:
             raise InputError(
-                f"'{one.name}' is 0, so a relative range is empty; give (least, largest)"
+                f"'{one.name}' is 0, so that a relative range is empty; give the bounds (least, "
+                "largest)"
             )
         least, largest = sorted((one.value * (1.0 - relative), one.value * (1.0 + relative)))
     expected = "" if least < largest else "least < largest"
@@ -356,7 +359,7 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
     return Block(key, "1", 1.0, relative, tuple(scaled))
 
 
-def _lft(of: Uncertain, lin: Any) -> LFT:
+def _lft(of: Uncertain, lin: LinearModel) -> LFT:
     ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
     if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in of.robot.outputs):
         feels = "an output depends on accelerations or masses, which the LFT cannot represent"

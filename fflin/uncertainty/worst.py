@@ -9,6 +9,7 @@ from operator import itemgetter
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
@@ -32,7 +33,7 @@ class Figures(NamedTuple):
 
     quick: Figure
     exact: Figure
-    above: Callable[[Array, float], Any]
+    above: Callable[[Array, float], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,8 @@ class Worst:
     def __str__(self) -> str:
         lines = [
             f"{self.unstable} of {self.tried} loops tried are unstable; "
-            f"{self.excluded} draws and corners excluded as not physically realisable"
+            f"{self.excluded} samples and corners were excluded, because they are not physically "
+            "realisable"
         ]
         for what, found in (
             ("least damping ratio", self.damping),
@@ -88,10 +90,13 @@ class Worst:
             lines.append(f"{what} {found.value:.4g} at {at}")
         if self.safe >= 1.0:
             lines.append(
-                f"guaranteed stable on the whole set, and on ranges {self.safe:.3g} times as wide"
+                f"guaranteed stable in all ranges, and in ranges that are {self.safe:.3g} times as "
+                "wide"
             )
         else:
-            lines.append(f"guaranteed stable on {100.0 * self.safe:.3g} % of each range")
+            lines.append(
+                f"guaranteed stable in the central {100.0 * self.safe:.3g} % of each range"
+            )
         return folded(lines)
 
 
@@ -191,7 +196,7 @@ class Loops:
             peaks.append(min(w, 1e300))  # where others like it have theirs
             return np.array((value,))
 
-        def above(rows: Array, bound: float) -> Any:
+        def above(rows: Array, bound: float) -> NDArray[np.bool_]:
             F, B = self.matrices(rows)
             unstable = np.linalg.eigvals(F).real.max(axis=-1) >= 0.0
             limit = bound * (1.0 + ACCURACY)

@@ -108,7 +108,8 @@ class Live:
         self._reference = reference_of(followed(policy, self.robot))
         if self._reference is None:
             raise InputError(
-                f"policy is a {type(policy).__name__}, which does not follow a trajectory; give a "
+                f"policy has type {type(policy).__name__}, which does not follow a trajectory; "
+                "give a "
                 "GainSchedule or a TrajectoryFeedback"
             )
         Drawing(self.robot, self.meshcat["target"], "ghost")

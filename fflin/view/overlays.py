@@ -30,12 +30,12 @@ def drawn_robot(robot: Robot, cloud: Any, motion: Any) -> Robot:
     from fflin.campaign.campaign import Campaign
 
     if not isinstance(cloud, Campaign):
-        said = f"cloud is a {type(cloud).__name__}, expected a Campaign"
+        said = f"cloud has type {type(cloud).__name__}, expected a Campaign"
         raise InputError(f"{said}, as fflin.monte_carlo returns it")
     if cloud.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
-            f"cloud is a campaign of '{cloud.robot}', which differs from the robot '{robot.name}'; "
-            "give the robot of the campaign"
+            f"cloud is a campaign of '{cloud.robot}', expected a campaign of the given robot "
+            f"'{robot.name}'"
         )
     drawn: Robot = getattr(motion, "_robot", None) or robot
     same = list(drawn.model.names) == list(robot.model.names) and drawn.name == robot.name
@@ -68,7 +68,7 @@ def tubes(
     from fflin.campaign.funnel import Funnel
 
     if not isinstance(funnel, Funnel):
-        said = f"funnel is a {type(funnel).__name__}, expected a Funnel"
+        said = f"funnel has type {type(funnel).__name__}, expected a Funnel"
         raise InputError(f"{said}, as fflin.funnel returns it")
     if funnel.robot.joint_names != robot.joint_names or funnel.q.shape[1] != robot.nq:
         raise InputError(f"the funnel belongs to '{funnel.robot.name}', expected '{robot.name}'")

@@ -43,7 +43,9 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
     notes: list[str] = []
     found = list(_visuals(robot, notes)) if robot.urdf else []
     if not found:
-        notes.append(f"{robot.name}: no visual geometry; drawn as boxes of the links' inertias")
+        notes.append(
+            f"{robot.name}: no visual geometry; boxes with the links' inertias are drawn instead"
+        )
         return tuple(_inertia_boxes(robot)), tuple(notes)
     for prefix, other in robot.attached:
         theirs, said = shapes(other)
@@ -115,10 +117,10 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
         notes.append(
             f"{robot.name}: {named('mesh file', missing)} not found below {where} and not "
-            "drawn; name further folders in package_dirs of fflin.load"
+            "drawn; give the folders of the meshes in package_dirs of fflin.load"
         )
     if unreadable:
-        notes.append(f"{robot.name}: {named('mesh file', unreadable)} cannot be read; not drawn")
+        notes.append(f"{robot.name}: {named('mesh file', unreadable)} cannot be read and not drawn")
     if odd:
         lines = ", ".join(map(str, odd[:6])) + ", ..." * (len(odd) > 6)
         notes.append(f"{path.name}: <visual> in line {lines} is malformed and not drawn")

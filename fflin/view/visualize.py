@@ -57,7 +57,7 @@ def visualize(
     port: int = 0,
     frame: str | None = None,
 ) -> Live | Path | None:
-    """Show a robot live, or write a motion of it to one HTML file that needs no network.
+    """Show a robot live, or write a motion of a robot to one HTML file for offline use.
 
     The page of a motion shows:
 
@@ -65,9 +65,9 @@ def visualize(
     - the trails of the tool and of the centre of mass;
     - arrows of force and torque on the base, thrusters, plumes with lengths proportional to u(t),
       and wheels at their frames;
-    - a translucent robot at the target, and another at the linear prediction, if there is one;
-    - a time slider, views of the camera, and a panel with errors and inputs over time: a click
-      enlarges a chart, and a click on a link shows its mass and pose.
+    - a translucent robot at the target, and another translucent robot at the linear prediction;
+    - a time slider, views of the camera, and a panel with errors and inputs over time. A click
+      enlarges a chart, and a click on a link shows the link's mass and pose.
 
     Along a trajectory, a translucent robot moves with the reference. Dashed lines are the reference
     paths of base and tool; pale curves are the reference joint positions. A dotted line marks the
@@ -87,8 +87,8 @@ def visualize(
     png, gif : path, optional
         Files for a picture (.png) and an animation (.gif); both need Chromium.
     times : sequence of float, optional
-        Times [s] of the pictures, four by default. One time gives a picture with its panel, several
-        give a strip.
+        Times [s] of the pictures, four by default. With one time, the picture shows one image
+        with its panel. With several times, the picture is a strip of images.
     open : bool, optional
         Whether to open a browser. By default a browser is opened if no file is given.
     scene : {"space", "lab"}, optional
@@ -99,19 +99,19 @@ def visualize(
         Frames per second of playback.
     speed : float, optional
         Seconds of motion per second of playback; by default 1, or more for motions longer than a
-        minute. A simulation that is shown live is slowed down to this speed.
+        minute. A live simulation is slowed down to this speed.
     follow : bool, optional
-        Whether the camera follows the base; by default it does if the path is so long that the
-        robot would appear as a dot.
+        Whether the camera follows the base; by default only for paths so long that the robot
+        would appear as a dot.
     target : array_like (nq,), optional
         Configuration from which errors are measured; by default the motion's target. Without a
-        target, the page shows the change from the start, and it shows no translucent robot.
+        target, the page shows the change from the start, and no translucent robot.
     tool : str, optional
         Frame whose trail is drawn; by default "tool", or the last link of the longest chain.
     cloud : Campaign, optional
-        Campaign from `monte_carlo`: the paths of base and tool in up to 240 runs, as thin lines. If
-        the motion is one of its runs, from `Campaign.replay`, the robot is drawn with the dispersed
-        bodies of that run.
+        Campaign from `monte_carlo`. Thin lines show the paths of base and tool in up to 240 runs.
+        If the motion is a run from `Campaign.replay`, the robot is drawn with the dispersed
+        bodies of this run.
     funnel : Funnel, optional
         Funnel along the trajectory that the motion follows. A tube shows the positions of base and
         tool inside the funnel.
@@ -130,8 +130,8 @@ def visualize(
     Raises
     ------
     InputError
-        If the motion or modes belong to another robot or a reduced model; if no mode oscillates, or
-        pictures of modes are requested; if a value is invalid or the port is in use.
+        If the motion or modes belong to another robot or a reduced model, or no mode oscillates.
+        Also if pictures of modes are requested, a value is invalid, or the port is in use.
     FileError
         If a file cannot be written. Files are written atomically.
     UnknownNameError

@@ -297,3 +297,15 @@ def test_bad_input(arm):
     ):
         with pytest.raises(fflin.FflinError, match=words):
             fflin.funnel(*arguments, **options)
+
+
+def test_draws_do_not_depend_on_the_rounding_of_eigenvectors():
+    """Equal eigenvalues have no unique eigenvectors; the symmetric root is unique."""
+    rng = np.random.default_rng(5)
+    P = np.kron(np.diag([4.0, 1.0, 9.0, 0.0]), [[1.0, 0.5], [0.5, 1.0]])
+    W = ellipsoid_axes(P)
+    np.testing.assert_allclose(P @ W @ W.T @ P, P, rtol=0, atol=1e-12)
+    for _ in range(4):
+        noise = np.pad(rng.normal(size=(6, 6)), (0, 2))
+        other = ellipsoid_axes(P + 1e-15 * (noise + noise.T))
+        np.testing.assert_allclose(other, W, rtol=0, atol=1e-10)

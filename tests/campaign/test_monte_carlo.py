@@ -726,7 +726,7 @@ def test_a_file_of_another_policy_or_robot_is_refused_before_compiling(
         return fflin.monte_carlo(robot, policy, {"q_b": 0.05}, **options | changes)
 
     first, before = fly(), path.read_bytes()
-    monkeypatch.setattr("fflin.simulation.packing.kernel", None)  # which compiles
+    monkeypatch.setattr("fflin.simulation.lanes.kernel", None)  # which compiles
     heavier = robot.perturbed(mass=1e-6, com=0.0, inertia=0.0)
     for changes in (
         {"gain": 1.0 + 1e-9},

@@ -189,7 +189,7 @@ def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(3), 0.0, 0.4, 0.0)
     job = settling_runs(loop, False, None, 0.0)
-    job.rule.every, times, e = 1, job.plan.times, x - lin.x0
+    job.rule.checked_every, times, e = 1, job.plan.times, x - lin.x0
     step, sizes = expm(loop.rate * times.dt), []
     for _ in range(times.steps):
         sizes.append(loop.size(e))

@@ -75,7 +75,7 @@ def test_warnings_are_one_line_each_on_stderr_and_in_info():
         capture_output=True,
         text=True,
     )
-    words = "planar_detumble: damping unused: 'joint_1', 'joint_2', 'joint_3'"
+    words = "planar_detumble: damping not modelled: 'joint_1', 'joint_2', 'joint_3'"
     assert done.returncode == 0
     assert done.stderr.startswith("fflin: warning: ") and done.stderr.count("\n") == 1
     assert words in done.stderr
@@ -346,7 +346,7 @@ def test_an_empty_name_is_said_to_be_empty():
 
 def test_negative_numbers_are_no_options():
     code, out, _ = run("check", "cubesat", "--rpy", "-30", "-1e-3", "0", "--position", "-.5", 0, 0)
-    assert code == 0 and "A and B hold" in out
+    assert code == 0 and "A and B are verified" in out
 
 
 def test_passive_joints_and_gravity(tmp_path):
@@ -365,7 +365,7 @@ def test_passive_joints_and_gravity(tmp_path):
     assert (fflin.LinearModel.load(path).A == again.A).all()
     options = ("--damping", "urdf", "--velocity", "joint_2=0.3", "--effort", "tau_m.joint_1=2")
     code, out, _ = run("check", "planar_detumble", *options)
-    assert code == 0 and "A and B hold" in out
+    assert code == 0 and "A and B are verified" in out
 
 
 def test_inputs_and_outputs_are_those_of_python(tmp_path):
@@ -388,7 +388,7 @@ def test_inputs_and_outputs_are_those_of_python(tmp_path):
         assert (getattr(saved, key) == getattr(lin, key)).all()
     assert saved.input_names == lin.input_names and saved.output_names == lin.output_names
     code, out, _ = run("check", "servicer_7dof", *options)
-    assert code == 0 and "A and B hold" in out
+    assert code == 0 and "A and B are verified" in out
 
 
 def test_output_and_output_file_are_told_apart(tmp_path):
@@ -607,7 +607,7 @@ def test_short_help_fits_a_screen_and_full_help_has_every_option():
         assert all(re.search(rf"^  .*{option}\b", full, re.MULTILINE) for option in options), name
         if options[1:]:
             assert short.endswith(
-                f"all {len(options) - 1} options in full: fflin {name} --help all\n"
+                f"help for all {len(options) - 1} options: fflin {name} --help all\n"
             )
 
 

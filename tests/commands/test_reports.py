@@ -15,7 +15,7 @@ ROBOTS = ("planar_detumble", "ets_vii", "servicer_7dof", "inspector", "canadarm2
 COMMANDS = {
     "info": ((), r"\d+ joints, \d+ states"),
     "linearize": ((), r"\d+ states, \d+ inputs"),
-    "check": ((), r"A and B hold: largest error \S+ \(allowed"),
+    "check": ((), r"A and B are verified: largest error \S+ \(allowed"),
     "analyze": ((), "controllable"),
     "modes": ((), r"\d+ rigid-body modes"),
     "lqr": ((), r"\d+ poles, slowest decay \S+ 1/s, smallest damping ratio"),
@@ -23,7 +23,7 @@ COMMANDS = {
     "uncertain": (("--vary", "base.mass=0.2"), r"1 parameter"),
     "simulate": (("--rpy", 5, 0, 0), "settled after .*; saturated inputs: none"),
     "validity": (("--samples", 3), "within 10 %"),
-    "init": (("--force", "-o", "own.toml"), r"try: fflin simulate own\.toml"),
+    "init": (("--force", "-o", "own.toml"), r"run: fflin simulate own\.toml"),
 }
 MOST = 24  # rows of a table: about a screen
 
@@ -52,7 +52,7 @@ def test_a_report_is_read_at_a_glance(robot, command, tmp_path):
 # Those of a trajectory, in the order that each needs, and those of many runs.
 CHAIN = {
     "linearize": (("--trajectory", "plan.npz"), r"\d+ knots, 0 to 2 s"),
-    "check": (("--trajectory", "plan.npz"), "A and B hold: largest error"),
+    "check": (("--trajectory", "plan.npz"), "A and B are verified: largest error"),
     "tvlqr": (("--trajectory", "plan.npz", "-o", "gains.npz"), r"\d+ knots, 0 to 2 s"),
     "funnel": (
         ("--schedule", "gains.npz", "--goal", "attitude=5", "--knots", 2, "--samples", 4),
@@ -79,5 +79,5 @@ def test_a_report_of_a_trajectory_and_of_many_runs_is_too(robot, tmp_path):
 
 def test_the_list_of_robots_begins_with_how_many_load():
     lines = run("robots")[1].splitlines()
-    assert re.fullmatch(r"robots: \d+ robots load by name, 1 cannot be loaded", lines[0])
+    assert re.fullmatch(r"robots: \d+ robots can be loaded by name, 1 cannot be loaded", lines[0])
     assert len(set(lines) - {""}) == len([line for line in lines if line])

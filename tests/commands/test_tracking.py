@@ -50,7 +50,7 @@ def test_the_chain_goes_from_a_file_to_gains(flown):
 
     code, out, err = run("check", *mat)
     assert (code, err) == (0, "")
-    assert "A and B hold" in out
+    assert "A and B are verified" in out
 
     weights = ("--bryson", "q_b=0.05", "--bryson", "tau_m=0.5", "--qf", "q_b=9")
     code, out, err = run("tvlqr", *given, *weights, "--sample", "0.1", "-o", folder / "gains.npz")

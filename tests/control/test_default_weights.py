@@ -225,7 +225,7 @@ def test_a_point_that_asks_for_more_than_the_limits_is_told(loops):
     asked = dict(zip(lin.input_names, np.abs(lin.u0), strict=True))
     beyond = [name for name in asked if asked[name] > lin.limits.get(name, np.inf)]
     said = fflin.lqr(lin).weights
-    words = f"; at or beyond the URDF limit at the point itself: {', '.join(beyond)}"
+    words = f"; already at or beyond the URDF limit at the operating point: {', '.join(beyond)}"
     assert beyond and said.endswith(words)
 
 
@@ -432,7 +432,7 @@ def test_panels_on_springs_come_to_rest_as_the_base_does(stiffness, inputs):
     assert decay == pytest.approx(gain.margin, rel=5e-3)
     least = 0.95 if inputs == "motors" or stiffness > 1.0 else 0.3
     assert gain.margin > least * np.sqrt(0.5) * 0.0754
-    assert ("slower than without springs" in gain.weights) == (least < 0.9)
+    assert ("slowed by springs" in gain.weights) == (least < 0.9)
 
 
 LEGGED = (
@@ -507,7 +507,7 @@ def test_largest_values_of_all_are_brysons_rule_and_of_some_are_on_its_scale(loo
     Q, R, _, rule = rule_weights(lin, None, {"bryson": {"q_b": own}})
     scale = R[0, 0] / gain.R[0, 0]
     assert scale * np.exp(np.log(gain.Q.diagonal()[:3]).mean()) == pytest.approx(own**-2, rel=1e-9)
-    assert R == pytest.approx(scale * gain.R, rel=1e-12) and rule.endswith("of this rule alone)")
+    assert R == pytest.approx(scale * gain.R, rel=1e-12) and rule.endswith("with this rule alone)")
     # The tighter one is held, the more of every input it takes.
     norms = []
     for size in (own, 0.1 * own, 0.01 * own):

@@ -111,7 +111,7 @@ def test_poles_of_a_sampled_loop_are_shown_as_rates():
 def test_what_has_no_poles_is_one_line():
     masked = np.ma.masked_array([-1.0, -2.0], mask=[True, False])
     for given in (3, np.zeros((3, 3)), [], {}, {"a": 5.0}, [np.nan], None):
-        with pytest.raises(fflin.InputError, match="poles is a"):
+        with pytest.raises(fflin.InputError, match="poles has type"):
             fflin.plot_poles(given)
     with pytest.raises(fflin.InputError, match="masked"):
         fflin.plot_poles(masked)

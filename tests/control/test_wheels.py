@@ -243,7 +243,7 @@ def test_a_wheel_that_is_at_its_limit_is_told_and_quickens_nothing(spin):
     still = fflin.lqr(fflin.linearize(robot))
     spun = fflin.lqr(fflin.linearize(robot, v=fflin.velocity(robot, {"wheel_2": spin})))
     assert says(still.weights, "speed of wheel_2")
-    assert says(spun.weights, "speed of wheel_2", "at the point itself", "qdot_m.wheel_2")
+    assert says(spun.weights, "speed of wheel_2", "at the operating point", "qdot_m.wheel_2")
     assert spun.R == pytest.approx(still.R, rel=1e-9)
     # A spin slows one mode, and the record has the slowest.
     assert (

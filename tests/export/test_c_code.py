@@ -263,7 +263,7 @@ def test_the_code_is_not_flown_with_other_continuous_joints(tmp_path):
     code = fflin.CLaw(fflin.write_c(fflin.lqr(fflin.linearize(robot)), tmp_path / "c"))
     turning = fflin.load(tmp_path / "own.urdf")
     assert turning.nq > robot.nq
-    with pytest.raises(fflin.InputError, match="other joints are continuous"):
+    with pytest.raises(fflin.InputError, match="has other continuous joints"):
         code.bind(turning)
 
 

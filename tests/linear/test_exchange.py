@@ -393,4 +393,4 @@ def test_an_orbit_has_angles_and_no_other_tool():
     n = len(m.A) // 2
     assert relative(m.A[:n], np.eye(n, 2 * n, n)) < 1e-13  # coordinates and their rates
     for tool in ("drake", "mujoco", "pinocchio", "spart"):
-        refused(r"is in orbit; use robot.replace", lin.to, tool)
+        refused(r"is in orbit; remove the orbit", lin.to, tool)

@@ -85,7 +85,7 @@ def test_what_is_no_motion_is_told_with_the_time_and_refused_where_asked():
     assert along.residual.argmax() == 7
     assert along.residual[7] > 1.0
     cases = {
-        r"t\[1\] is .* s, after .* s; expected each time later": (t[::-1], q, v, u),
+        r"t\[1\] is .* s, after .* s; expected increasing": (t[::-1], q, v, u),
         r"q has shape \(16, 19\), expected \(17, 19\)": (t, q[:-1], v, u),
         r"v has shape \(17, 11\), expected \(17, 12\)": (t, q, v[:, 1:], u),
         r"u has shape \(17, 11\), expected \(17, 12\)": (t, q, v, u[:, 1:]),

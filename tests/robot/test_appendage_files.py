@@ -67,7 +67,7 @@ def test_robot_file_gives_the_same_robot_as_python(tmp_path):
     [
         ("frequency = [0.2, 0.5]", "frequency = [0.2, -0.5]", 7, "mode 2"),
         ("frequency = [0.2, 0.5]", "frequencies = [0.2, 0.5]", 7, "frequency"),
-        ("frequency = [0.2, 0.5]\n", "", 4, "needs the key 'frequency'"),
+        ("frequency = [0.2, 0.5]\n", "", 4, "the key 'frequency'"),
         ('frame = "panel_left_link"', 'frame = "panel_lef"', 6, "panel_lef"),
         ("mass = 5.0", 'mass = "5 kg"', 23, "mass"),
         ("radius = 0.3", "radius = -0.3", 13, "radius"),
@@ -76,7 +76,7 @@ def test_robot_file_gives_the_same_robot_as_python(tmp_path):
         ("[0.5, 0.1]", "[0.5, 5.1]", 4, "left_mode_2"),
         ('frame = "panel_left_link"', 'frame = "base"\nop4 = "a.op4"', 8, "'frequency'"),
         ("mass = 5.0", "mass = 5e6", 4, "base_slosh_x"),
-        ("radius = 0.3\n", "", 13, "needs the key 'radius'"),
+        ("radius = 0.3\n", "", 13, "the key 'radius'"),
     ],
 )
 def test_mistakes_are_told_by_file_and_line(tmp_path, old, new, line, message):

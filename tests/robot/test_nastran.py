@@ -113,7 +113,7 @@ def test_a_link_that_differs_from_the_file_is_told_and_may_be_replaced(files):
     op4, asm, (rigid_mass, _, _) = files
     robot = fflin.load("planar_detumble")
     read = fflin.FlexibleAppendage.from_nastran
-    with pytest.warns(FflinWarning, match="correct the URDF, or take the file's with rigid=True"):
+    with pytest.warns(FflinWarning, match="correct the URDF, or use the inertia of the file"):
         robot.replace(appendages=[read(op4, asm, frame="base", name="array")])
     taken = robot.replace(appendages=[read(op4, asm, frame="base", name="array", rigid=True)])
     base = robot.links["base"].mass

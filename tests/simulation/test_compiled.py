@@ -10,8 +10,7 @@ import pytest
 
 import fflin
 from fflin.kernel.compiled import ENGINES
-from fflin.kernel.tree import batch_tree
-from fflin.simulation import compiled, packing, run
+from fflin.simulation import compiled, lanes, packing, run
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.plan import planned
 from fflin.simulation.plant import Plant
@@ -309,11 +308,8 @@ def test_eight_lanes_are_eight_runs(robots):
         count = len(plant.faults.gain)
         faults = plant.faults._replace(gain=np.full(count, gain))
         plans.append((plan, Plant(plant.state, faults=faults)))
-    parts = [
-        packing.packed(plan, plant, Conserved(plant.robot, plan.q), batch_tree(plant.robot))
-        for plan, plant in plans
-    ]
-    together = packing.CompiledLoop(parts[0])
+    parts = [packing.packed(plan, plant) for plan, plant in plans]
+    together = lanes.LaneLoop(*plans[0])
     for lane, own in enumerate(parts):
         for array, values in zip(in_lanes(together.parts), in_lanes(own), strict=True):
             array[:, lane] = values

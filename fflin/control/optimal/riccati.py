@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import warnings
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
@@ -31,17 +31,17 @@ class Solution(NamedTuple):
 
     P: Array
     K: Array
-    poles: Any
+    poles: Values
     residual: float
     method: str
 
-    def ordered(self, dt: float) -> tuple[Any, float]:
+    def ordered(self, dt: float) -> tuple[Values, float]:
         """Return the poles in order, and how far they are from the boundary of stability."""
         poles = self.poles[np.lexsort((self.poles.imag, self.poles.real))]
         return poles, float(1.0 - np.abs(poles).max() if dt else -poles.real.max())
 
 
-def rates_of(poles: Any, dt: float) -> Any:
+def rates_of(poles: Values, dt: float) -> Values:
     """Return poles [1/s] in continuous time, converted from samples of dt [s] if dt is not 0."""
     return np.log(np.where(poles == 0.0, 1e-300, poles) + 0j) / dt if dt else poles
 
@@ -241,7 +241,7 @@ def _norm(matrix: Array) -> float:
 class ModalMatrix:
     """Modes V (n, n) of a real matrix F, with complex pairs side by side."""
 
-    def __init__(self, V: Any, poles: Any, discrete: bool) -> None:
+    def __init__(self, V: Values, poles: Values, discrete: bool) -> None:
         self.V, self.inverse, self.values = V, np.linalg.inv(V), poles
         across = poles.conj()[:, None]
         self._factors = -1.0 / (across * poles - 1.0 if discrete else across + poles)
@@ -256,13 +256,13 @@ class ModalMatrix:
         """Solve F' D + D F = -r, or where discrete F' D F - D = -r, for a symmetric r (n, n)."""
         return self.lyapunov_modal(self.V.conj().T @ r @ self.V)
 
-    def lyapunov_modal(self, r: Any) -> Array:
+    def lyapunov_modal(self, r: Values) -> Array:
         """Solve the same where V^H r V is given."""
         # In the modes the equation is a division.
         D: Array = (self.inverse.conj().T @ (r * self._factors) @ self.inverse).real
         return 0.5 * (D + D.T)
 
-    def poles(self, F: Array) -> Any:
+    def poles(self, F: Array) -> Values:
         """Return the eigenvalues of a matrix, read off where these modes decouple it."""
         M = self.inverse @ F @ self.V
         values = M.diagonal().astype(complex)
@@ -280,7 +280,7 @@ class OptimalLoop(NamedTuple):
     """A closed loop by its modes V, and V^H (Q + K' R K) V of its gain."""
 
     modes: ModalMatrix
-    cost: Any
+    cost: Values
 
 
 def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalLoop | None:
@@ -291,7 +291,7 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
         return None
     white = _lower(R_factor, B[m:].T)
     # Of the inverse weight on forces, S = Ls Ls'; squaring it would square its condition.
-    triangle: Any = np.linalg.qr(white, mode="r")
+    triangle = np.asarray(np.linalg.qr(white, mode="r"))
     Ls = triangle.T
     sizes = np.abs(Ls.diagonal())
     singular = len(white) < m or sizes.min() <= 1e-14 * sizes.max()

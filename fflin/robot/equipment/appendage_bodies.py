@@ -79,7 +79,7 @@ def mounted_appendages(
             raise InputError(
                 f"mode '{of_body[0].name}' has a participation in translation, but the slosh of "
                 f"its body leaves it {bodies[joint].mass:.3g} kg; the mass in the URDF must "
-                "include both"
+                "include the appendage and the liquid"
             )
         for ball in of_body:
             part, removed = ball.mounted(joint, lighter)
@@ -136,8 +136,8 @@ def _compare_inertia(item: _Modes, bodies: list[pin.Inertia], links: Mapping[str
         ]
         warnings.warn(
             f"flexible appendage '{appendage.title}': its file has {both[0]}, but {what} has "
-            f"{both[1]}, in the axes of the frame; correct the URDF, or take the file's with "
-            "rigid=True",
+            f"{both[1]}, in the axes of the frame; correct the URDF, or use the inertia of the "
+            "file with rigid=True",
             FflinWarning,
             stacklevel=6,
         )
@@ -167,8 +167,8 @@ def _require_inertia(body: pin.Inertia, of: str, found: Sequence[_Modes]) -> Non
         f"mode '{names[first]}' has more participation ({np.linalg.norm(t):.3g} kg^0.5, "
         f"{np.linalg.norm(r):.3g} kg^0.5 m about the centre of mass) than {of} with "
         f"{body.mass:.4g} kg can have: M_rr - L L^T has the eigenvalue {leasts[first]:.2g}, "
-        "relative to the largest of M_rr; the inertia in the URDF must include the appendage as "
-        "if it were rigid"
+        "relative to the largest eigenvalue of M_rr; the URDF's inertia must include the appendage "
+        "as if it were rigid"
     )
 
 

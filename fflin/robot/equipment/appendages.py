@@ -49,7 +49,7 @@ class Appendage(FrozenArrays):
 
     @property
     def participation(self) -> Array:
-        """Participation L (6, k) in the frame: translation over rotation about its origin."""
+        """Participation L (6, k): translation, then rotation about the frame's origin."""
         raise NotImplementedError
 
     @property
@@ -63,9 +63,9 @@ class FlexibleAppendage(Appendage):
     r"""Flexible part of a link, such as a solar array, described by its clamped modes.
 
     Each mode becomes a coordinate of q_m, its modal amplitude in kg^0.5 m for unit modal mass, with
-    the name NAME_mode_1, NAME_mode_2, ... It has the stiffness :math:`\omega^2` and the damping
-    :math:`2 \zeta \omega`, and no motor. The link's inertia in the URDF must include the appendage
-    as if it were rigid.
+    the name NAME_mode_1, NAME_mode_2, ... A modal amplitude has the stiffness :math:`\omega^2`,
+    the damping :math:`2 \zeta \omega` and no motor. The link's inertia in the URDF must include
+    the appendage as if it were rigid.
 
     Parameters
     ----------
@@ -74,8 +74,9 @@ class FlexibleAppendage(Appendage):
     frequency : float or sequence of float (k,)
         Frequencies [Hz] of the clamped appendage.
     translation : array_like (3, k)
-        Modal participation in translation [kg^0.5]: the linear momentum of each mode for a unit of
-        its rate, in the frame's axes. The effective mass of a mode along an axis is its square.
+        Modal participation in translation [kg^0.5]: the linear momentum of each mode for a unit
+        modal rate, in the frame's axes. Its square is the effective mass of the mode along an
+        axis.
     rotation : array_like (3, k)
         Modal participation in rotation [kg^0.5 m]: the angular momentum about the frame's origin.
     damping : float or sequence of float (k,)
@@ -87,8 +88,9 @@ class FlexibleAppendage(Appendage):
     ------
     InputError
         If a shape is wrong, a value is not finite, a frequency is not positive, or a damping ratio
-        is not between 0 and 1. When the robot is made: if the inertia of the carrying body cannot
-        have this participation, because :math:`M_{rr} - L L^T` is not positive semidefinite.
+        is not between 0 and 1. `load` raises the error if :math:`M_{rr} - L L^T` is not positive
+        semidefinite, which means that the participation is too large for the inertia of the
+        carrying body.
 
     Examples
     --------
@@ -177,13 +179,13 @@ class FlexibleAppendage(Appendage):
         op4 : path
             Output4 file with the mass and stiffness matrix (mxx, maa or maax; kxx, kaa or kaax).
         asm : path
-            Assembly file with the boundary grids and the points of the modes. If there is a .pch
-            file beside it, it says which degrees of freedom of the grids are kept.
+            Assembly file with the boundary grids and the points of the modes. A .pch file in the
+            same folder defines which degrees of freedom of the grids are kept.
         frame : str
-            Frame of the model that is the interface. Its axes are the file's basic axes.
+            Frame of the model at the interface. The axes of this frame are the file's basic axes.
         origin : sequence of float (3,), optional
-            Point of the file [m], in its basic coordinates, that is at the frame's origin; the mean
-            of the boundary grids by default.
+            Point [m] in the file's basic coordinates that coincides with the frame's origin; the
+            mean of the boundary grids by default.
         modes : int, optional
             Number of modes to use, the lowest frequency first; all by default.
         length : {"m", "mm", "cm", "in", "ft"}
@@ -194,7 +196,7 @@ class FlexibleAppendage(Appendage):
             As in `FlexibleAppendage`.
         rigid : bool
             Whether the file's rigid inertia replaces the URDF's inertia of the link at the frame.
-            Otherwise a warning gives both if they differ by more than 1 %.
+            With False, a warning gives both inertias if they differ by more than 1 %.
 
         Returns
         -------
@@ -203,8 +205,8 @@ class FlexibleAppendage(Appendage):
         Raises
         ------
         InputError
-            If a file is missing, truncated or of another kind, or is no Craig-Bampton model; or if
-            pyYeti is not installed (``pip install 'fflin[nastran]'``).
+            If a file is missing, truncated or not a Craig-Bampton model, or pyYeti is not
+            installed (``pip install 'fflin[nastran]'``).
         UnknownNameError
             If a unit is unknown.
         """
@@ -229,7 +231,7 @@ class FlexibleAppendage(Appendage):
 
     @property
     def participation(self) -> Array:
-        """Participation L (6, k) in the frame: translation over rotation about its origin."""
+        """Participation L (6, k): translation, then rotation about the frame's origin."""
         return np.vstack((self.translation, self.rotation))
 
     @property
@@ -270,11 +272,11 @@ class FlexibleAppendage(Appendage):
 class Slosh(Appendage):
     r"""Liquid that sloshes in a tank: a mass that is free to move across an axis.
 
-    The mass is a point. With `frequency` it moves on springs, by the coordinates NAME_x and NAME_y
-    [m]. With `length` it is a pendulum, whose coordinates are angles [rad]: it has no stiffness of
-    its own, and swings with :math:`\sqrt{a/l}` under an acceleration a along the axis, such as that
-    of a thruster, see ``linearize(..., moving=True)``. The link's inertia in the URDF must include
-    the mass.
+    The liquid is a point mass. With `frequency`, the mass moves on springs, with the coordinates
+    NAME_x and NAME_y [m]. With `length`, the mass is a pendulum, with angles [rad] as
+    coordinates. A pendulum has no stiffness of its own. Its frequency is :math:`\sqrt{a/l}` under
+    an acceleration a along the axis, such as the acceleration by a thruster, see ``linearize(...,
+    moving=True)``. The link's inertia in the URDF must include the mass.
 
     Parameters
     ----------
@@ -283,16 +285,16 @@ class Slosh(Appendage):
     mass : float
         Mass m [kg] that sloshes.
     position : sequence of float (3,)
-        Its position [m] at rest, in the frame.
+        Position [m] of the mass at rest, in the frame.
     frequency : float, optional
-        Frequency [Hz] of the mass on its springs. For a pendulum the frequency to which the damping
-        ratio refers.
+        Frequency [Hz] of the mass on its springs. For a pendulum, `frequency` is the frequency to
+        which the damping ratio refers.
     length : float, optional
         Length l [m] of the pendulum, whose hinge is at `position` + l `axis`.
     axis : sequence of float (3,)
-        Axis of the tank in the frame's axes, opposite to the pull under which the liquid lies. The
-        directions x and y are perpendicular to it: x as near to the frame's x axis as possible, or
-        to its y axis if that is closer to the perpendicular plane.
+        Axis of the tank in the frame's axes, from its bottom up. The directions x and y are
+        perpendicular to `axis`. Direction x is the projection of the frame's x or y axis,
+        whichever is more nearly perpendicular to `axis`.
     damping : float
         Damping ratio, from 0 to 1.
     name : str, optional
@@ -301,8 +303,8 @@ class Slosh(Appendage):
     Raises
     ------
     InputError
-        If a number is not finite or out of range, or if neither a frequency nor a length is given.
-        When the robot is made: if the carrying body has not this much mass there.
+        If a number is not finite or out of range, or both frequency and length are missing.
+        `load` raises the error if the carrying body has less mass than the liquid.
 
     Examples
     --------
@@ -365,16 +367,16 @@ class Slosh(Appendage):
     ) -> Slosh:
         r"""Return the first lateral mode of the liquid in an upright circular cylinder.
 
-        With the liquid's mass m, k = 1.8412 / R, filled to the height h under the acceleration a:
+        For a liquid of mass m and height h under the acceleration a, with k = 1.8412 / R:
 
         .. math::
             \omega^2 = a k \tanh k h, \qquad
             \frac{m_1}{m} = \frac{2 \tanh k h}{k h\,(k^2 R^2 - 1)}, \qquad
             l = \frac{a}{\omega^2}.
 
-        The mass m1 is :math:`\tfrac{2}{k} \tanh \tfrac{k h}{2}` below the surface, both as a
-        pendulum and on springs (Dodge, The new dynamic behavior of liquids in moving containers,
-        Southwest Research Institute 2000, chapter 3; NASA SP-106, chapter 6).
+        The sloshing mass m1 is at the depth :math:`\tfrac{2}{k} \tanh \tfrac{k h}{2}` below the
+        surface, as a pendulum or on springs (Dodge, The new dynamic behavior of liquids in moving
+        containers, Southwest Research Institute 2000, chapter 3; NASA SP-106, chapter 6).
 
         Parameters
         ----------
@@ -391,10 +393,11 @@ class Slosh(Appendage):
         axis : sequence of float (3,)
             Axis of the tank, from its bottom up, in the frame's axes.
         pendulum : bool
-            Whether the mass is a pendulum, whose frequency follows the acceleration at which the
-            robot is linearised; otherwise it is on springs of the given acceleration's frequency.
+            Whether the mass is a pendulum, whose frequency depends on the acceleration at the
+            operating point. With False, the mass is on springs, with the constant frequency for
+            `acceleration`.
         damping, name
-            As in `Slosh`; the damping ratio refers to the given acceleration.
+            Parameters of `Slosh`; the damping ratio refers to the given acceleration.
 
         Returns
         -------
@@ -438,12 +441,12 @@ class Slosh(Appendage):
 
     @property
     def modal_mass(self) -> float:
-        """Inertia of each coordinate with the tank clamped: a mass [kg], or [kg m^2]."""
+        """Inertia of each coordinate with a clamped tank: mass [kg] or inertia [kg m^2]."""
         return self.mass * (self.length or 1.0) ** 2
 
     @property
     def participation(self) -> Array:
-        """Participation L (6, 2) in the frame: translation over rotation about its origin."""
+        """Participation L (6, 2): translation, then rotation about the frame's origin."""
         t = math.sqrt(self.mass) * self.axes[:, :2]
         return np.vstack((t, np.cross(np.array(self.position), t, axisb=0, axisc=0)))
 
@@ -474,12 +477,14 @@ def checked_appendages(value: Any) -> tuple[Appendage, ...]:
         value = [value]
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise InputError(
-            f"appendages is a {type(value).__name__}, expected a sequence of FlexibleAppendage "
+            f"appendages has type {type(value).__name__}, expected a sequence of FlexibleAppendage "
             "and Slosh"
         )
     for item in value:
         if not isinstance(item, Appendage):
-            raise InputError(f"{item!r} is no appendage; expected FlexibleAppendage or Slosh")
+            raise InputError(
+                f"{item!r} is not an appendage; expected a FlexibleAppendage or a Slosh"
+            )
     return tuple(value)
 
 

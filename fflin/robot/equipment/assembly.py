@@ -36,8 +36,8 @@ def with_appendages(robot: Any, appendages: Any) -> Any:
             joint = find_frame(bare.model, item.frame).joint
             if joint in taken:
                 raise InputError(
-                    f"flexible appendage '{item.title}' is the second of its body with rigid=True; "
-                    "the inertia of a body can be taken from one file only"
+                    f"flexible appendage '{item.title}' is the second appendage with rigid=True on "
+                    "its body; use rigid=True for one appendage of each body"
                 )
             taken.add(joint)
             bare = _with_rigid(bare, item)

@@ -47,10 +47,11 @@ def mounted_wheels(
             of = "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
             about = float(axis @ bodies[joint].inertia @ axis)
             raise InputError(
-                f"wheel '{name}' of {wheel.inertia:g} kg m^2 has more inertia than its carrier: "
-                f"{of} has {about:.3g} kg m^2 about its axis, which leaves a principal moment of "
-                f"{moments[0]:.3g}; the inertia in the URDF must include the wheels: correct the "
-                "URDF or the wheel"
+                f"wheel '{name}' of {wheel.inertia:g} kg m^2 has a larger inertia than the link "
+                "that carries it: "
+                f"{of} has {about:.3g} kg m^2 about its axis, so that {moments[0]:.3g} kg m^2 "
+                "would be left without the wheel; the URDF's inertia must include the wheels, so "
+                "correct the URDF or the wheel"
             )
         bodies[joint] = rest
         placement = pin.SE3(turned_to(axis), np.zeros(3))

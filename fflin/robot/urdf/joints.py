@@ -308,8 +308,8 @@ def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[s
         earlier = parts.setdefault(part.name, part)
         if earlier is not part:
             raise element.error(
-                f"this is the second {element.tag} named {quoted(part.name)}, the first is in line "
-                f"{earlier.element.line}; rename one of them"
+                f"a second {element.tag} has the name {quoted(part.name)}, which is already used "
+                f"in line {earlier.element.line}; rename one of them"
             )
     return parts
 

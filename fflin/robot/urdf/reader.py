@@ -106,7 +106,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
     resistances = {"damping": ("damping", damping), "Coulomb friction": ("friction", friction)}
     advice = [
-        Advice(key, tuple(values), f"{path.stem}: {what} unused: {enumerated(list(values))}")
+        Advice(key, tuple(values), f"{path.stem}: {what} not modelled: {enumerated(list(values))}")
         for what, (key, values) in resistances.items()
         if values
     ]
@@ -117,7 +117,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     for zero, of in unlimited.items():
         if zero:
             joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
-            text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
+            text = f"{path.stem}: {', '.join(of)} 0 of {joints} taken as unlimited (or passive)"
             advice.append(Advice("passive", zero, text))
     weights = {name: link for name, link in urdf.links.items() if link.mass}
     of_links, said = (weights, tuple(urdf.joints)), (tuple(notes), tuple(advice))
@@ -134,7 +134,7 @@ def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> p
     if nv > _LARGEST_NV:
         raise root.error(
             f"the joints have {nv - 6} degrees of freedom, expected at most {_LARGEST_NV - 6}, "
-            "which take 1 GiB in Pinocchio's Data; make fixed the joints that do not matter"
+            "for which Pinocchio's Data takes 1 GiB; change the type of unimportant joints to fixed"
         )
     root_joint = "root_joint"
     while root_joint in urdf.joints or root_joint in urdf.links:

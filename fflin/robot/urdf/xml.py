@@ -62,7 +62,7 @@ class Element:
         found = self.find_all(tag)
         if len(found) > 1:
             raise found[1].error(
-                f"this is the second <{tag}> in {of}, the first is in line {found[0].line}; keep "
+                f"{of} has a second <{tag}>; the first <{tag}> is in line {found[0].line}; keep "
                 "one of them"
             )
         return found[0] if found else None
@@ -193,7 +193,7 @@ def _explain(error: expat.ExpatError) -> str:
         "unknown encoding": "its declared encoding is unknown; save it as UTF-8",
     }
     return advice.get(
-        what, f"not well-formed XML: {what} at column {error.offset + 1}; correct it there"
+        what, f"not well-formed XML: {what} at column {error.offset + 1}; correct the file there"
     )
 
 

@@ -1,0 +1,288 @@
+"""The compiled loop: eight runs of a plan side by side in lanes, or one run in all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import ClassVar, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fflin.base.process import Progress
+from fflin.base.validation import Array, vector
+from fflin.kernel import loop
+from fflin.kernel.arguments import laid_out, words_of
+from fflin.kernel.compiled import kernel
+from fflin.kernel.tree import LANES, work_space
+from fflin.simulation.conservation import conserved_by
+from fflin.simulation.packing import SLOTS, noise_of, packed
+from fflin.simulation.plan import Plan
+from fflin.simulation.plant import Plant
+from fflin.simulation.run import STOPS, Recording, ending_of, go, stop_conditions, stop_of
+
+_MEMORY = 2**22  # [bytes] of rows that are there at a time
+_SPAN = 4096  # steps between looks at Ctrl-C
+
+# Values of runs (N, size) by the names of arrays of the loop, see `Dispersions.in_lanes`.
+Runs: TypeAlias = Mapping[str, Array]
+
+
+def noise_generator(seed: float) -> np.random.Generator:
+    """Return the generator of the noise of a run."""
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
+
+
+def noises(plan: Plan, size: int, step: int, last: int) -> tuple[NDArray[np.intp], Array]:
+    """Return the samples (k,) from a step up to another, and the policy's noise (k, size)."""
+    times, noise = plan.times, noise_of(plan)
+    at = np.arange(-(-step // times.sample), -(-last // times.sample))
+    rows = np.zeros((len(at), size))
+    for row, t in zip(rows, (at * times.sample * times.dt).tolist(), strict=True):
+        if noise:
+            row[:] = vector("noise(t)", noise(t), size, "one value for each output")
+    return at, rows
+
+
+class Statistics(Protocol):
+    """What is kept of eight parallel runs, slice by slice."""
+
+    FIELDS: ClassVar[tuple[str, ...]]  # names of the outcomes
+    every: int  # steps from one row to the next
+    span: int  # steps between checks of `over`
+
+    @property
+    def over(self) -> NDArray[np.bool_]:
+        """Which runs (LANES,) may end before their time."""
+
+    def reset(self) -> None:
+        """Begin with eight other runs."""
+
+    def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
+        """Add the rows (count, LANES, ..) of q, nu, u, momentum and centre of mass.
+
+        They begin at step `first`. `raw` (count * width, LANES) holds the same. A row may be added
+        again.
+        """
+
+    def outcome(self, done: int, stop: Array) -> dict[str, Array]:
+        """Return the outcomes of the runs after so many steps; `stop` are indices into STOPS."""
+
+
+class LaneLoop:
+    """The compiled loop over a plan, with arrays of its own: not to be shared by threads.
+
+    `parts` are the arguments of the loop, in lanes. A row consists of q, nu, u, momentum and centre
+    of mass, at `columns`.
+    """
+
+    def __init__(self, plan: Plan, plant: Plant, runs: Runs | None = None) -> None:
+        if runs and "delay" in runs:  # so that there is room for the latest
+            latest = int(runs["delay"].max())
+            plan = replace(plan, times=plan.times._replace(delay=latest))
+        parts, stop = packed(plan, plant), stop_conditions(plan)
+        law = parts.law
+        if runs and "seed" in runs and len(law.added) == len(law.y):
+            law = law._replace(added=np.zeros(SLOTS * len(law.y)))
+        if runs:  # all are given with the base on the side of the chart where this is positive
+            stop = stop._replace(sign=[abs(stop.sign[0])])
+        parts = parts._replace(law=law, stop=parts.stop._replace(sign=stop.sign))
+        self._plan, self._state = plan, plant.state
+        self._ending, self._noisy = ending_of(plan, stop), len(law.added) > len(law.y)
+        # The arrays in lanes, each with a column of its initial values.
+        self._fresh: list[tuple[Array, Array]] = []
+        self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self._fresh.append(pair))
+        self._words = words_of(self.parts, loop.ARGUMENTS)
+        self._work = work_space(self.parts.robot.layout.size)
+        self._advance = kernel("loop", "advance", "the loop of eight runs at a time")
+        robot, point = self.parts.robot, self.parts.point
+        ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3]).tolist()
+        self.width, self.steps, self.done = ends[-1], plan.times.steps, 0
+        self.columns = [slice(first, end) for first, end in pairwise([0, *ends])]
+        self._of_run = {
+            **{"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay},
+            **{key: getattr(robot.tree, key) for key in ("bodies", "fixed")},
+            **{key: getattr(robot.loads, key) for key in robot.loads._fields},
+            **robot.faults._asdict(),
+        }
+
+    def rows(self, most: int) -> Array:
+        """Return room for so many rows or for fewer, that do not fill the memory."""
+        return work_space(max(1, min(most, _MEMORY // (8 * LANES * self.width))) * self.width)
+
+    def advance(self, clock: NDArray[np.intp], last: int, every: int, rows: Array) -> None:
+        """Go on up to a step, see `kernel.loop.advance`."""
+        self._advance(self._words, clock, last, every, rows, self._work)
+
+    def split(self, raw: Array) -> list[Array]:
+        """Return what rows hold, each (rows, LANES, size)."""
+        by_row = raw.reshape(-1, self.width, LANES).transpose(0, 2, 1)
+        return [by_row[..., part] for part in self.columns]
+
+    # A motion that diverges overflows before it is stopped: that is no reason to warn.
+    @np.errstate(over="ignore", invalid="ignore")
+    def fly(self, statistics: Statistics, out: Runs, runs: Runs | None = None) -> list[str]:
+        """Simulate up to eight runs, the plan's own by default, and return why each was stopped.
+
+        The outcomes of the statistics are written into the rows of `out`.
+        """
+        times, every, runs = self._plan.times, statistics.every, runs or {}
+        steps, point = self.steps, self.parts.point
+        count = len(next(iter(out.values())))
+        of_lane = np.minimum(np.arange(LANES), count - 1)
+        sense = self._begin(runs, of_lane)
+        statistics.reset()
+        space = self.rows(-(-steps // every))
+        span = max(1, min((len(space) // self.width - 1) * every, statistics.span))
+        if self._noisy:
+            span = min(span, SLOTS * times.sample)
+        clock, going, told = np.zeros(1, dtype=np.intp), np.ones(count, dtype=bool), [""] * count
+        bar = Progress(self._plan.progress)
+        try:
+            while clock[0] < steps and going.any():
+                first = int(clock[0])
+                last = min(steps, (first // span + 1) * span)
+                sense(first, last)
+                self.advance(clock, last, every, space)
+                self.done = done = int(clock[0])
+                raw = space[: (-(-done // every) - -(-first // every)) * self.width]
+                if len(raw):
+                    statistics.add(first, self.split(raw), raw)
+                bar.update(done, steps)
+                v = self._state.spread(point.nu.T)
+                for lane in going.nonzero()[0]:
+                    told[lane] = self._ending(done * times.dt, point.q[:, lane], v[lane])
+                stop = np.array([float(stop_of(each)) for each in told])
+                ending = going & ((stop > 0.0) | (done == steps) | statistics.over[:count])
+                if not ending.any():
+                    continue
+                self._end(statistics, ending, stop[of_lane], out)
+                going &= ~ending
+                # What has ended would stop the others: it goes on as one of them.
+                if going.any():
+                    over = ~going[of_lane]
+                    for array, _ in self._fresh:
+                        array[:, over] = array[:, [going.argmax()]]
+        finally:
+            bar.close()
+        return told
+
+    def _begin(self, runs: Runs, of_lane: NDArray[np.intp]) -> Callable[[int, int], None]:
+        """Write what the runs begin with, and return what writes the errors of their sensors."""
+        for array, initial in self._fresh:
+            array[:] = initial
+        for name, values in runs.items():
+            if name in self._of_run:
+                self._of_run[name][:] = values[of_lane].T
+        robot, kept = self.parts.robot, self.parts.reference
+        mass = robot.tree.bodies[::10].sum(axis=0)
+        kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * robot.gravity[:, None]
+        kept.start[9:], self.done = self.parts.point.q[:3], 0
+        return self._sensors(runs, of_lane)
+
+    def _sensors(self, runs: Runs, of_lane: NDArray[np.intp]) -> Callable[[int, int], None]:
+        """Return what writes the errors of all that is sensed from a step up to another."""
+        law, size = self.parts.law, len(self.parts.law.y)
+        rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
+        nothing = np.zeros((LANES, size))
+        bias, deviation = (runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise"))
+        rows[:] = bias
+        draws = [noise_generator(seed) for seed in runs["seed"][of_lane]] if "seed" in runs else []
+
+        drawn = 0
+
+        def sense(step: int, last: int) -> None:
+            nonlocal drawn
+            if drawn == last:  # some of the others ended on the way
+                return
+            drawn = last
+            k, values = noises(self._plan, size, step, last)
+            rows[k % SLOTS] = values[..., None] + bias
+            for lane, normal in enumerate(draws):
+                random = normal.standard_normal(values.shape)
+                rows[k % SLOTS, :, lane] += deviation[:, lane] * random
+
+        return sense if self._noisy else lambda *_: None
+
+    def _end(
+        self, statistics: Statistics, ending: NDArray[np.bool_], stop: Array, out: Runs
+    ) -> None:
+        """Write the outcomes of the runs that end after the steps that are done."""
+        count = len(ending)
+        diverged = (stop == STOPS.index("diverged"))[:count]
+
+        def write(chosen: NDArray[np.bool_]) -> None:
+            for name, values in statistics.outcome(self.done, stop).items():
+                out[name][chosen] = values[:count][chosen]
+
+        if (ending & diverged).any():
+            write(ending & diverged)
+        if (ending & ~diverged).any():
+            # The last state is added, except if it diverged and is not finite.
+            last = self.last_row()
+            statistics.add(self.done, self.split(last), last)
+            write(ending & ~diverged)
+
+    def last_row(self) -> Array:
+        """Return the row (width, LANES) of the step that was done last."""
+        point, kept = self.parts.point, self.parts.reference
+        conserved = kept.start[:9] + kept.sums[:9]
+        conserved[6:] += self.done * self._plan.times.dt * kept.per_mass * kept.start[:3]
+        return np.vstack((point.q, point.nu, self.parts.stages.u, conserved))
+
+
+class LaneRows:
+    """Rows of some runs of a loop, every so many steps, and how they end.
+
+    The rows of run k before its end are ``kept[:counts[k], :, k]``, with the columns of the loop.
+    """
+
+    FIELDS: ClassVar[tuple[str, ...]] = ("steps", "last")
+    span = _SPAN
+    over = np.zeros(LANES, dtype=bool)
+
+    def __init__(self, loop: LaneLoop, every: int, count: int) -> None:
+        self.every, self._count = every, count
+        self.kept = np.empty((loop.steps // every + 2, loop.width, count))
+        self.ends = {"steps": np.zeros(count), "last": np.zeros((count, loop.width))}
+
+    @property
+    def counts(self) -> list[int]:
+        """Numbers of rows before the ends of the runs."""
+        return [-(-int(steps) // self.every) for steps in self.ends["steps"]]
+
+    def reset(self) -> None:
+        """Begin with other runs."""
+
+    def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
+        """Keep the rows, see `Statistics`."""
+        begin, self._next = -(-first // self.every), -(-first // self.every) + len(rows[0])
+        by_row = np.concatenate(rows, axis=2)[:, : self._count]
+        self.kept[begin : self._next] = by_row.transpose(0, 2, 1)
+
+    def outcome(self, done: int, stop: Array) -> dict[str, Array]:
+        """Return the step at which runs end, and the row that was added last."""
+        last = self.kept[self._next - 1].T
+        return {"steps": np.full(self._count, float(done)), "last": last}
+
+
+def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
+    """Run a plan, or the one of its dispersed `runs`, by the compiled loop."""
+    every, dt, loop = plan.times.every, plan.times.dt, LaneLoop(plan, plant, runs)
+    rows = LaneRows(loop, every, 1)
+    try:
+        [stopped] = loop.fly(rows, rows.ends, runs)
+    except KeyboardInterrupt:
+        if not loop.done:
+            raise
+        stopped = f"interrupted at t = {loop.done * dt:g} s"
+    if runs is None and not np.isfinite(loop.parts.stages.u).all():
+        # The loop in Python raises the error that names the command.
+        return go(plan, plant, conserved_by(plant.robot, plan.q, plant.field))
+    count = -(-loop.done // every)
+    t = np.append(every * np.arange(count) * dt, loop.done * dt)
+    count += not stopped.startswith(("diverged", "interrupted"))
+    q, nu, u, momentum, center = (rows.kept[:count, part, 0] for part in loop.columns)
+    v = plant.state.spread(nu)
+    return Recording(t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled")
