@@ -75,8 +75,8 @@ def decoded(suffix: str, content: bytes) -> tuple[Record, bool]:
 
 
 @contextmanager
-def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn what is raised while a file is read into one `FileError`."""
+def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
+    """Turn errors in reading a file that was saved by a program into one `FileError`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of headers that damage makes look old
@@ -88,7 +88,7 @@ def reading(path: Path, what: str) -> Iterator[None]:
     except Exception as error:  # each decoder has its own dozen
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
             raise NoRoomError(f"{shown(path)}: does not fit into memory") from None
-        raise FileError(f"{shown(path)}: not a {what} saved by fflin ({reason(error)})") from None
+        raise FileError(f"{shown(path)}: not a {what} saved by {by} ({reason(error)})") from None
 
 
 def require_finite(record: Mapping[str, Any]) -> None:

@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.names import joints_by_name
-from fflin.base.validation import Array, as_double, number, whole
+from fflin.base.validation import Array, as_double, instance, number, whole
 from fflin.batch.rows import checked_configurations, follow_rows
 from fflin.dynamics.points import configuration
 from fflin.robot.joints import Joint
@@ -227,8 +227,8 @@ def random_configurations(
     UnknownNameError
         If a joint does not exist.
     InputError
-        If the count or seed is not a whole number, a range is empty, or a prismatic joint has
-        neither limits nor a range.
+        If the count or seed is not a whole number, a range is empty, or a prismatic joint has no
+        limits and no range is given.
 
     Examples
     --------
@@ -250,8 +250,7 @@ def random_configurations(
 
 def as_configurations(robot: Robot, q: Any) -> Configurations:
     """Return the points that `sweep` is given as rows of this robot."""
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot has type {type(robot).__name__}, expected a fflin.Robot")
+    instance("robot", robot, Robot, "a fflin.Robot")
     if isinstance(q, GivenConfigurations):  # checked already
         return q
     if not isinstance(q, Grid | RandomConfigurations):

@@ -7,7 +7,6 @@ import pinocchio as pin
 
 import fflin.robot.inputs as kinds
 from fflin.base.errors import InputError
-from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.names import ANGULAR, LINEAR
@@ -97,13 +96,6 @@ class Actuation:
         if not self.held:
             return u
         return chart.to_base(self.held, u[..., None])[..., 0]
-
-    def rows_in_base_axes(self, q: Array, u: Array) -> Array:
-        """Return rows u (N, nu) in base axes at valid configurations (N, nq), at any turn."""
-        if not self.held:
-            return u
-        R = self._state.origin.rotation @ rotation_matrices(q[:, 3:7])
-        return self.in_base_axes(Chart(q[:, 3:6], q[:, 6:7], R), u)
 
     def turn_columns(self, chart: Chart, by_u: Array) -> None:
         """Convert derivatives (.., k, nu) over `in_base_axes` to those over u: F_u^T of (4.7)."""

@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.names import by_name, input_keys, rates_by_name
-from fflin.base.validation import Array, numbers, placement
+from fflin.base.validation import Array, instance, numbers, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.fields import combined
@@ -52,8 +52,7 @@ def configuration(
            0.        , 1.        , 1.        , 0.        , 0.92106099,
            0.38941834, 1.        , 0.        ])
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot has type {type(robot).__name__}, expected a fflin.Robot")
+    instance("robot", robot, Robot, "a fflin.Robot")
     q = pin.neutral(robot.model)
     if base is not None:
         root = robot.model.jointPlacements[ROOT]

@@ -123,7 +123,7 @@ class Flow:
         pairs = zip(self._q[k], steps, strict=True)
         q = np.array([pin.integrate(self._model, *pair) for pair in pairs])
         u = np.array([self._input(*each) for each in placements])
-        u = self._aba.actuation.rows_in_base_axes(q, u)
+        u = self._in_base_axes(q, u)
         return q, np.einsum("ij,ijk->ik", powers, speeds[k]), u
 
     def input(self, t: float) -> Array:
@@ -135,7 +135,8 @@ class Flow:
         return u if self._held else u + fraction * (self._u[k + 1] - u)
 
     def _in_base_axes(self, q: Array, u: Array) -> Array:
-        return self._aba.actuation.rows_in_base_axes(q[None], u[None])[0]
+        actuation, state = self._aba.actuation, self._aba.state
+        return actuation.in_base_axes(state.charts(q), u) if actuation.held else u
 
     def rate(self, q: Array, v: Array, u: Array) -> Array:
         """Return dv/dt (nv,) under inputs in the frame's axes."""

@@ -156,7 +156,8 @@ class Trajectory(Design):
     @cached_property
     def u_base(self) -> Array:
         """Inputs (N, nu) just after each knot; inputs on the base are in base axes."""
-        return frozen(Actuation(self._state).rows_in_base_axes(self.q, self.u))
+        state = self._state
+        return frozen(Actuation(state).in_base_axes(state.charts(self.q), self.u))
 
     @property
     def residual(self) -> Array:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
-from fflin.base.errors import InputError, ModelError, unknown
+from fflin.base.errors import InputError, ModelError, require_known
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
 from fflin.base.toml_file import NAME, NUMBER, Kind
 from fflin.base.validation import dimension, number, numbers
@@ -43,9 +43,7 @@ def checked_fields(fields: Mapping[str, Any], scope: Scope) -> dict[str, Any]:
             "dry friction is not differentiable at rest, so a linear model cannot contain it; use "
             "damping, or add the friction in a simulation"
         )
-    for name in fields:
-        if name not in FIELDS:
-            raise unknown("field of a robot", name, FIELDS)
+    require_known("field of a robot", fields, FIELDS)
     return {name: FIELDS[name].check(value, scope) for name, value in fields.items()}
 
 
@@ -64,15 +62,15 @@ def checked_inputs(
     value = [one for item in value for one in _spread(item, find, joints, passive)]
     if not value:
         raise InputError("all inputs are torques of passive joints; add another input")
-    # What has a name is told by that, all else by what it is but for its limits.
-    named = [item for item in value if isinstance(item, kinds.WrenchInput)]
-    told: list[Any] = [
-        item.name for item in named if isinstance(item, kinds.Thruster) and item.name
-    ]
-    told += [name for name, _ in named_wheels(value)]
-    told += [replace(item, min=None, max=None) for item in value if item not in named]
-    for each in told:
-        if told.count(each) > 1:
+    # Thrusters and wheels differ by their names, other inputs by what they are but for limits.
+    identities: list[str | Input] = [name for name, _ in named_wheels(value)]
+    for item in value:
+        if isinstance(item, kinds.Thruster):
+            identities += [item.name] if item.name else []
+        elif not isinstance(item, kinds.WrenchInput):
+            identities.append(replace(item, min=None, max=None))
+    for each in identities:
+        if identities.count(each) > 1:
             raise InputError(f"input {each} is given twice; remove one of the two")
     return tuple(value)
 
@@ -203,8 +201,7 @@ def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, An
 def _weights(value: Any, scope: Scope) -> dict[str, Any]:
     """Return the weights of a robot's regulator, by names of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)
-    if str(weights.get("rule", RULES[0])) not in RULES:
-        raise unknown("rule of weights", weights["rule"], RULES)
+    require_known("rule of weights", [str(weights.get("rule", RULES[0]))], RULES)
     states, keys = state_keys(scope.joints), _input_keys(scope.inputs)
     parts = {
         "q": ("state", states),
@@ -246,9 +243,7 @@ def checked_passive(
 def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         raise InputError(f"{what} is {value!r}, expected a table with the keys {', '.join(known)}")
-    for name in value:
-        if name not in known:
-            raise unknown(f"part of {what}", name, known)
+    require_known(f"part of {what}", value, known)
     return dict(value)
 
 

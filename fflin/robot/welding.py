@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError, require_known
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
 from fflin.robot.equipment.assembly import with_inputs
@@ -83,8 +83,7 @@ def locked_model(
     movable = list(model.names)[ROOT + 1 :]
 
     def found(name: str) -> str:
-        if name not in movable:
-            raise unknown("joint to lock", name, movable)
+        require_known("joint to lock", [name], movable)
         return name
 
     given: dict[str, float | None] = {}
@@ -169,14 +168,14 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         body = other.model.inertias[ROOT]
         at_center = pin.SE3(np.eye(3), body.lever)
         both["links"][prefix] = LinkMass(body.mass, body.inertia, at_center)
-    told = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
+    identity = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
     weighed = b"".join(each.toDynamicParameters().tobytes() for each in model.inertias.tolist())
     whole = replace(
         robot,
         model=model,
         _unequipped=None,
         name=f"{robot.name}+{other.name}",
-        urdf_sha256=sha256(told.encode() + weighed).hexdigest(),
+        urdf_sha256=sha256(identity.encode() + weighed).hexdigest(),
         joints=tuple(sorted((*own, *theirs), key=lambda each: each.idx_v)),
         followers=tuple(followers),
         attached=(*robot.attached, (prefix, other)),

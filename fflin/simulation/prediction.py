@@ -144,7 +144,7 @@ def _states(predictor: Predictor, plan: Any, x: Array, steps: int) -> Array:
             e = lin.A @ e + lin.B @ (u - u0) + lin.f0
         return np.array([*rows, e]) + x0
 
-    held = lin.discretize(dt)
+    held = lin.discretize(dt) if sample else lin
 
     def slope(_: int, e: Array) -> Array:
         rate: Array = lin.A @ e + lin.B @ (channel.ask(e) - u0) + lin.f0

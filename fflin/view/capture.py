@@ -33,7 +33,7 @@ _ARGUMENTS = (
     *("--disable-dev-shm-usage", "--disable-extensions"),
 )
 
-# It is told what to do through descriptor 3 and answers through 4. It ends when they are closed,
+# It takes commands on descriptor 3 and answers on 4. It ends when they are closed,
 # so that nothing of it outlives this process, however that ends.
 _WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 

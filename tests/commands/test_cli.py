@@ -75,7 +75,7 @@ def test_warnings_are_one_line_each_on_stderr_and_in_info():
         capture_output=True,
         text=True,
     )
-    words = "planar_detumble: damping not modelled: 'joint_1', 'joint_2', 'joint_3'"
+    words = "planar_detumble: damping unused: 'joint_1', 'joint_2', 'joint_3'"
     assert done.returncode == 0
     assert done.stderr.startswith("fflin: warning: ") and done.stderr.count("\n") == 1
     assert words in done.stderr

@@ -23,7 +23,7 @@ from fflin.robot.urdf.joints import (
     resolve_mimics,
 )
 from fflin.robot.urdf.links import INERTIA, Link, Pose, inertia_notes
-from fflin.robot.urdf.xml import Element, enumerated, named, parse, told
+from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
 _SIZE_LIMIT = 64 * 2**20
 
@@ -96,7 +96,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     urdf = read_description(root, prune)
     mimics = resolve_mimics(urdf.joints)
     model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
-    notes += told(root)
+    notes += notes_of(root)
     notes += inertia_notes(urdf.links.values(), model, path.stem)
 
     named_meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
@@ -106,7 +106,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
     resistances = {"damping": ("damping", damping), "Coulomb friction": ("friction", friction)}
     advice = [
-        Advice(key, tuple(values), f"{path.stem}: {what} not modelled: {enumerated(list(values))}")
+        Advice(key, tuple(values), f"{path.stem}: {what} unused: {enumerated(list(values))}")
         for what, (key, values) in resistances.items()
         if values
     ]
@@ -117,7 +117,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     for zero, of in unlimited.items():
         if zero:
             joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
-            text = f"{path.stem}: {', '.join(of)} 0 of {joints} taken as unlimited (or passive)"
+            text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
             advice.append(Advice("passive", zero, text))
     weights = {name: link for name, link in urdf.links.items() if link.mass}
     of_links, said = (weights, tuple(urdf.joints)), (tuple(notes), tuple(advice))
