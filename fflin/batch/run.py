@@ -103,10 +103,12 @@ def run_chunks(
     threads: int = 1,
     progress: Progress | None = None,
     upto: int | None = None,
+    all_needed: bool = False,
 ) -> list[Done]:
     """Compute the missing chunks of a store, save the results, and return failed chunks."""
     # `rows(start, stop)` is a named tuple, which the store keeps of what it has a name for. Only
     # chunks that begin before `upto` are done; threads are of this process, without an executor.
+    # If all chunks are needed, the first that fails is the last.
     size = store.chunk
     spans = [Span(at, min(at + size, store.count)) for at in range(0, store.count, size)]
     left = [span for span in spans if not store.finished(*span)]
@@ -123,6 +125,8 @@ def run_chunks(
     ):
         if done.result is None:
             failed.append(done)
+            if all_needed:
+                break
         else:
             store.write(*done.span, {**rows(*done.span)._asdict(), **done.result.arrays})
             notes += done.result.notes
