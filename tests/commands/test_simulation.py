@@ -295,6 +295,7 @@ def test_three_wheels_settle_the_attitude(tmp_path, options):
     assert np.abs(motion.u).max() > 1e-4 and np.abs(motion.momentum).max() < 1e-12
 
 
+@pytest.mark.compiled
 @pytest.mark.exhaustive
 def test_a_target_velocity_is_the_points_and_is_held(tmp_path):
     def speeds(*options):
