@@ -94,7 +94,7 @@ class Mode(FrozenArrays):
 
     @property
     def time_constant(self) -> float:
-        """Time constant [s] in which the mode decays to 1/e, or grows by e if it is unstable."""
+        """Time constant [s] of decay by a factor e, or of growth for an unstable mode."""
         return float("inf") if self.pole.real == 0.0 else 1.0 / abs(self.pole.real)
 
 

@@ -48,12 +48,13 @@ class ReducedModel(LinearModel):
     T : ndarray (nx, nz)
         Map from the reduced state to the full state.
     S : ndarray (nz, nx)
-        Map from the full state to the reduced state; it selects the states that have the same
+        Map from the full state to the reduced state, which selects the states with the same
         names.
     momenta : ndarray (k, nx)
         Rows L1 of the conserved momenta, which are zero in the reduced model.
     coordinates : ndarray (k, nx)
-        Rows L2 of the coordinates whose rates are the momenta; they are zero in the reduced model.
+        Rows L2 of the coordinates whose rates are the momenta. These coordinates are zero in the
+        reduced model.
     margin : Margin
         Certainty of the rank decision on the conserved momenta, as in `Controllability`.
     notes : tuple of str

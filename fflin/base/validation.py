@@ -45,6 +45,16 @@ def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
     return array
 
 
+def shaped(name: str, value: ArrayLike, shape: tuple[int, ...], hint: str = "") -> Array:
+    """Return a new array of finite native floats of a shape, or raise `InputError`."""
+    array = as_double(name, value)
+    if array.shape != shape:
+        raise InputError(f"{name} has shape {array.shape}, expected {shape}{hint}")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} has entries that are NaN or infinite, expected finite numbers")
+    return array
+
+
 def number(name: str, value: Any) -> float:
     """Return a finite float, or raise `InputError` that says what was given."""
     refuse_masked(name, value)

@@ -141,7 +141,7 @@ def monte_carlo(
         Number of runs per chunk, a multiple of 8. If `until` is given, this number must divide 256.
     histories : int, optional
         Number of evenly spaced times at which the errors and inputs of each run are recorded. The
-        bands of `plot_campaign` need them.
+        bands of `plot_campaign` require histories.
     out : str or Path, optional
         File to write, .h5 or .npz. Unfinished results are kept in NAME.part. After a crash, the
         same call resumes from the intact chunks in NAME.part. If a .h5 file already contains all

@@ -90,8 +90,9 @@ def mpc(
     Returns
     -------
     Mpc or TrajectoryMpc
-        Policy for `simulate` and `monte_carlo`. Its method ``matrices(e)``, or along a trajectory
-        ``matrices(e, t)``, returns the quadratic program at a state error, for other solvers.
+        Policy for `simulate` and `monte_carlo`. The method ``matrices(e)`` of the policy
+        (``matrices(e, t)`` along a trajectory) returns the quadratic program at a state error e,
+        for other solvers.
 
     Raises
     ------

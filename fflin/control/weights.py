@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
-from fflin.base.validation import Array, dimension, instance, number, vector
+from fflin.base.validation import Array, dimension, instance, number, positive, shaped, vector
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 from fflin.linear.sampling import held_cost
@@ -116,19 +116,12 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
     return np.diag(diagonal)
 
 
-def cross_weight(what: str, value: ArrayLike, rows: int, columns: int) -> Array:
-    """Return a matrix (rows, columns)."""
-    if dimension(what, value) != 2 or np.shape(value) != (rows, columns):
-        raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, {columns})")
-    return vector(what, np.ravel(value), rows * columns, "its entries").reshape(rows, columns)
-
-
 def columns(what: str, value: ArrayLike, rows: int) -> Array:
     """Return a matrix (rows, k) with k >= 1."""
     shape = np.shape(value) if dimension(what, value) == 2 else ()
     if not shape or not shape[1]:
         raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, k) with k >= 1")
-    return cross_weight(what, value, rows, shape[1])
+    return shaped(what, value, (rows, shape[1]))
 
 
 def require_semidefinite(
@@ -149,14 +142,14 @@ def cost_weights(
     R = weight("R", R, input_keys(of), definite=True)
     if N is None:
         return Q, R, None
-    cross = cross_weight("N", N, len(Q), len(R))
+    cross = shaped("N", N, (len(Q), len(R)))
     require_semidefinite("Q - N R^-1 N'", Q - cross @ np.linalg.solve(R, cross.T), of.state_names)
     return Q, R, cross
 
 
 def _checked_matrix(what: str, value: ArrayLike, names: Sequence[str], definite: bool) -> Array:
     size = len(names)
-    matrix = cross_weight(what, value, size, size)
+    matrix = shaped(what, value, (size, size))
     skew = np.abs(matrix - matrix.T)
     if skew.max() > _ROUNDING * np.abs(matrix).max():
         i, j = np.unravel_index(int(skew.argmax()), skew.shape)
@@ -170,12 +163,6 @@ def _checked_matrix(what: str, value: ArrayLike, names: Sequence[str], definite:
     except np.linalg.LinAlgError:
         require_semidefinite(what, matrix, names, definite)
     return matrix
-
-
-def named_weights(what: str, values: Mapping[str, float], names: Sequence[str]) -> dict[int, float]:
-    """Return {index: value} of {name, group or pattern: value}."""
-    checked = {name: number(f"weight of '{name}'", value) for name, value in values.items()}
-    return by_name(what, checked, names)
 
 
 class SampledCost(NamedTuple):
@@ -237,9 +224,7 @@ def sampled_cost(
     """
     if not isinstance(lin, LinearModel) or lin.dt:
         raise InputError("lin must be a continuous LinearModel; give the model that was sampled")
-    h = number("dt", dt)
-    if h <= 0.0:
-        raise InputError(f"dt is {h:g} s, expected a positive sampling time")
+    h = positive("dt", dt, "s")
     Q, R, cross = cost_weights(lin, Q, R, N)
     nx, nu = lin.B.shape
     F, W = np.zeros((2, nx + nu, nx + nu))
@@ -256,7 +241,8 @@ def sampled_cost(
 def _diagonal(
     what: str, values: Mapping[str, float], names: Sequence[str], *, complete: bool
 ) -> Array:
-    found = named_weights(f"entry of {what}", values, names)
+    checked = {name: number(f"weight of '{name}'", value) for name, value in values.items()}
+    found = by_name(f"entry of {what}", checked, names)
     if complete and len(found) < len(names):
         missing = next(name for index, name in enumerate(names) if index not in found)
         raise InputError(f"{what} has no value for {missing}; give a value for each entry")

@@ -90,11 +90,11 @@ def simulate(
     duration : float, optional
         Simulated time [s]; by default the duration of the followed trajectory.
     dt : float, optional
-        Step [s]; by default 0.01, or less if the loop's fastest pole or the samples require it. If
-        the default step diverges, the simulation is repeated with a quarter of it, up to three
-        times, and `Motion.notes` report this. A simulation with an event, a callback, a
-        disturbance or a custom Python policy is not repeated, because such a function may have an
-        internal state. If the input is neither sampled nor delayed, the step is adjusted to
+        Step [s]; by default 0.01, or less if the loop's fastest pole or the samples require a
+        shorter step. If the default step diverges, the simulation is repeated with a quarter of
+        it, up to three times, and `Motion.notes` report this. A simulation with an event, a
+        callback, a disturbance or a custom Python policy is not repeated, because such a function
+        may have an internal state. For continuous policies without delay, the step is adjusted to
         divide the duration.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
@@ -146,9 +146,10 @@ def simulate(
         Whether to show a progress bar on stderr; by default on a terminal, for long runs.
     engine : {"python", "compiled"}, optional
         Engine that runs the loop. The default is Python, except that a run of more than 20,000
-        steps uses the compiled engine if it has already been compiled. The compiled engine needs
-        numba. The compiled engine supports no orbits, and no policies, events, callbacks or
-        disturbances written in Python. Both engines agree to machine precision.
+        steps uses the compiled engine if this engine has already been compiled. The compiled
+        engine needs numba. The compiled engine supports no orbits, and no policies, events,
+        callbacks or disturbances written in Python. The Python engine and the compiled engine
+        agree to machine precision.
 
     Returns
     -------

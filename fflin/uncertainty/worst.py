@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
-from fflin.base.validation import Array, as_double
+from fflin.base.validation import Array, shaped
 from fflin.control.margins import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.singular_value import largest_bound
@@ -103,9 +103,7 @@ class Worst:
 @in_one_thread
 def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     """Do what `Uncertain.worst` does."""
-    K = as_double("gain", getattr(gain, "K", gain))
-    if K.shape != lft.B2.T.shape:
-        raise InputError(f"gain has shape {K.shape}, expected {lft.B2.T.shape} (nu, nx)")
+    K = shaped("gain", getattr(gain, "K", gain), lft.B2.T.shape, " (nu, nx)")
     size, loops = len(lft.repeats), Loops(lft, K)
     middle = np.zeros((1, size))
     if loops.undamped(middle)[0] >= 0.0:
