@@ -224,7 +224,7 @@ def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
     robot = fflin.load("cubesat").replace(inputs=added)
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin)
-    assert re.search("set by the speed of wheel_[12]$", gain.weights)
+    assert re.search("limited by the speed of wheel_[12]$", gain.weights)
     turn = pin.SE3(pin.exp3(np.radians(30.0) * unit(axis)), np.zeros(3))
     motion = fflin.simulate(
         robot,
