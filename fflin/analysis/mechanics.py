@@ -112,7 +112,7 @@ class SecondOrder:
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether springs are symmetric, and dampers are and all take energy, or all give it."""
+        """Whether springs and dampers are symmetric, and all dampers have the same sign."""
         units = np.outer(self.size, self.size)
         for matrix in (self.K.values / units, self.D.values / units):
             if np.abs(matrix - matrix.T).max(initial=0.0) > _SYMMETRIC * np.abs(matrix).max():
@@ -122,7 +122,7 @@ class SecondOrder:
 
     @cached_property
     def poles(self) -> tuple[Values, Margin]:
-        """The poles that are not zero, one of each pair, as eigenvalues approximate them."""
+        """Approximate nonzero poles, one of each conjugate pair."""
         rigid, margin = self._null(self.K, self.D)
         unloaded, other = self._null(self.K)
         R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
@@ -198,7 +198,7 @@ def rates_of_positions(X: Array) -> Array:
 
 @dataclass(frozen=True)
 class ConservedMomenta:
-    """The momenta that no input, spring or damper changes, and what follows from them."""
+    """Conserved momenta, which no input, spring or damper changes, and the kept coordinates."""
 
     # W (k, nv) with W M nu conserved, in echelon form: a unit vector is one coordinate's momentum.
     weights: Array

@@ -47,14 +47,14 @@ Progress = Callable[[int, int], object]
 
 
 class Span(NamedTuple):
-    """The rows of a chunk, start up to but not including stop."""
+    """Rows of a chunk, from start to stop - 1."""
 
     start: int
     stop: int
 
 
 class ChunkResult(NamedTuple):
-    """The result of a chunk: its arrays by name, and the warnings on the way."""
+    """Result of a chunk: its arrays by name, and its warnings."""
 
     arrays: dict[str, Array]
     notes: list[str]

@@ -39,7 +39,7 @@ class MemoryStore:
         self._written: set[int] = set()
 
     def finished(self, start: int, stop: int) -> bool:
-        """Whether a chunk is there."""
+        """Return whether a chunk is in the file."""
         return start in self._written
 
     def read(self, stop: int) -> dict[str, Array]:
@@ -148,7 +148,7 @@ class FileStore:
             raise FileError(f"{self.part}: cannot be written: {reason(error)}") from None
 
     def finished(self, start: int, stop: int) -> bool:
-        """Whether a chunk is there, and is what was written."""
+        """Return whether a chunk is in the file and matches its checksum."""
         with self._readable():
             kept = self._file[CHUNK_CHECKSUMS][start // self.chunk]
             return bool(kept.any()) and kept.tobytes() == chunk_checksum(

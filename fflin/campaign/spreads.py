@@ -190,7 +190,7 @@ def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
 
 
 def is_closed_form(inverse: Callable[[Array], Array]) -> bool:
-    """Whether an inverse is one of this module; those of SciPy may take long."""
+    """Return whether an inverse is from this module; inverses of SciPy may be slow."""
     return isinstance(inverse, partial) or inverse is whole_number
 
 

@@ -177,13 +177,13 @@ def unreachable(W: Array) -> dict[str, list[str]]:
 
 
 def gives_every_wrench(W: Array, pushing: NDArray[np.bool_]) -> bool:
-    """Whether columns W (6, k), of which some only push, together give every wrench."""
+    """Return whether columns W (6, k), some of them only positive, produce every wrench."""
     both = np.hstack((W, -W[:, ~pushing]))
     return not any(unreachable(both).values())
 
 
 def thrusters_give_every_wrench(robot: Robot) -> bool:
-    """Whether a robot has thrusters that, with what else acts on its base, push it every way."""
+    """Return whether thrusters and other base inputs of a robot can push in every direction."""
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust")
     if thrusters is None:

@@ -201,7 +201,7 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
 
 
 class Channel:
-    """The way of the commands of `law` to the inputs, by the rules of the kernel.
+    """Channel from the commands of `law` to the inputs, by the rules of the kernel.
 
     `law` is called with the arguments of `begin` or `ask`. `speeds` (k,) of these arguments are
     the speeds of the wheels whose speed is limited.
@@ -236,7 +236,7 @@ class Channel:
 
     @property
     def continuous(self) -> bool:
-        """Whether the law is asked at every stage."""
+        """Whether the law is evaluated at every stage."""
         return not self._rules.sample
 
     @property

@@ -25,7 +25,7 @@ Costs: TypeAlias = Callable[[float], tuple[Array, Array]]
 
 
 class Limit(NamedTuple):
-    """The largest bandwidth that a limit leaves, and what limits it."""
+    """Largest bandwidth permitted by a limit, and the name of this limit."""
 
     bandwidth: float
     what: str

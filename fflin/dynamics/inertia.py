@@ -118,7 +118,7 @@ class Inertia:
         )
 
     def _judge(self, coupling: float, M: Array, inverse: Array) -> None:
-        """Refuse or warn of an M whose inverse has lost its digits; name what moves with it."""
+        """Refuse a singular M, or warn of an ill-conditioned M, by coordinate names."""
         name, scale = self._state.robot.name, np.sqrt(np.maximum(M.diagonal(), 0.0))
         scale[scale == 0.0] = 1.0
         lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # or NaN
@@ -213,7 +213,7 @@ def rotor_names(robot: Robot) -> tuple[str, ...]:
 
 
 def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
-    """Whether the body behind a joint stays as it is when the joint turns."""
+    """Return whether the body of a joint is symmetric about the joint axis."""
     if joint.prismatic:
         return False
     pin_joint = robot.model.joints[index]

@@ -44,7 +44,7 @@ _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 class LeastSquares(
     namedtuple("LeastSquares", "least most columns given A Q R b y wanted x s low high state order")
 ):
-    """The x (k,) within `least` and `most` (k,) that makes the sum of columns nearest to a force.
+    """Solve for x (k,) between `least` and `most` (k,) so that columns @ x is nearest to a force.
 
     `columns` has the k columns of an input's unit force, one after the other, and then the force.
     What follows is work space: the `given` columns of a lane; `A`, the same divided by their norm;

@@ -23,7 +23,7 @@ SUMS = 18
 
 
 class MomentumReference(namedtuple("MomentumReference", "start weight per_mass sums")):
-    """What is kept; each array of doubles may have a second axis of eight lanes.
+    """Reference of the conserved quantities; arrays of doubles may have a second axis of lanes.
 
     `start` (12,): momentum, centre of mass, and the point that both are seen from; weight (3,); and
     `sums` (18,): the impulse (6,), and the shift (3,) of the centre of mass beyond the one of its

@@ -44,7 +44,7 @@ class ActuatorFaults(namedtuple("ActuatorFaults", "gain bias until turn")):
 
 
 class Point(namedtuple("Point", "q nu u pushing wrench")):
-    """Where a robot is, q (nq,) and nu (6 + n,) in base axes, and the inputs (nu,) there.
+    """Point of a robot: q (nq,) and nu (6 + n,) in base axes, and the inputs (nu,).
 
     `u` is as it is commanded, `pushing` in base axes; `wrench` (6,) is what the inputs of the last
     acceleration are at the base's origin, moment and force.

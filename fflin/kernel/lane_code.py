@@ -230,7 +230,7 @@ def chosen(typing: Any, left: Any, right: Any, less: Any, other: Any) -> Any:
 
 @intrinsic
 def below(typing: Any, value: Any, bound: Any) -> Any:
-    """Whether a number, or every lane, is less than a bound; not where one is no number."""
+    """Return whether a number, or every lane, is less than a bound; false for NaN."""
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         value, bound = _alike(builder, arguments)

@@ -54,7 +54,7 @@ class Tree(
 
 
 class Layout(namedtuple("Layout", "motion load bias c columns lower held size")):
-    """Where the parts of the kernel's work space begin, beyond those of the tree; its size."""
+    """Offsets of the arrays in the kernel's work space after the tree's arrays, and its size."""
 
 
 class Loads(namedtuple("Loads", "body wrench input stored_body stored stiffness damping")):

@@ -54,7 +54,7 @@ class Joint(NamedTuple):
 
     @property
     def mode(self) -> bool:
-        """Whether it is a degree of freedom of a flexible appendage or of slosh."""
+        """Whether the joint is a degree of freedom of a flexible appendage or of slosh."""
         return self.kind != "joint"
 
     def oscillation(self, stiffness: float, damping: float) -> tuple[float, float]:

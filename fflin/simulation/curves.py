@@ -36,7 +36,7 @@ class Curve(NamedTuple):
 
     @property
     def near(self) -> list[float]:
-        """The limits that the values come near."""
+        """Limits that are close to the values."""
         levels: list[float] = self.limits[np.isfinite(self.limits)].tolist()
         return [level for level in levels if level and (self.values / level).max() >= _NEAR]
 

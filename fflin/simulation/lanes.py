@@ -46,7 +46,7 @@ def noises(plan: Plan, size: int, step: int, last: int) -> tuple[NDArray[np.intp
 
 
 class Statistics(Protocol):
-    """What is kept of eight parallel runs, slice by slice."""
+    """Records of eight parallel runs, slice by slice."""
 
     FIELDS: ClassVar[tuple[str, ...]]  # names of the outcomes
     every: int  # steps from one row to the next
@@ -54,7 +54,7 @@ class Statistics(Protocol):
 
     @property
     def over(self) -> NDArray[np.bool_]:
-        """Which runs (LANES,) may end before their time."""
+        """Mask (LANES,) of the runs that may end early."""
 
     def reset(self) -> None:
         """Begin with eight other runs."""

@@ -101,12 +101,12 @@ class Plan:
 
     @property
     def last_node(self) -> float:
-        """When in a step, of 1, its last stage asks: before a knot at its end where inputs jump."""
+        """Time of the last stage, relative to the step; below 1 if inputs jump at knots."""
         return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
 
     @property
     def repeatable(self) -> bool:
-        """Whether nothing that it calls is a function of the caller's, which may remember."""
+        """Whether the plan calls no user functions, which may have an internal state."""
         bound_anew = self.policy is None or hasattr(self.policy, "bind")
         return bound_anew and not self.events and self.callback is None
 

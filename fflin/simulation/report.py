@@ -138,7 +138,7 @@ def settled_at(sizes: Array) -> NDArray[np.intp]:
 
 
 def is_late(settled: Array | NDArray[np.intp] | int, count: int) -> Any:
-    """Whether errors settle so late in a run of `count` rows that they count as not settled.
+    """Return whether errors settle too late in a run of `count` rows to count as settled.
 
     An error that passes through zero is small for a moment.
     """
@@ -155,12 +155,12 @@ class ErrorHistory(NamedTuple):
 
     @property
     def settled(self) -> int:
-        """The row from which on it has settled; N where it has not."""
+        """First row from which the error is settled; N if the error has not settled."""
         return int(settled_at(self.size))
 
     @property
     def late(self) -> bool:
-        """Whether it has not settled."""
+        """Whether the error has not settled."""
         return bool(is_late(self.settled, len(self.size)))
 
     @property
@@ -310,7 +310,7 @@ def courses(motion: Any) -> list[ErrorHistory]:
 
 
 def pushed(of: Any) -> bool:
-    """Whether of a motion's inputs, or of what else has their names, one is a force on the base."""
+    """Return whether an input of a motion or similar object is a force on the base."""
     return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
 

@@ -20,7 +20,7 @@ Point = tuple[Array, Array]
 
 
 class Shooting:
-    """The knots at times t (N + 1,) as the starts of N motions that are to meet."""
+    """Knots at times t (N + 1,): initial points of N motions with continuity constraints."""
 
     # Steps between configurations and velocities are z = (theta_b, r_b, q_m, nu) (nx,) in base
     # axes, those of the linear models with the rotation vector for twice q_b.

@@ -35,7 +35,7 @@ def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
 
 @dataclass(eq=False, repr=False, slots=True)
 class Element:
-    """One XML element; text between elements is not kept, for URDF has none."""
+    """XML element; text between elements is ignored, because URDF has no such text."""
 
     tag: str  # with its prefix, if any: prefixes need not be bound
     attributes: dict[str, str]
