@@ -285,7 +285,7 @@ def _fastest(
 
 
 def _limits(what: str, room: Mapping[str, float], used: Array, power: float) -> list[_Limit]:
-    """Return what is left of a bandwidth of 1, with a power of which what is used grows."""
+    """Return the factors of the bandwidth at which the inputs reach their limits."""
     return [
         _Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
         for (name, most), size in zip(room.items(), used.tolist(), strict=True)
@@ -294,7 +294,7 @@ def _limits(what: str, room: Mapping[str, float], used: Array, power: float) -> 
 
 
 def _efforts(lin: LinearModel) -> dict[str, float]:
-    """Return what the limits of the inputs leave beside what the point asks for."""
+    """Return the input limits minus the inputs at the operating point."""
     inputs = zip(lin.input_names, lin.u0.tolist(), strict=True)
     return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
 
