@@ -42,7 +42,7 @@ def largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
 
 
 def limits_on(what: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
-    """Return what is left of a bandwidth of 1, with a power of which what is used grows."""
+    """Return the factors of the bandwidth at which the inputs reach their limits."""
     return [
         Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
         for (name, most), size in zip(room.items(), used.tolist(), strict=True)
@@ -51,7 +51,7 @@ def limits_on(what: str, room: Mapping[str, float], used: Array, power: float) -
 
 
 def efforts_left(lin: LinearModel) -> dict[str, float]:
-    """Return what the limits of the inputs leave beside what the point asks for."""
+    """Return the input limits minus the inputs at the operating point."""
     inputs = zip(lin.input_names, lin.u0.tolist(), strict=True)
     return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
 
