@@ -111,7 +111,7 @@ class Plan:
         return bound_anew and not self.events and self.callback is None
 
     def channel(self) -> Channel | None:
-        """Return the way of the law's commands to the inputs, with nothing on it yet."""
+        """Return the channel of the law's commands to the inputs, without pending commands."""
         if self.law is None:
             return None
         return Channel(
@@ -171,7 +171,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
 
 
 def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law | None:
-    """Return the policy bound to the robot, of which nothing but inputs is taken."""
+    """Return the policy bound to the robot, with checked inputs."""
     if policy is None:
         return None
     within = (limits.low, limits.high)

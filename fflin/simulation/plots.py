@@ -99,7 +99,7 @@ def curves(motion: Any, wheels: Mapping[str, float]) -> Iterator[Curve]:
 
 
 def resting_from(motion: Any) -> float | None:
-    """Return the time [s] from which a target that moved stands still; None where none does."""
+    """Return the time [s] from which a moving target is at rest, or None."""
     places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
     if not len(moved) or moved[-1] + 2 >= len(places):

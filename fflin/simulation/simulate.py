@@ -239,7 +239,7 @@ def simulate(
 
 
 def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = None) -> Motion:
-    """Return the motion that a plan leads to, or led to where its run is given."""
+    """Return the motion of a plan, or of a given run of the plan."""
     state, robot = plant.state, plant.robot
     conserved = conserved_by(robot, plan.q, plant.field)
     run = run or carried_out(plan, plant, conserved, engine)
