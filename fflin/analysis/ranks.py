@@ -189,7 +189,7 @@ def image(matrix: Array, tolerance: float) -> tuple[Array, Array]:
 
 
 def unit_columns(matrix: Array) -> Array:
-    """Scale columns to unit length; those that are rounding of the others are left out."""
+    """Scale columns to unit length; omit columns that depend on others within rounding error."""
     sizes = np.linalg.norm(matrix, axis=0)
     real = sizes > 1e2 * EPS * sizes.max(initial=0.0)
     return matrix[:, real] / sizes[real]

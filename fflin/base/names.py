@@ -1,4 +1,4 @@
-"""Names GROUP.ENTRY of states and inputs; groups, entries and patterns that stand for them."""
+"""Names GROUP.ENTRY of states and inputs; groups, entries and patterns that match them."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Run of a job over rows, chunk by chunk, into a store that may already hold some chunks.
+"""Run of a job over rows, chunk by chunk, into a store that may already contain chunks.
 
 Chunks run on threads of this process, or on the workers of an executor; a chunk is repeated if its
 worker dies. This module is independent of the meaning of the rows and of the job's results.
@@ -105,7 +105,7 @@ def run_chunks(
     upto: int | None = None,
     all_needed: bool = False,
 ) -> list[Done]:
-    """Do the chunks that a store has not yet, keep what comes of them, return those that failed."""
+    """Compute the missing chunks of a store, save the results, and return failed chunks."""
     # `rows(start, stop)` is a named tuple, which the store keeps of what it has a name for. Only
     # chunks that begin before `upto` are done; threads are of this process, without an executor.
     # If all chunks are needed, the first that fails is the last.
@@ -272,7 +272,7 @@ class Dispatch:
         return done
 
     def _lost(self, span: Span, reason: str) -> Iterator[Done]:
-        """Put a chunk back whose worker died, or give it up."""
+        """Queue a chunk again whose worker died, or report its failure."""
         if self._attempts[span] < _ATTEMPTS:
             self._waiting.append(span)
         else:

@@ -195,7 +195,7 @@ class FileStore:
 
 
 def _reserve(file: Any, name: str, shape: tuple[int, ...]) -> None:
-    """Create a dataset of doubles whose place in the file is settled and that is not filled."""
+    """Create a dataset of doubles with allocated space and without a fill value."""
     h5py = hdf5()
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_layout(h5py.h5d.CONTIGUOUS)
@@ -215,7 +215,7 @@ def output_path(out: str | Path) -> Path:
 
 
 def part_of(path: Path) -> Path:
-    """Return the file that a result grows in until it is whole, beside what a link leads to."""
+    """Return the path NAME.part of an unfinished result, next to the target of a link."""
     real = Path(os.path.realpath(path)) if os.path.islink(path) else path
     return real.with_name(real.name + ".part")
 

@@ -304,7 +304,7 @@ def _request_of(path: Path) -> str:
 def _found(
     job: CampaignJob, path: Path | None, request: str, header: dict[str, Any]
 ) -> Campaign | None:
-    """Return the campaign of a file that holds all runs of this call; its goals may differ."""
+    """Return the campaign of a file with all runs of this call; its goals may differ."""
     if path is None or path.suffix != ".h5" or not path.is_file() or _request_of(path) != request:
         return None
     try:

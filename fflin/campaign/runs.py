@@ -222,7 +222,7 @@ def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, Any]:
 
 
 def _remade(arguments: tuple[Any, ...], engine: str) -> CampaignJob:
-    """Make a job in a worker, whose warnings nobody would see."""
+    """Make a job in a worker, with warnings suppressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         job = CampaignJob(*arguments)

@@ -27,7 +27,7 @@ _EXPECTED = (
 
 
 class DispersionFile(dict[str, Any]):
-    """{name, group or pattern: spread} of a file, and the lines on which they stand."""
+    """{name, group or pattern: spread} of a file, and their line numbers."""
 
     def __init__(self, document: TomlFile) -> None:
         super().__init__()

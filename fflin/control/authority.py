@@ -143,7 +143,7 @@ def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]
 
 
 def thruster_report(properties: Mapping[str, Any]) -> str:
-    """Show whether the thrusters push every way, and their least force and torque."""
+    """Report whether the thrusters push in every direction, with least force and torque."""
     if not properties["thrusters"]:
         return ""
     text = f"{counted(properties['thrusters'], 'thruster')} alone"
@@ -163,7 +163,7 @@ def thruster_report(properties: Mapping[str, Any]) -> str:
 
 
 def unreachable(W: Array) -> dict[str, list[str]]:
-    """Return the directions of pure torque and pure force that no thrusts u >= 0 give as W u."""
+    """Return the pure torques and forces that W u does not reach with thrusts u >= 0."""
     from scipy.optimize import nnls
 
     size = np.linalg.norm(W, axis=0)

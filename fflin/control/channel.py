@@ -122,7 +122,7 @@ def warn_beyond(
     low: Array,
     high: Array,
 ) -> None:
-    """Warn of inputs that are asked, in any of the rows (N, nu), for more than their limits."""
+    """Warn of inputs whose commands in rows (N, nu) exceed their limits."""
     bounds = np.where(asked > 0.0, high, low)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)

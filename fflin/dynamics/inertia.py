@@ -198,7 +198,7 @@ def inertia_bounds(model: pin.Model) -> Array | None:
 
 
 def rotor_names(robot: Robot) -> tuple[str, ...]:
-    """Return the names of the joints whose turning changes no inertia and that carry nothing."""
+    """Return the names of rotors: symmetric joints that carry no other joint."""
     model = robot.model
     index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
     named = set(robot.used_frames)

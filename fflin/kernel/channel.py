@@ -121,7 +121,7 @@ def _arrive(channel, step, u):
 
 @inlined
 def _begin_pulses(channel, step, u):
-    """Fire the command of a sample, and carry the rest of its impulse to the next sample."""
+    """Fire the pulse of a sample, and add the remaining impulse to the next sample."""
     pulses, sample, fresh = channel.pulses, channel.sample, load(channel.fresh, 0)
     for index in range(len(pulses.at)):
         most, least = load(pulses.most, index), load(pulses.least, index)

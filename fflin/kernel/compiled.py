@@ -155,7 +155,7 @@ def is_kept(module: str, name: str) -> bool:
 
 
 def _kept(folder: Path, module: str, name: str) -> list[Path]:
-    """Return what is kept of a function and not older than any source."""
+    """Return a function's stored machine code if no source is newer."""
     # numba compares with the function's own file, not with those of the functions that it calls.
     source = max(file.stat().st_mtime for file in _sources())
     entries = _entries(folder, module, name)

@@ -1,4 +1,4 @@
-r"""Momentum and centre of mass as the impulse from outside takes them, and their keeping.
+r"""Momentum and centre of mass from the external impulse, and their projection.
 
 .. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
 
@@ -82,7 +82,7 @@ def kept_at(reference, t):
 
 @inlined
 def start_at(work, robot, reference, point):
-    """Write what is to be kept from a point on, whose M must be there."""
+    """Write the conserved quantities at a point whose M is already computed."""
     axes, tree = axes_of(point.q), robot.tree
     lever = vec.get3(work, tree.inertias + 1)
     nothing = vec.minus(lever, lever)

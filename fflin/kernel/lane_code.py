@@ -109,7 +109,7 @@ def _negative(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
 
 
 def _held(array: Any) -> Any:
-    """Return the type of what an array holds."""
+    """Return the type of an array's entries."""
     return lanes if array.ndim == 2 else double
 
 

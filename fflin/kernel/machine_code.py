@@ -82,7 +82,7 @@ class PartLibrary(CPUCodeLibrary):
                     library._called(found)
 
     def _own_module(self) -> Any:
-        """Return the code without that of what it calls."""
+        """Return the source code without the code of called functions."""
         return super()._get_module_for_linking()
 
     def _get_module_for_linking(self) -> Any:

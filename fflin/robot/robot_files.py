@@ -138,7 +138,7 @@ def _leaves(value: Any, *place: str) -> Iterator[tuple[Any, ...]]:
 
 
 def _without(gone: list[str], left: tuple[str, ...], value: Any) -> Any:
-    """Return a field of a robot without what is of joints alone that are gone."""
+    """Return a field of a robot without entries for removed joints."""
     if isinstance(value, dict) and gone:
         kept = {key: x for key, x in value.items() if _kept(key, gone, left)}
         return {key: _without(gone, left, x) for key, x in kept.items()}

@@ -112,11 +112,11 @@ class LaneLoop:
         return work_space(max(1, min(most, _MEMORY // (8 * LANES * self.width))) * self.width)
 
     def advance(self, clock: NDArray[np.intp], last: int, every: int, rows: Array) -> None:
-        """Go on up to a step, see `kernel.loop.advance`."""
+        """Advance to a step, see `kernel.loop.advance`."""
         self._advance(self._words, clock, last, every, rows, self._work)
 
     def split(self, raw: Array) -> list[Array]:
-        """Return what rows hold, each (rows, LANES, size)."""
+        """Return the recorded arrays, each (rows, LANES, size)."""
         by_row = raw.reshape(-1, self.width, LANES).transpose(0, 2, 1)
         return [by_row[..., part] for part in self.columns]
 
@@ -182,7 +182,7 @@ class LaneLoop:
         return self._sensors(runs, of_lane)
 
     def _sensors(self, runs: Runs, of_lane: NDArray[np.intp]) -> Callable[[int, int], None]:
-        """Return what writes the errors of all that is sensed from a step up to another."""
+        """Return a function that writes the sensor errors between two steps."""
         law, size = self.parts.law, len(self.parts.law.y)
         rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
         nothing = np.zeros((LANES, size))

@@ -77,7 +77,7 @@ class Saturated(NamedTuple):
 
 
 def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:
-    """Return what went beyond its limit, that first which did so by the largest share of it."""
+    """Return the limit violations, with the largest relative violation first."""
     found = []
     for name, values, unit, limits in histories:
         size = float(np.abs(limits[np.isfinite(limits)]).max())
@@ -92,7 +92,7 @@ def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:
 
 
 def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
-    """Return what was at a limit other than zero, that first which was longest."""
+    """Return signals at a nonzero limit, with the longest saturation first."""
     held = np.diff(t, append=t[-1:])
     found = [
         Saturated(name, limit, unit, float(held[near].sum() / held.sum()))
@@ -315,7 +315,7 @@ def pushed(of: Any) -> bool:
 
 
 def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
-    """Return one line: whether a motion settled at its target, and what prevented it."""
+    """Return one line: whether a motion settled at its target, and why not."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
@@ -356,7 +356,7 @@ def _and(words: list[str]) -> str:
 
 
 def _largest_modes(motion: Any) -> str:
-    """Return the largest amplitude of each mode, and the rotation that it stands for."""
+    """Return the largest amplitude of each mode, and the corresponding rotation."""
     rows = [["mode", "unit", "largest", "rotation [deg]", "at [s]"]]
     far = []
     for name, rotation in zip(motion.modes, motion.mode_rotations.tolist(), strict=True):

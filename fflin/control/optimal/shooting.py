@@ -144,7 +144,7 @@ class Shooting:
         return A, B, D, np.array(inside).reshape(parts - 1, *Z.shape).swapaxes(0, 1)
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
-        """Return knots on cubics from a point to another, and inputs near to what these take."""
+        """Return knots on cubics between two points, and approximate inputs for them."""
         model, T = self.state.robot.model, self.t[-1]
         s, rates = self.t[:, None] / T, np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))

@@ -61,7 +61,7 @@ class StageQP(NamedTuple):
     scale: Array  # (nx + nu,), sizes that variables may have, in fractions of which it is solved
 
     def solve(self) -> StageSolution | None:
-        """Return the solution; None where the hard bounds leave none, or it is not found."""
+        """Return the solution; None if the hard bounds are infeasible, or no solution is found."""
         import scipy.sparse as sp
 
         try:
