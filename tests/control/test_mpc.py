@@ -364,7 +364,7 @@ def test_a_plan_that_is_not_found_is_told_and_not_applied(servicer, monkeypatch)
     regulator = fflin.StateFeedback(policy.lin, policy.gain.K)
     cut = fflin.simulate(robot, regulator, **options)
     assert flown.u[0] == pytest.approx(cut.u[0], rel=1e-9, abs=1e-12)
-    assert "regulator" in flown.notes[-1]
+    assert "LQR command" in flown.notes[-1]
 
 
 @pytest.mark.exhaustive
