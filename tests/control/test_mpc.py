@@ -383,7 +383,7 @@ def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp
         "the point exceeds the limits of tau_b.x": {"limits": {"tau_b": (0.1, 0.2)}},
         "Qf is 'nosuch'": {"Qf": "nosuch"},
         "limits is 'nosuch'": {"limits": "nosuch"},
-        "only one of Q and R": {"R": None},
+        "both Q and R": {"R": None},
     }
     for said, given in wrong.items():
         with pytest.raises(fflin.FflinError, match=said):
