@@ -230,8 +230,8 @@ def random_configurations(
     UnknownNameError
         If a joint does not exist.
     InputError
-        If the count or seed is not a whole number, a range is empty, or a prismatic joint has
-        neither limits nor a range.
+        If the count or seed is not a whole number, a range is empty, or a prismatic joint has no
+        limits and no range is given.
 
     Examples
     --------

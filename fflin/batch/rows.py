@@ -55,7 +55,7 @@ def positions(q: Array, columns: Sequence[Column]) -> Array:
 
 
 def away(q: Array, column: Column, value: float) -> Array:
-    """Return how far a joint is from a value (N,), the short way round where it has no stop."""
+    """Return distances (N,) of a joint from a value; continuous joints use the short way."""
     distance = values(q, column) - value
     if column[1] >= 0:
         distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))
@@ -63,7 +63,7 @@ def away(q: Array, column: Column, value: float) -> Array:
 
 
 def follow_rows(robot: Robot, q: Array) -> None:
-    """Put the mimic joints of configurations (N, nq) where their leaders say."""
+    """Set the mimic joints of configurations (N, nq) from their leaders."""
     for joint, leader, multiplier, offset in robot.followers:
         at: Any = multiplier * values(q, column(leader)) + offset
         joint.place(q.T, at)

@@ -123,7 +123,7 @@ def sweep(
         If the engine does not exist.
     SweepError
         If a point cannot be linearised, or a worker dies repeatedly. The message names the chunk;
-        `SweepError.batch` or the file holds the other chunks.
+        `SweepError.batch` or the file contains the results of the other chunks.
     FileError, MissingPackageError
         If the file cannot be written.
 

@@ -53,7 +53,7 @@ def _example_robot_data() -> dict[str, RobotFile]:
 
 
 def list_robots() -> tuple[str, ...]:
-    """Return all robot names that `load` accepts: first bundled, then from example-robot-data.
+    """Return all robot names that `load` accepts: bundled, then from example-robot-data.
 
     Returns
     -------

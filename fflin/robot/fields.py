@@ -1,4 +1,4 @@
-"""Fields of a robot that the user may set: their checks, and how a robot file gives them."""
+"""Fields of a robot that the user may set: their checks, and their form in robot files."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -76,7 +76,7 @@ def checked_inputs(
 
 
 def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[str]) -> list[Input]:
-    """Return a joint torque for each joint with a motor that its name, or pattern, stands for."""
+    """Return a joint torque for each joint with a motor that matches the name or pattern."""
     if not isinstance(item, JointTorque):
         return [item]
     found = by_joint({str(item.joint): None}, joints, find)
@@ -190,7 +190,7 @@ def of_joints(state: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]
 
 
 def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a state with the parts, joints and rates of another in place of its own."""
+    """Return a state with parts, joints and rates replaced by those of another state."""
     both = {**state, **other}
     for part in ("joints", "velocity"):
         if part in both:
@@ -248,7 +248,7 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, Any]:
 
 
 class Field(NamedTuple):
-    """Key of a robot file: what its values are, and the check of a field."""
+    """Key of a robot file: the types of its values, and the check of a field."""
 
     check: Callable[[Any, Scope], object] = lambda value, _: value
     kind: Kind = NUMBER  # of a value, and of the entries of a list

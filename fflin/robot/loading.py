@@ -47,10 +47,11 @@ def load(
         robot file is a TOML file that names a URDF and sets fields of the robot; see the guide.
         No mesh is loaded.
     lock : mapping or iterable of str, optional
-        Joints to weld: {joint: value [rad|m]} (None: at neutral), or their names. A name may be a
-        pattern, ``hinge_*``. The mimic joints of a locked joint are also welded.
+        Joints to weld: {joint: value [rad|m]} (None: at the neutral position), or names of
+        joints. A name may be a pattern, ``hinge_*``. The mimic joints of a locked joint are also
+        welded.
     package_dirs : sequence of path
-        Folders to search for ``package://`` meshes when the robot is drawn. These folders are
+        Folders to search for ``package://`` meshes when the robot is drawn. The given folders are
         searched before the folders that contain the URDF.
     **fields
         inputs, outputs, stiffness, damping, rest, gravity, orbit, limits, passive, weights, start:
@@ -179,7 +180,7 @@ def from_model(
     Raises
     ------
     ModelError
-        If one of these holds:
+        If one of these conditions is true:
 
         - the root is not a single free-flyer;
         - a joint has more than one degree of freedom;

@@ -35,13 +35,14 @@ class CircularOrbit:
     r"""Circular orbit about a central body.
 
     The robot is described relative to a frame whose origin moves along the orbit in free fall.
-    The frame rotates with the orbit. Its axes are one of
+    The frame rotates with the orbit. The axes of the rotating frame are one of
 
     - ``lvlh``: x along the orbit, y opposite to the orbit normal, z towards the central body;
     - ``hill``: x away from the central body, y along the orbit, z along the orbit normal.
 
-    This rotating frame is Pinocchio's world, and velocities are relative to this frame. The
-    gravity gradient is linear in the position x relative to the origin: the force per mass is
+    The rotating frame is Pinocchio's world, so that velocities are relative to the rotating
+    frame. The gravity gradient is linear in the position x relative to the origin: the force per
+    mass is
     :math:`n^2 (3 r r^T - E) x`, with the unit vector r away from the central body and the
     identity E. The relative error of this linearisation is of the order of ``|x|`` divided by the
     orbit's radius.
@@ -174,7 +175,7 @@ class CircularOrbit:
 
 
 def checked_orbit(value: Any) -> CircularOrbit | None:
-    """Return the orbit that a field says: one, its altitude [m], its parts by name, or none."""
+    """Return the orbit of a field: an orbit, an altitude [m], a mapping of parts, or None."""
     if value is None or isinstance(value, CircularOrbit):
         return value
     if not isinstance(value, Mapping):

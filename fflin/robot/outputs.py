@@ -252,7 +252,8 @@ class Accelerometer(FrameOutput):
     """Output of an accelerometer: specific force (3,) [m/s^2] of a frame, in its own axes.
 
     The specific force is the acceleration of the frame's origin minus gravity. The specific force
-    is zero in free fall without rotation and thrust. At rest under gravity, it is +g upwards.
+    is zero in free fall without rotation and thrust. At rest under gravity, the specific force is
+    +g upwards.
 
     Parameters
     ----------

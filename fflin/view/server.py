@@ -136,7 +136,7 @@ class _Page(_Guarded):
 
 
 class _Socket(_Guarded, WebSocketHandler):
-    """One browser. It is sent the newest state when it has taken the one before."""
+    """Connection to one browser, which receives the newest state after the previous state."""
 
     _busy = False
     _behind = False

@@ -131,7 +131,8 @@ def visualize(
     ------
     InputError
         If the motion or modes belong to another robot or a reduced model, or no mode oscillates.
-        Also if pictures of modes are requested, a value is invalid, or the port is in use.
+        The error is also raised if pictures of modes are requested, a value is invalid, or the
+        port is in use.
     FileError
         If a file cannot be written. Files are written atomically.
     UnknownNameError
