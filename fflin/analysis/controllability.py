@@ -148,9 +148,9 @@ def controllability(lin: LinearModel) -> Controllability:
     Notes
     -----
     All inputs, including thrusters, are assumed to act in both directions. At a nonzero angular
-    velocity, the result applies to the model with A and B frozen at the point. Such a result does
-    not prove that the motion is controllable. At nonzero velocity, poles with a modulus below
-    about 1e-8 times the largest modulus are treated as zero.
+    velocity, the result applies to the model with A and B frozen at the point. Controllability of
+    the frozen model does not prove that the motion is controllable. At nonzero velocity, poles
+    with a modulus below about 1e-8 times the largest modulus are treated as zero.
 
     References
     ----------
@@ -209,7 +209,7 @@ def controllability(lin: LinearModel) -> Controllability:
 
 
 class _Part(NamedTuple):
-    """The split of what is left without the conserved momenta, in its own coordinates."""
+    """Split of the model without its conserved momenta, in reduced coordinates."""
 
     controllable: Array  # (2 r, d), a basis
     rows: Array  # (2 r - d, 2 r) with rows @ z what no input acts on

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, FrozenArrays, instance, number
+from fflin.base.validation import Array, FrozenArrays, instance, positive
 from fflin.linear.model import LinearModel
 from fflin.linear.sampling import held_cost
 
@@ -69,8 +69,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     Raises
     ------
     InputError
-        If `duration` is not positive or not a multiple of dt, or if it is missing and the model is
-        not asymptotically stable.
+        If `duration` is not positive or not a multiple of dt, or if the model is not
+        asymptotically stable and `duration` is missing.
 
     References
     ----------
@@ -87,8 +87,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     pairs = ((lin.A, lin.B), (lin.A.T, lin.C.T))
     if duration is None:
         _require_decay(lin)
-    elif (duration := number("duration", duration)) <= 0.0:
-        raise InputError(f"duration is {duration:g} s, expected a positive horizon")
+    else:
+        duration = positive("duration", duration, "s")
     with np.errstate(over="ignore", invalid="ignore"):
         found = [_gramian(A, B @ B.T, lin.dt, duration) for A, B in pairs]
     if not all(np.isfinite(W).all() for W in found):

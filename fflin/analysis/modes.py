@@ -94,7 +94,7 @@ class Mode(FrozenArrays):
 
     @property
     def time_constant(self) -> float:
-        """Time constant [s] in which the mode decays to 1/e, or grows by e if it is unstable."""
+        """Time constant [s] of decay by a factor e, or of growth for an unstable mode."""
         return float("inf") if self.pole.real == 0.0 else 1.0 / abs(self.pole.real)
 
 
@@ -327,7 +327,7 @@ def modes(lin: LinearModel) -> Modes:
 
 
 def _percents(energy: Mapping[str, float], room: int) -> str:
-    """Name the bodies with 1 % of the energy or more, and sum up those that are left out."""
+    """Name the bodies with 1 % of the energy or more, and sum up all other bodies."""
     words = [f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01]
     text = ""
     for count in range(len(words), 0, -1):

@@ -1,7 +1,7 @@
 """Errors that fflin raises; each message says what was given, what was expected, what to do."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 # Characters that end a line or command the terminal, names that are too long to be read, and how
@@ -247,7 +247,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def _visible(name: str) -> str:
-    """Quote a name whose blanks at an end would not be seen."""
+    """Quote a name that begins or ends with a blank."""
     return name if name == name.strip() else repr(name)
 
 
@@ -265,3 +265,10 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
         hint = f"known names: {', '.join(map(_visible, names[:12]))}"
         hint += f", ... ({len(names)} in all)" if len(names) > 12 else ""
     return UnknownNameError(f"no {kind} named '{name}'; {hint}")
+
+
+def require_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:
+    """Raise `UnknownNameError` for the first of the names that is not known."""
+    for name in names:
+        if name not in known:
+            raise unknown(kind, name, known)

@@ -70,13 +70,13 @@ def read_record(path: Path) -> tuple[Record, bool]:
 
 
 def decoded(suffix: str, content: bytes) -> tuple[Record, bool]:
-    """Return the record that the content of a file holds, and whether it is verified."""
+    """Return the record in the content of a file, and whether the record is verified."""
     return _CODECS[suffix][1](content)
 
 
 @contextmanager
-def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn what is raised while a file is read into one `FileError`."""
+def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
+    """Turn errors in reading a file that was saved by a program into one `FileError`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of headers that damage makes look old
@@ -88,7 +88,7 @@ def reading(path: Path, what: str) -> Iterator[None]:
     except Exception as error:  # each decoder has its own dozen
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
             raise NoRoomError(f"{shown(path)}: does not fit into memory") from None
-        raise FileError(f"{shown(path)}: not a {what} saved by fflin ({reason(error)})") from None
+        raise FileError(f"{shown(path)}: not a {what} saved by {by} ({reason(error)})") from None
 
 
 def require_finite(record: Mapping[str, Any]) -> None:
@@ -164,7 +164,7 @@ def _from_npz(content: bytes) -> tuple[Record, bool]:
 
 
 def verify_checksum(record: Record) -> bool:
-    """Take the digest out of the entries of .npz; return whether there is one, and it holds."""
+    """Remove the digest from the entries of .npz; return whether it exists and is valid."""
     checksum = record.pop(CHECKSUM, None)
     if checksum is not None and text(checksum) != content_digest(record):
         raise ValueError(DAMAGED)
@@ -324,7 +324,7 @@ def _saved(cls: type[Design]) -> list[Field[Any]]:
 
 
 def _value(cls: type[Design], item: Field[Any], raw: Any) -> Any:
-    """Return a field's value; its annotation says what it is."""
+    """Return a field's value, with the type of its annotation."""
     for kind, of_kind in (("float", figure), ("str", text), ("tuple", texts)):
         if str(item.type).startswith(kind):
             return of_kind(raw)

@@ -6,18 +6,21 @@ import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.names import joints_by_name
-from fflin.base.validation import Array, as_double, number, whole
+from fflin.base.validation import Array, as_double, instance, number, whole
 from fflin.batch.rows import checked_configurations, follow_rows
 from fflin.dynamics.points import configuration
 from fflin.robot.joints import Joint
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 # Random rows are drawn in blocks of this size, each with a seed of its own, so that a row does not
 # depend on the chunk that it is read in.
@@ -135,7 +138,7 @@ Configurations: TypeAlias = Grid | RandomConfigurations | GivenConfigurations
 
 def grid(
     robot: Robot,
-    axes: Mapping[str, Any],
+    axes: Mapping[str, ArrayLike],
     *,
     joints: Mapping[str, float] | None = None,
     base: pin.SE3 | None = None,
@@ -227,8 +230,8 @@ def random_configurations(
     UnknownNameError
         If a joint does not exist.
     InputError
-        If the count or seed is not a whole number, a range is empty, or a prismatic joint has
-        neither limits nor a range.
+        If the count or seed is not a whole number, a range is empty, or a prismatic joint has no
+        limits and no range is given.
 
     Examples
     --------
@@ -248,10 +251,9 @@ def random_configurations(
     return RandomConfigurations(robot, count, seed, checked, start)
 
 
-def as_configurations(robot: Robot, q: Any) -> Configurations:
+def as_configurations(robot: Robot, q: ArrayLike | Configurations) -> Configurations:
     """Return the points that `sweep` is given as rows of this robot."""
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot has type {type(robot).__name__}, expected a fflin.Robot")
+    instance("robot", robot, Robot, "a fflin.Robot")
     if isinstance(q, GivenConfigurations):  # checked already
         return q
     if not isinstance(q, Grid | RandomConfigurations):
@@ -274,7 +276,7 @@ def content(configurations: Configurations) -> dict[str, Any]:
     return {"of": type(configurations).__name__, **values, **named}
 
 
-def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:
+def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tuple[float, float]:
     if given is not None:
         what = f"range of '{joint.name}'"
         try:

@@ -11,7 +11,7 @@ import numpy as np
 from fflin.base.errors import FflinError, InputError
 from fflin.base.names import input_keys
 from fflin.base.record import Design
-from fflin.base.validation import Array, vector
+from fflin.base.validation import Array, instance, vector
 from fflin.batch.files import is_constant
 from fflin.batch.linear_batch import LinearBatch
 from fflin.batch.rows import column, positions
@@ -182,11 +182,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     >>> fflin.lqr_batch(batch, 1.0, 1.0).K.shape
     (3, 9, 18)
     """
-    if not isinstance(batch, LinearBatch):
-        raise InputError(
-            f"batch has type {type(batch).__name__}, expected a LinearBatch; fflin.sweep returns "
-            "one"
-        )
+    instance("batch", batch, LinearBatch, "a LinearBatch; fflin.sweep returns one")
     if not len(batch):
         raise InputError("the batch has no points; give a batch with at least one point")
     batch[0].require_unchanged()
@@ -321,11 +317,8 @@ class ScheduledFeedback(Feedback):
     gains: GainBatch
 
     def __post_init__(self) -> None:
-        for name, kind in (("lin", LinearModel), ("gains", GainBatch)):
-            if not isinstance(value := getattr(self, name), kind):
-                raise InputError(
-                    f"{name} has type {type(value).__name__}, expected a {kind.__name__}"
-                )
+        instance("lin", self.lin, LinearModel, "a LinearModel")
+        instance("gains", self.gains, GainBatch, "a GainBatch")
         lin, by = self.lin, self.gains
         here = [k for k, x in enumerate(by.joint_names) if f"q_m.{x}" in lin.state_names]
         lined = replace(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import numpy as np
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError, require_known
 from fflin.base.record import NOT_VERIFIED, reading
 from fflin.base.validation import Array, FrozenArrays, frozen, number, refuse_masked
 from fflin.base.writing import as_path
@@ -45,7 +45,7 @@ class LinearBatch(FrozenArrays):
     ----------
     A : ndarray (N, nx, nx)
     B_lower : ndarray (N, 6 + n, nu)
-        Velocity rows of B. At rest, with the default inputs, they are the inverse inertia.
+        Velocity rows of B. At rest, with the default inputs, ``B_lower`` is the inverse inertia.
     C : ndarray (N, ny, nx)
     D : ndarray (N, ny, nu)
     f0 : ndarray (N, nx)
@@ -69,7 +69,7 @@ class LinearBatch(FrozenArrays):
         of cos and sin for a continuous joint. The third number is the entry of q per unit of q_m;
         it differs from 1 only for modal amplitudes.
     verified : bool
-        Whether the data is known to be unchanged. The value is False for a file without a
+        Whether the data are known to be unchanged. The value is False for a file without a
         checksum, or if the checksum was not verified.
 
     Examples
@@ -212,7 +212,7 @@ class LinearBatch(FrozenArrays):
         UnknownNameError
             If a joint does not exist.
         InputError
-            If a value is neither a number nor a range, or no point of the batch matches.
+            If a value is not a number or a range, or no point of the batch matches.
         """
         mask = np.ones(len(self), dtype=bool)
         for index, value in self._named(joints).items():
@@ -339,9 +339,7 @@ class LinearBatch(FrozenArrays):
     def _named(self, joints: Mapping[str, Any]) -> dict[int, Any]:
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
-        for name in joints:
-            if name not in self.joint_names:
-                raise unknown("joint", name, self.joint_names)
+        require_known("joint", joints, self.joint_names)
         return {self.joint_names.index(name): value for name, value in joints.items()}
 
 

@@ -44,7 +44,7 @@ _FACTORS = {  # from the unit of a condition to the unit of a figure
 
 
 class Bound(NamedTuple):
-    """Comparison in a condition, and which runs (N,) meet it."""
+    """Comparison in a condition, and the mask (N,) of runs that meet the condition."""
 
     name: str
     sign: str
@@ -85,7 +85,8 @@ class Campaign(FrozenArrays):
     Statistics and conditions refer to the figures of a run by these names:
 
     - ``attitude`` [deg], ``position`` [m], ``joints``, ``turning`` (omega_b), ``moving`` (v_b) and
-      ``rates`` (of the joints): final error in these states. These names are the kinds of error.
+      ``rates`` (of the joints): final error in these states. The names before the colon are the
+      kinds of error.
     - The name of a state or input: final value of this signal, with sign.
     - ``worst NAME``: largest value over the whole run, or largest error if NAME is a state.
     - ``settle KIND`` [s]: settling time, after which the error of this kind stays within 2 % of its
@@ -348,8 +349,9 @@ class Campaign(FrozenArrays):
         """Save the campaign to a .npz, .h5, .csv or .mat file, atomically.
 
         A .csv or .mat file is a table of figures for other programs, with one row for each run;
-        `load` cannot read it. The columns have the names of the figures with units, such as
-        ``worst tau_b.x [N m]``. A .mat file contains `columns`, the names, and `runs`, the values.
+        `load` cannot read this table. The columns have the names of the figures with units, such
+        as ``worst tau_b.x [N m]``. A .mat file contains `columns`, the names, and `runs`, the
+        values.
         """
         target = as_path(path)
         if target.suffix in (".csv", ".mat"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import zlib
 from collections.abc import Callable, Mapping
 from copy import copy
@@ -37,7 +36,7 @@ from fflin.simulation.times import Times
 from fflin.uncertainty.parameters import bodies_named
 
 _BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
-_GLANCE = 0.3  # seconds of drawing from one look at its progress to the next
+_PART = 16  # values of a slow distribution that are drawn together; a divisor of _BLOCK
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
 _AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
@@ -223,44 +222,32 @@ class Dispersions:
         # At 0 and 1 the inverse may be infinite.
         return np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
 
-    def _drawn(
-        self, column: Column, block: int, count: int, said: Callable[[int], None] | None = None
-    ) -> Array:
-        """Return the first values of a block of runs, each drawn once: some distributions are slow.
+    def _drawn(self, column: Column, block: int, count: int) -> Array:
+        """Return the first values of a block of runs.
 
-        `said` is called with the number of values that this block has, as they are drawn.
+        Each is drawn once, since some distributions take long.
         """
         uniform = self._uniform(column, block)
         if is_closed_form(column.inverse):
             return column.inverse(uniform)
-        kept, size = self._kept.get((column.name, block), np.empty(0)), 1
-        while len(kept) < count:
-            begun = time.monotonic()
-            part = uniform[len(kept) : min(count, len(kept) + size)]
+        kept = self._kept.get((column.name, block), np.empty(0))
+        if len(kept) < count:
             try:
-                values = np.asarray(column.inverse(part), dtype=float)
+                values = np.asarray(column.inverse(uniform[len(kept) : count]), dtype=float)
             except Exception as error:  # each distribution has its own
                 raise InputError(
                     f"the distribution of '{column.name}' cannot be drawn: {reason(error)}"
                 ) from None
             kept = self._kept[column.name, block] = np.concatenate((kept, values))
-            if said:
-                said(len(kept))
-            took = max(time.monotonic() - begun, 1e-9)
-            size = max(1, min(2 * size, int(size * _GLANCE / took)))
         return kept
 
     def _draw_all(self, column: Column, runs: int) -> None:
         """Draw a distribution for so many runs, with a bar on a terminal."""
         bar = Progress()
         try:
-            for first in range(0, runs, _BLOCK):
-
-                def said(count: int, first: int = first) -> None:
-                    done = first + count
-                    bar.update(done, runs, f"drawing '{column.name}', {done:,} of {runs:,} ")
-
-                self._drawn(column, first // _BLOCK, min(_BLOCK, runs - first), said)
+            for done in (*range(1, min(_PART, runs)), *range(_PART, runs, _PART), runs):
+                self._drawn(column, (done - 1) // _BLOCK, (done - 1) % _BLOCK + 1)
+                bar.update(done, runs, f"drawing '{column.name}', {done:,} of {runs:,} ")
         finally:
             bar.close()
 
@@ -340,7 +327,7 @@ class Dispersions:
 
     @property
     def _springs_of(self) -> tuple[str, ...]:
-        """Which of stiffness and damping are dispersed."""
+        """Dispersed properties among stiffness and damping."""
         if "frequency" in self._kinds:
             return _OF_SPRINGS
         return tuple(kind for kind in _OF_SPRINGS if kind in self._kinds)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import math
 import pickle
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, nullcontext
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -32,14 +31,14 @@ from fflin.campaign.statistics import KINDS
 from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
-from fflin.simulation.plan import planned
+from fflin.simulation.plan import SimulationOptions
 from fflin.simulation.report import pushed
 
 # With `until`, the interval is first computed after this number of runs, and again whenever their
 # number has grown by this factor. Chunks divide it, so that they do not change the number of runs.
 _STAGE, _GROWTH = 256, 1.25
 
-_OPTIONS = {*list(inspect.signature(planned).parameters)[2:]} - {
+_OPTIONS = {each.name for each in fields(SimulationOptions)} - {
     *("duration", "events", "callback", "linear", "every", "progress")
 }
 
@@ -139,10 +138,10 @@ def monte_carlo(
     executor, workers, threads, progress : optional
         As in `sweep`. The workers of an executor must be able to import the policy's modules.
     chunk : int, optional
-        Number of runs per chunk, a multiple of 8. If `until` is given, this number must divide 256.
+        Number of runs per chunk: a multiple of 8, and a divisor of 256 if `until` is given.
     histories : int, optional
         Number of evenly spaced times at which the errors and inputs of each run are recorded. The
-        bands of `plot_campaign` need them.
+        bands of `plot_campaign` require histories.
     out : str or Path, optional
         File to write, .h5 or .npz. Unfinished results are kept in NAME.part. After a crash, the
         same call resumes from the intact chunks in NAME.part. If a .h5 file already contains all
@@ -305,7 +304,7 @@ def _request_of(path: Path) -> str:
 def _found(
     job: CampaignJob, path: Path | None, request: str, header: dict[str, Any]
 ) -> Campaign | None:
-    """Return the campaign of a file that holds all runs of this call; its goals may differ."""
+    """Return the campaign of a file with all runs of this call; its goals may differ."""
     if path is None or path.suffix != ".h5" or not path.is_file() or _request_of(path) != request:
         return None
     try:

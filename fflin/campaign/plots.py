@@ -161,7 +161,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
 
 
 def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
-    """Draw the half-axes of a funnel at each knot, and the success rates of the runs from there.
+    """Draw the half-axes of a funnel and the success rates of the runs at each knot.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ from fflin.simulation.conservation import conserved_by
 from fflin.simulation.lanes import LaneLoop, LaneRows, Runs, Statistics, noises, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.packing import SLOTS, noise_of, packed
-from fflin.simulation.plan import Plan, law_of, planned
+from fflin.simulation.plan import Plan, SimulationOptions, law_of, planned
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import Recording, go, stop_of
 from fflin.simulation.simulate import motion_of
@@ -57,7 +57,8 @@ class CampaignJob:
         self._arguments: tuple[Any, ...] = (robot, policy, given, seed, engine, options, rule)
         self.rule, options = rule, dict(options)
         histories, unlimited = options.pop("histories", 0), options.pop("unlimited", False)
-        self.plan, self.plant = planned(robot, policy, linear=False, progress=False, **options)
+        options = SimulationOptions(linear=False, progress=False, **options)
+        self.plan, self.plant = planned(robot, policy, options)
         if unlimited:
             most = np.full(len(self.plan.initial), np.inf)
             self.plan = replace(self.plan, limits=Saturation(-most, most))
@@ -221,7 +222,7 @@ def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, Any]:
 
 
 def _remade(arguments: tuple[Any, ...], engine: str) -> CampaignJob:
-    """Make a job in a worker, whose warnings nobody would see."""
+    """Make a job in a worker, with warnings suppressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         job = CampaignJob(*arguments)
@@ -251,7 +252,15 @@ def completed(
     threads = (threads or available_cores()) if compiled else 1
     size = chunk_size(count, workers or threads, LANES if compiled else 1)
     store = MemoryStore(count, size, job.shapes)
-    failed = run_chunks(job, rows, store, executor=executor, threads=threads, progress=progress)
+    failed = run_chunks(
+        job,
+        rows,
+        store,
+        executor=executor,
+        threads=threads,
+        progress=progress,
+        all_needed=True,
+    )
     if failed:
         died = "a worker process died: " if executor else ""
         raise FflinError(f"{died}{failed[0].reason}")

@@ -178,7 +178,7 @@ def validity(
 
     The nonlinear robot is simulated under ``u = u0 - K (x - x0)``, held between samples if the
     model is sampled. All runs start at displaced configurations with the operating point's
-    velocity. There are two sets of runs:
+    velocity. `validity` simulates two sets of runs:
 
     - Displacements of growing size, to compare the motion with the linear prediction.
     - Random displacements. A run has settled if its error falls to a thousandth of its initial
@@ -197,7 +197,7 @@ def validity(
         Gain K, which must stabilise the linear loop.
     attitude, position, joint : float
         Largest displacement of the base [deg] and [m], and of the most displaced joint [rad|m].
-        States that are not in a reduced model, or are not regulated, are not displaced. Their
+        States that are not in a reduced model, or are not regulated, are not displaced, and their
         displacement is reported as 0.
     samples, seed : int
         Number of random runs, and random seed. The same seed gives the same result for any executor

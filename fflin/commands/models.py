@@ -134,7 +134,7 @@ def _info(arguments: argparse.Namespace) -> Report:
 
     import numpy as np
 
-    from fflin.control.authority import mass_properties, point_report
+    from fflin.control.authority import point_properties, point_report
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
     from fflin.robot.limits import limits_of
@@ -143,8 +143,8 @@ def _info(arguments: argparse.Namespace) -> Report:
     robot = load_robot(arguments)
     q = configuration_of(robot, arguments, robot.point)
     v = velocity_of(robot, arguments, robot.point, "velocity")
-    at_point = point_report(robot, q, np.zeros(robot.nv) if v is None else v)
-    text = robot_info(robot, at_point)
+    properties = point_properties(robot, q, np.zeros(robot.nv) if v is None else v)
+    text = robot_info(robot, point_report(properties))
     if (
         arguments.inputs is not None
         or robot.limits
@@ -153,12 +153,9 @@ def _info(arguments: argparse.Namespace) -> Report:
         text += f"\n\n{inputs_report(robot)}"
     state = StateMap(robot)
     inputs = Actuation(state)
-    center, inertia = mass_properties(robot, q)
     result = {
         "mass": robot.mass,
-        "center_of_mass": center,
-        "inertia": inertia,
-        "principal_moments": np.linalg.eigvalsh(inertia),
+        **properties,
         "joint_names": robot.joint_names,
         "wheels": robot.wheels,
         "state_names": state.names,

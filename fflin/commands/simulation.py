@@ -75,6 +75,12 @@ def _add_simulate(commands: parser.Commands) -> None:
         "save one row for every N integration steps; by default N is 1, or larger for long runs",
         int,
     )
+    simulate.group(parser.SIMULATION).add(
+        "--engine",
+        "simulate in compiled code or in Python. The default is compiled for long runs, if numba "
+        "is installed",
+        choices=("compiled", "python"),
+    )
     options.add_figure(simulate, "the nonlinear and the linear motion")
     shown = simulate.group(parser.OUTPUT)
     shown.add(
@@ -101,7 +107,7 @@ def _simulate(arguments: argparse.Namespace) -> Report:
     try:
         motion = simulated(robot, arguments)
     except InputError as error:
-        hint = " (--sample)" if "time between samples" in str(error) else ""
+        hint = " (--sample)" if "needs sampled commands" in str(error) else ""
         raise InputError(f"{error}{hint}") from None
     return Report(
         robot.name,
@@ -124,7 +130,8 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     loop = loop_of(robot, arguments)
     # The continuous model predicts every row, a sampled model only its samples.
     foresees: dict[str, Any] = {"linear": loop.lin} if loop.feedback else {}
-    motion = simulate(robot, loop.policy, every=arguments.every, **loop.options, **foresees)
+    shown = {"every": arguments.every, "engine": arguments.engine}
+    motion = simulate(robot, loop.policy, **shown, **loop.options, **foresees)
     if loop.feedback:
         _warn_of_cut_thrust(robot, motion, loop.feedback)
     return motion

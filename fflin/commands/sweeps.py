@@ -248,23 +248,12 @@ def _base(robot: Robot, q: Array) -> Any:
 
 
 def _given(path: Path) -> dict[str, Array]:
-    import io
-    import warnings
+    from fflin.base.record import decoded, reading
+    from fflin.base.writing import read_file
 
-    import numpy as np
-
-    from fflin.base.writing import read_file, reason
-
-    content = io.BytesIO(read_file(path, ".npz"))
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about damaged headers, which look like an old format
-            with np.load(content, allow_pickle=False) as file:
-                given = {key: file[key] for key in ("q", "v", "u") if key in file.files}
-    except Exception as error:  # each decoder of a zip archive raises its own errors
-        raise FileError(
-            f"{path}: not an npz file as numpy.savez writes it ({reason(error)})"
-        ) from None
+    with reading(path, "npz file", by="numpy.savez"):
+        arrays, _ = decoded(".npz", read_file(path, ".npz"))
+    given: dict[str, Array] = {key: arrays[key] for key in ("q", "v", "u") if key in arrays}
     if "q" not in given:
         raise FileError(f"{path}: contains no array q; save the configurations as q (N, nq)")
     if given["q"].ndim != 2:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from itertools import combinations, islice, product
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -27,9 +29,21 @@ _ROUNDING = 1e-9
 _AXES = "xyz"
 
 
-def point_report(robot: Robot, q: Array, v: Array) -> str:
-    """Show mass, centre of mass, inertia, wheels and thrusters at a point, in base axes."""
+def point_properties(robot: Robot, q: Array, v: Array) -> dict[str, Any]:
+    """Return mass properties, wheels and thrusters at a point, in base axes, by name."""
     center, inertia = mass_properties(robot, q)
+    return {
+        "center_of_mass": center,
+        "inertia": inertia,
+        "principal_moments": np.linalg.eigvalsh(inertia),
+        "wheel_momentum": wheel_properties(robot, q, v),
+        "thruster_authority": thruster_properties(robot, q, center),
+    }
+
+
+def point_report(properties: Mapping[str, Any]) -> str:
+    """Show the properties of a robot at a point."""
+    inertia = properties["inertia"]
     moments, axes = np.linalg.eigh(inertia)
     axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), range(3)])
     head = ["inertia", *_AXES, "principal", *(f"axis {axis}" for axis in _AXES)]
@@ -38,12 +52,13 @@ def point_report(robot: Robot, q: Array, v: Array) -> str:
         shown = ["." if abs(x) < _ROUNDING * moments[-1] else f"{x:.5g}" for x in row]
         along = ["." if abs(x) < _ROUNDING else f"{x:.4f}" for x in axis]
         rows.append([name, *shown, f"{moment:.5g}", *along])
-    wheels, thrusters = wheel_report(robot, q, v), thruster_report(robot, q, center)
     head_line = (
-        f"centre of mass {_vector(center)} m from the base frame; inertia about it in kg\u00a0m^2; "
-        "at the operating point, in base axes"
+        f"centre of mass {_vector(properties['center_of_mass'])} m from the base frame; inertia "
+        "about it in kg\u00a0m^2; at the operating point, in base axes"
     )
-    parts = [f"{folded([head_line])}\n\n{grid(rows)}", wheels, thrusters]
+    parts = [f"{folded([head_line])}\n\n{grid(rows)}"]
+    parts.append(wheel_report(properties["wheel_momentum"]))
+    parts.append(thruster_report(properties["thruster_authority"]))
     return "\n\n".join(part for part in parts if part)
 
 
@@ -74,54 +89,81 @@ def wheel_momenta(robot: Robot, q: Array, v: Array) -> tuple[Array, Array, Array
     return np.array(axes).reshape(-1, 3).T, np.array(stored), np.array(largest)
 
 
-def wheel_report(robot: Robot, q: Array, v: Array) -> str:
-    """Show the total momentum of the wheels, and whether they span three axes."""
+def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, Any]:
+    """Return total and least momentum [N m s] of the wheels, and how many axes they span."""
     axes, stored, largest = wheel_momenta(robot, q, v)
-    if not stored.size:
+    rank = int(np.linalg.matrix_rank(axes, tol=1e-6)) if stored.size else 0
+    bounded = rank == 3 and np.isfinite(largest).all()
+    return {
+        "wheels": stored.size,
+        "total": axes @ stored,
+        "axes": rank,
+        "least": least_reach(axes, -largest, largest, np.eye(3)) if bounded else None,
+    }
+
+
+def wheel_report(properties: Mapping[str, Any]) -> str:
+    """Show the total momentum of the wheels, and whether they span three axes."""
+    if not properties["wheels"]:
         return ""
-    total, rank = axes @ stored, int(np.linalg.matrix_rank(axes, tol=1e-6))
-    spans = {3: "three axes", 2: "only two axes", 1: "only one axis"}[rank]
+    total = properties["total"]
+    spans = {3: "three axes", 2: "only two axes", 1: "only one axis"}[properties["axes"]]
     text = (
-        f"{counted(stored.size, 'wheel')}: total momentum {_vector(total)} N m s, "
+        f"{counted(properties['wheels'], 'wheel')}: total momentum {_vector(total)} N m s, "
         f"{np.linalg.norm(total):.4g} in all; they span {spans}"
     )
-    if rank == 3 and np.isfinite(largest).all():
-        least = least_reach(axes, -largest, largest, np.eye(3))
+    if (least := properties["least"]) is not None:
         text += f", with at least {least:.4g} N m s in every direction at their largest speeds"
     return folded([text])
 
 
-def thruster_report(robot: Robot, q: Array, center: Array) -> str:
-    """Show whether the thrusters push every way, and their least force and torque."""
-    actuation = Actuation(StateMap(robot))
+def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]:
+    """Return what the thrusters alone reach: pure forces and torques, and their least sizes.
+
+    The sizes are None unless the thrusters push every way, all have limits and are not too many.
+    """
+    actuation, found = Actuation(StateMap(robot)), dict[str, Any]()
+    found |= {"thrusters": 0, "every_way": False, "bounded": False, "unreachable": {}}
+    found |= {"least_force": None, "least_torque": None}
     if "thrust" not in actuation.groups:
-        return ""
-    # Imported where there are thrusters: both take longer than all the rest of the report.
+        return found
     from fflin.control.channel import input_limits
 
     thrusters = actuation.groups["thrust"]
     W = actuation.columns(robot.create_data(), _at_origin(q))[:6, thrusters]
     W[:3] -= np.cross(center, W[3:].T).T
-    head = f"{counted(len(thrusters), 'thruster')} alone"
-    if any((missing := unreachable(W)).values()):
-        shown = [f"{kind} along {', '.join(axes)}" for kind, axes in missing.items() if axes]
-        return folded([f"{head} do not push every way: no pure {' and no pure '.join(shown)}"])
     low, high = (each[thrusters] for each in input_limits(robot, limits_of(robot)))
-    if not np.isfinite(high).all():
-        return folded([f"{head} push every way; not all of them have a limit (max)"])
-    if len(thrusters) > _MANY:
-        return f"{head} push every way"
-    torque, force = (least_reach(W, low, high, axes) for axes in np.hsplit(np.eye(6), 2))
-    return folded(
-        [
-            f"{head} push every way: in any direction at least {force:.4g} N without torque about "
-            f"the centre of mass, or {torque:.4g} N m without force"
-        ]
-    )
+    found |= {"thrusters": len(thrusters), "bounded": bool(np.isfinite(high).all())}
+    found["unreachable"] = unreachable(W)
+    found["every_way"] = not any(found["unreachable"].values())
+    if found["every_way"] and found["bounded"] and len(thrusters) <= _MANY:
+        for kind, axes in zip(("torque", "force"), np.hsplit(np.eye(6), 2), strict=True):
+            found[f"least_{kind}"] = least_reach(W, low, high, axes)
+    return found
+
+
+def thruster_report(properties: Mapping[str, Any]) -> str:
+    """Report whether the thrusters push in every direction, with least force and torque."""
+    if not properties["thrusters"]:
+        return ""
+    text = f"{counted(properties['thrusters'], 'thruster')} alone"
+    if not properties["every_way"]:
+        missing = properties["unreachable"].items()
+        shown = [f"{kind} along {', '.join(axes)}" for kind, axes in missing if axes]
+        return folded([f"{text} do not push every way: no pure {' and no pure '.join(shown)}"])
+    text += " push every way"
+    if not properties["bounded"]:
+        text += "; not all of them have a limit (max)"
+    elif properties["least_force"] is not None:
+        text += (
+            f": in any direction at least {properties['least_force']:.4g} N without torque about "
+            f"the centre of mass, or {properties['least_torque']:.4g} N m without force"
+        )
+    return folded([text])
 
 
 def unreachable(W: Array) -> dict[str, list[str]]:
-    """Return the directions of pure torque and pure force that no thrusts u >= 0 give as W u."""
+    """Return the pure torques and forces that W u does not reach with thrusts u >= 0."""
     from scipy.optimize import nnls
 
     size = np.linalg.norm(W, axis=0)
@@ -135,13 +177,13 @@ def unreachable(W: Array) -> dict[str, list[str]]:
 
 
 def gives_every_wrench(W: Array, pushing: NDArray[np.bool_]) -> bool:
-    """Whether columns W (6, k), of which some only push, together give every wrench."""
+    """Return whether columns W (6, k), some of them only positive, produce every wrench."""
     both = np.hstack((W, -W[:, ~pushing]))
     return not any(unreachable(both).values())
 
 
 def thrusters_give_every_wrench(robot: Robot) -> bool:
-    """Whether a robot has thrusters that, with what else acts on its base, push it every way."""
+    """Return whether thrusters and other base inputs of a robot can push in every direction."""
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust")
     if thrusters is None:

@@ -128,7 +128,7 @@ class Compensator(Design):
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
-        Signals of the compensator. Its inputs are the outputs of the model.
+        Signals of the compensator. The inputs of the compensator are the outputs of the model.
     robot : str
 
     Examples
@@ -220,7 +220,7 @@ def kalman(
     UnknownNameError
         If a name does not exist.
     ModelError
-        If the robot's model was changed after it was made.
+        If the robot's model was changed after the robot was made.
 
     References
     ----------

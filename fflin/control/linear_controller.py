@@ -150,7 +150,7 @@ class LinearController(Feedback):
     A continuous controller is integrated together with the robot, in the same Runge-Kutta stages.
     If `simulate` is given `sample` or `delay`, y is held between samples and z is advanced exactly.
     A sampled controller is evaluated at its own sample times, which must be multiples of the step.
-    Its output u is held between its samples.
+    The output u of a sampled controller is held between samples.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ class LinearController(Feedback):
     Raises
     ------
     InputError
-        If one of these holds:
+        If one of these conditions is true:
 
         - a size, name or sampling time does not fit the model;
         - an entry is not finite, or a transfer function is improper;
@@ -334,9 +334,9 @@ def closed_loop(policy: object) -> tuple[Array, float, tuple[str, ...]] | None:
 class OutputFeedback(LinearController):
     """Feedback of the robot's outputs by a sampled compensator, such as the result of `lqg`.
 
-    At each sample, u - u0 = C z is applied. Then y is measured, and z is advanced to the next
-    sample. Accelerometer outputs are computed with the commanded u, before saturation. The initial
-    estimate of the deviation from the point is zero.
+    At each sample, u - u0 = C z is applied and y is measured. The state z is then advanced to the
+    next sample. Accelerometer outputs are computed with the commanded u, before saturation. The
+    initial estimate of the deviation from the point is zero.
 
     Parameters
     ----------

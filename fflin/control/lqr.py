@@ -74,18 +74,18 @@ def lqr(
     Parameters
     ----------
     lin : LinearModel
-        Model about a fixed point, or about a steady motion if it was made with ``moving=True``.
+        Model about a fixed point, or a model with ``moving=True`` about a steady motion.
     Q : array_like (nx, nx) or (nx,), float, or mapping, optional
         Weight on the state, positive semidefinite: a matrix, its diagonal, or {name: weight} with
         names of states or of their groups, such as ``q_b``. Unnamed states have zero weight.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
-        Weight on the inputs, positive definite, in the same forms.
+        Weight on the inputs, positive definite, in the forms of Q.
     N : array_like (nx, nu), optional
         Cross weight. Q - N R^-1 N' must be positive semidefinite.
     weights : {"urdf", "identity"}, optional
-        Rule for the weights, instead of Q and R: "urdf" (default) respects the limits of the
-        URDF, "identity" is 1 on every state and input. For a sampled model, the rule defines the
-        continuous-time cost, which `sampled_cost` converts.
+        Rule for the weights if Q and R are omitted. The rule "urdf" (default) respects the limits
+        of the URDF, "identity" is 1 on every state and input. For a sampled model, the rule
+        defines the continuous-time cost, which `sampled_cost` converts.
     wheel_speeds : bool, optional
         Whether to regulate the wheel speeds to their values at the point. By default, wheel
         speeds are regulated if inputs other than the wheels can change them. With True,
@@ -110,7 +110,7 @@ def lqr(
     UnknownNameError
         If a name does not exist.
     ModelError
-        If the robot's model was changed after it was made.
+        If the robot's model was changed after the robot was made.
 
     Warns
     -----
@@ -193,7 +193,7 @@ def acceleration_lqr(
         If the model is sampled, its dynamics are not double integrators, or a weight is negative or
         not diagonal. Qp, Ra, and Qv on wheel speeds must be positive.
     ModelError
-        If the robot's model was changed after it was made.
+        If the robot's model was changed after the robot was made.
 
     References
     ----------

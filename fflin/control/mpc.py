@@ -85,13 +85,14 @@ def mpc(
         Weight on the error after N samples, or at the end of a trajectory. "steady" is the cost
         to go of the regulator from the end of the horizon on.
     weights : {"urdf", "identity"}, optional
-        Rule for the weights, instead of Q and R, as in `lqr`.
+        Rule for the weights if Q and R are omitted, as in `lqr`.
 
     Returns
     -------
     Mpc or TrajectoryMpc
-        Policy for `simulate` and `monte_carlo`. Its method ``matrices(e)``, or along a trajectory
-        ``matrices(e, t)``, returns the quadratic program at a state error, for other solvers.
+        Policy for `simulate` and `monte_carlo`. The method ``matrices(e)`` of the policy
+        (``matrices(e, t)`` along a trajectory) returns the quadratic program at a state error e,
+        for other solvers.
 
     Raises
     ------

@@ -9,7 +9,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, as_double, instance
+from fflin.base.validation import Array, frozen, instance, shaped
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import Frame, StateMap, readout
@@ -88,16 +88,8 @@ class StateFeedback(Feedback):
                 "the model is about a moving reference, expected one about a fixed point; follow "
                 "a moving reference with TrajectoryFeedback"
             )
-        K, shape = as_double("K", self.K), self.lin.B.shape[::-1]
-        if K.shape != shape:
-            raise InputError(
-                f"K has shape {K.shape}, expected {shape} (nu, nx); give the gain that was "
-                "designed for this model"
-            )
-        if not np.isfinite(K).all():
-            raise InputError("K has entries that are NaN or infinite, expected finite numbers")
-        K.setflags(write=False)
-        self.K = K
+        hint = " (nu, nx); give the gain that was designed for this model"
+        self.K = frozen(shaped("K", self.K, self.lin.B.shape[::-1], hint))
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of u = offset - K x for a robot's whole state x, and its x0."""
@@ -129,8 +121,7 @@ class Allocation:
     The policy commands the inputs of the robot `design`, such as torque and force on the base.
     The thrusters and motors of the simulated robot produce the generalised force that is closest
     to the commanded force. The distance between two forces is the sum of squared differences
-    between the accelerations that they cause. No thrust is negative, and no input exceeds its
-    limit.
+    between the resulting accelerations. No thrust is negative, and no input exceeds its limit.
 
     Parameters
     ----------
@@ -211,7 +202,7 @@ class AllocatedPolicy:
 
 
 class Clock:
-    """The samples of a controller that remembers, each `dt` [s] after the last."""
+    """Samples of a controller with an internal state, every `dt` [s]."""
 
     def __init__(self, dt: float) -> None:
         self._dt, self._last = dt, -np.inf

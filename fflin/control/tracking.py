@@ -115,7 +115,7 @@ class TrajectoryFeedback(Feedback):
 
     @property
     def jumps(self) -> bool:
-        """Whether the command jumps at knots, because inputs are held between them."""
+        """Whether the command jumps at knots, because inputs are held between knots."""
         return self.trajectory.hold == "previous" and not self.schedule.dt
 
     @property
@@ -197,7 +197,7 @@ class TrajectoryFeedback(Feedback):
         return state
 
     def deviation(self, robot: Robot) -> Callable[..., tuple[Array, Array]]:
-        """Return f(t, q, v) -> u*, e: the inputs of the trajectory, and the error from it."""
+        """Return f(t, q, v) -> u*, e: the inputs of the trajectory, and the error."""
         state = self.state_map(robot)
 
         def deviation(t: float, q: Array, v: Array) -> tuple[Array, Array]:

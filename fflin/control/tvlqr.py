@@ -48,7 +48,7 @@ def tvlqr(
     .. math:: e(T)^T Q_f\,e(T) + \int_t^T e^T Q\,e + \delta u^T R\,\delta u\;d\tau.
 
     The differential Riccati equation is :math:`-\dot P = A^T P + P A - P B R^{-1} B^T P + Q`, with
-    :math:`P(T) = Q_f`. It is solved backwards from knot to knot by maps
+    :math:`P(T) = Q_f`. The Riccati equation is solved backwards from knot to knot by maps
     :math:`P_0 = W + T^T P_1 (I + G P_1)^{-1} T` with positive semidefinite W and G. Each map is
     computed from a short matrix exponential by doubling, so P stays positive semidefinite over any
     horizon. The method has order four in general, and is exact if A and B are constant. Knots are
@@ -71,7 +71,7 @@ def tvlqr(
         motion is steady. States that the inputs cannot stabilise have zero weight in Qf, see
         `momentum_reduction`.
     sample : float, optional
-        Sampling time [s]. It must divide the duration.
+        Sampling time [s], which must divide the duration.
     weights : {"urdf", "identity"}, optional
         Rule for the weights if Q and R are omitted. The rule of `lqr` is applied to the linear
         model at the last point of the trajectory, with displacements a tenth as large as in
@@ -155,7 +155,7 @@ def asks_steady(value: Any, name: str = "Qf", kind: str = "a weight") -> bool:
 def held_stages(
     traj: LinearTrajectory, dt: float, Q: Array, R: Array
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield the samples that `samples_back` takes, from first to last."""
+    """Yield the samples for `samples_back`, from first to last."""
     nx, W = len(Q), block_diag(Q, R)
     for steps, whole in transitions(traj, dt):
         total, way = np.zeros_like(W), np.eye(len(W))
@@ -259,7 +259,7 @@ def tvkalman(
         start point is the first configuration at rest, or in its initial motion if this motion is
         steady.
     sample : float, optional
-        Sampling time [s]. It must divide the duration.
+        Sampling time [s], which must divide the duration.
 
     Returns
     -------

@@ -1,14 +1,16 @@
 """Weights of a quadratic cost, given as matrices, diagonals, numbers or names."""
 
+import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
-from fflin.base.validation import Array, dimension, instance, number, vector
+from fflin.base.validation import Array, dimension, instance, number, positive, shaped, vector
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 from fflin.linear.sampling import held_cost
@@ -17,6 +19,9 @@ Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 
 # What rounding may leave of symmetry and of semidefiniteness, relative to the largest entry.
 _ROUNDING = 1e-9
+
+# A weight that is given and this many times apart from that of the rule is on another scale.
+_APART = 1e4
 
 
 def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) -> Array:
@@ -116,19 +121,12 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
     return np.diag(diagonal)
 
 
-def cross_weight(what: str, value: ArrayLike, rows: int, columns: int) -> Array:
-    """Return a matrix (rows, columns)."""
-    if dimension(what, value) != 2 or np.shape(value) != (rows, columns):
-        raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, {columns})")
-    return vector(what, np.ravel(value), rows * columns, "its entries").reshape(rows, columns)
-
-
 def columns(what: str, value: ArrayLike, rows: int) -> Array:
     """Return a matrix (rows, k) with k >= 1."""
     shape = np.shape(value) if dimension(what, value) == 2 else ()
     if not shape or not shape[1]:
         raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, k) with k >= 1")
-    return cross_weight(what, value, rows, shape[1])
+    return shaped(what, value, (rows, shape[1]))
 
 
 def require_semidefinite(
@@ -149,14 +147,14 @@ def cost_weights(
     R = weight("R", R, input_keys(of), definite=True)
     if N is None:
         return Q, R, None
-    cross = cross_weight("N", N, len(Q), len(R))
+    cross = shaped("N", N, (len(Q), len(R)))
     require_semidefinite("Q - N R^-1 N'", Q - cross @ np.linalg.solve(R, cross.T), of.state_names)
     return Q, R, cross
 
 
 def _checked_matrix(what: str, value: ArrayLike, names: Sequence[str], definite: bool) -> Array:
     size = len(names)
-    matrix = cross_weight(what, value, size, size)
+    matrix = shaped(what, value, (size, size))
     skew = np.abs(matrix - matrix.T)
     if skew.max() > _ROUNDING * np.abs(matrix).max():
         i, j = np.unravel_index(int(skew.argmax()), skew.shape)
@@ -170,12 +168,6 @@ def _checked_matrix(what: str, value: ArrayLike, names: Sequence[str], definite:
     except np.linalg.LinAlgError:
         require_semidefinite(what, matrix, names, definite)
     return matrix
-
-
-def named_weights(what: str, values: Mapping[str, float], names: Sequence[str]) -> dict[int, float]:
-    """Return {index: value} of {name, group or pattern: value}."""
-    checked = {name: number(f"weight of '{name}'", value) for name, value in values.items()}
-    return by_name(what, checked, names)
 
 
 class SampledCost(NamedTuple):
@@ -237,9 +229,7 @@ def sampled_cost(
     """
     if not isinstance(lin, LinearModel) or lin.dt:
         raise InputError("lin must be a continuous LinearModel; give the model that was sampled")
-    h = number("dt", dt)
-    if h <= 0.0:
-        raise InputError(f"dt is {h:g} s, expected a positive sampling time")
+    h = positive("dt", dt, "s")
     Q, R, cross = cost_weights(lin, Q, R, N)
     nx, nu = lin.B.shape
     F, W = np.zeros((2, nx + nu, nx + nu))
@@ -256,7 +246,8 @@ def sampled_cost(
 def _diagonal(
     what: str, values: Mapping[str, float], names: Sequence[str], *, complete: bool
 ) -> Array:
-    found = named_weights(f"entry of {what}", values, names)
+    checked = {name: number(f"weight of '{name}'", value) for name, value in values.items()}
+    found = by_name(f"entry of {what}", checked, names)
     if complete and len(found) < len(names):
         missing = next(name for index, name in enumerate(names) if index not in found)
         raise InputError(f"{what} has no value for {missing}; give a value for each entry")
@@ -304,3 +295,34 @@ def weights_of(
     nx = len(lin.x0)
     shifted = {nx + index: each for index, each in of_inputs.items()}
     return by_name("state", q, lin.state_names) | shifted, [*q, *r]
+
+
+def reweighed(
+    lin: LinearModel, Q: Array, R: Array, terms: Array, given: Mapping[int, GivenWeight]
+) -> tuple[Array, Array]:
+    """Return Q and R, scaled to the largest values that are given, with what is given in them.
+
+    A common factor of Q and R does not change the gain. The rule's weights are scaled so that the
+    largest values of the named states and inputs cost 1, as in Bryson's rule.
+    """
+    costs = [terms[index] for index, each in given.items() if each.largest and terms[index]]
+    scale = math.exp(-np.log(costs).mean()) if costs else 1.0
+    Q, R, nx, apart = scale * Q, scale * R, len(Q), dict[str, str]()
+    names = (*lin.state_names, *input_keys(lin))
+    for index, (value, largest) in given.items():
+        matrix, at = (Q, index) if index < nx else (R, index - nx)
+        own = float(matrix[at, at])
+        if terms.any() and not largest and value > 0.0 and own > 0.0:
+            ratio = value / own
+            if not 1.0 / _APART < ratio < _APART:
+                apart[names[index]] = f"{names[index]} is {value:.3g}, the rule gives {own:.3g}"
+        matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
+    if apart:
+        warnings.warn(
+            f"the weights given differ in scale from the rule's weights: {listed(apart.values())}; "
+            "one of the two groups will dominate the cost, so give largest acceptable values "
+            "(bryson) instead of weights",
+            FflinWarning,
+            stacklevel=4,
+        )
+    return Q, R

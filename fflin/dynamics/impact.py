@@ -31,8 +31,8 @@ class Impact(FrozenArrays):
     q, v : ndarray (nq,), (nv,)
         Configuration and velocity of this robot just after the impact.
     impulse : ndarray (k,)
-        For `jam`, the impulse on each jammed joint: [N m s] if it is revolute, [N s] if it is
-        prismatic. For `capture`, see `Capture`.
+        For `jam`, the impulse on each jammed joint: [N m s] for a revolute joint, [N s] for a
+        prismatic joint. For `capture`, see `Capture`.
     energy_lost : float
         Kinetic energy lost in the impact [J], never negative.
     momentum : ndarray (6,)
@@ -111,7 +111,7 @@ def jam(
         If a size or value is wrong, no joint is named, a mode of a flexible appendage is named, or
         the robot would have no input left.
     ModelError
-        If the robot was changed after it was made.
+        If the robot's model was changed after the robot was made.
 
     Examples
     --------
@@ -206,8 +206,8 @@ class Capture(Impact):
         Impulse on the robot about the origin of the payload's frame, in the axes of this frame:
         linear [N s], then angular [N m s].
     payload : Robot
-        The grasped payload as a robot. Its configuration and velocity just before the impact are
-        ``payload_q`` (nq,) and ``payload_v`` (nv,).
+        The grasped payload as a robot. The configuration and velocity of the payload just before
+        the impact are ``payload_q`` (nq,) and ``payload_v`` (nv,).
     prefix : str
         Name of the payload's frame in the combined robot.
 
@@ -287,7 +287,7 @@ def capture(
     UnknownNameError
         If there is no such frame.
     InputError
-        If one of these holds:
+        If one of these conditions is true:
 
         - a size or value is wrong;
         - the payload's inertia is not physically realisable;
@@ -295,7 +295,7 @@ def capture(
         - robot and payload have different gravity or orbits;
         - a wheel of the payload has momentum but no inertia.
     ModelError
-        If a robot was changed after it was made.
+        If the model of a robot was changed after the robot was made.
 
     References
     ----------

@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.names import by_name, input_keys, rates_by_name
-from fflin.base.validation import Array, numbers, placement
+from fflin.base.validation import Array, instance, numbers, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.fields import combined
@@ -52,8 +52,7 @@ def configuration(
            0.        , 1.        , 1.        , 0.        , 0.92106099,
            0.38941834, 1.        , 0.        ])
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot has type {type(robot).__name__}, expected a fflin.Robot")
+    instance("robot", robot, Robot, "a fflin.Robot")
     q = pin.neutral(robot.model)
     if base is not None:
         root = robot.model.jointPlacements[ROOT]
@@ -90,7 +89,7 @@ def start_of(robot: Robot) -> tuple[Array, Array]:
 def point_of(
     state: StateMap, x0: Any, q0: Any, v0: Any, default: Callable[[], tuple[Array, Array]]
 ) -> tuple[Array, Array]:
-    """Return the configuration (nq,) and velocity (nv,) that a caller gives, as x or as q and v."""
+    """Return the configuration (nq,) and velocity (nv,) from x or from q and v."""
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:

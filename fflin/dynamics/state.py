@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from fflin.base import rotation as turning
 from fflin.base.errors import ChartError, InputError
-from fflin.base.validation import Array, placement, vector
+from fflin.base.validation import Array, instance, placement, vector
 from fflin.dynamics import names
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
 from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR, Frame
@@ -54,7 +54,7 @@ class StateMap:
     in_reference : tuple of slice
         Rows of a velocity or wrench (6 + n) that are in reference axes.
     S : ndarray (nv, 6 + n) or None
-        Matrix of v = S nu if the robot has mimic joints or modes; otherwise None, and v is a
+        Matrix of v = S nu if the robot has mimic joints or modes. None means that v is a
         permutation of nu.
     unbounded : ndarray of int
         Indices of the continuous joints among the n joints.
@@ -70,7 +70,7 @@ class StateMap:
     InputError
         If the frame is unknown or the reference is not a pin.SE3.
     ModelError
-        If the robot's model was changed after it was made.
+        If the robot's model was changed after the robot was made.
 
     Examples
     --------
@@ -88,11 +88,7 @@ class StateMap:
     def __init__(
         self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame | None = None
     ) -> None:
-        if not isinstance(robot, Robot):
-            raise InputError(
-                f"robot has type {type(robot).__name__}, expected a fflin.Robot; fflin.load makes "
-                "one"
-            )
+        instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
         robot.require_unchanged()
         n, self.robot = robot.n, robot
         self.frame = names.frame_of(robot, frame)
@@ -268,7 +264,7 @@ class StateMap:
         return q[0], v[0]
 
     def points(self, x: Array) -> tuple[Chart, Array, Array]:
-        """Return the charts, configurations and velocities of many states (N, nx)."""
+        """Return the attitude charts, configurations and velocities of states (N, nx)."""
         g = self.groups
         if not np.isfinite(x).all():
             raise InputError("x has entries that are not finite; give finite numbers")
@@ -305,7 +301,7 @@ class StateMap:
         return v
 
     def lift(self, forces: Array) -> Array:
-        """Return a tau (nv, ...) with the given generalised forces (6 + n, ...) in base axes."""
+        """Return tau (nv, ...) from generalised forces (6 + n, ...) in base axes."""
         tau = np.zeros((self.robot.nv, *forces.shape[1:]))
         tau[self._order] = forces
         if self._scaled:
@@ -320,14 +316,14 @@ class StateMap:
         return (own.T * self._scale).T if self._scaled else own
 
     def columns(self, matrix: Array) -> Array:
-        """Return ``matrix S``: columns (..., nv) for Pinocchio's v, converted to state order."""
+        """Return ``matrix S``: columns (..., nv) converted from Pinocchio's v to state order."""
         if self._mimics:
             return matrix @ np.asarray(self.S)
         own = matrix.take(self._order, axis=1)
         return own * self._scale if self._scaled else own
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
-        """Return ``S^T matrix S`` (7.3): a matrix (nv, nv) for v, converted to state order."""
+        """Return ``S^T matrix S`` (7.3): a matrix (nv, nv) converted from v to state order."""
         if self._mimics and self.S is not None:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.

@@ -42,7 +42,7 @@ class CLaw:
     folder : path
         Folder that `write_c` wrote.
     name : str, optional
-        The `name` given to `write_c`. It is necessary only if the folder contains several laws.
+        The `name` given to `write_c`; necessary only if the folder contains several laws.
     compiler : str
         Command of the C compiler.
 
@@ -64,7 +64,7 @@ class CLaw:
     MissingPackageError
         If there is no C compiler.
     InputError
-        If the code cannot be compiled, or it was written from a design without a model.
+        If the code cannot be compiled, or was written from a design without a model.
 
     Examples
     --------

@@ -36,8 +36,8 @@ class Equilibrium(FrozenArrays):
     Attributes
     ----------
     q : ndarray (nq,)
-        Equilibrium configuration, the argument q of `linearize`. It differs from the given
-        configuration by the spring deflections of passive joints.
+        Equilibrium configuration, the argument q of `linearize`. The equilibrium differs from the
+        given configuration by the spring deflections of passive joints.
     u : ndarray (nu,)
         Minimum-norm inputs, the argument u of `linearize`.
     sag : ndarray (n,)
@@ -136,7 +136,7 @@ def equilibrium(
     Raises
     ------
     EquilibriumError
-        If one of these holds:
+        If one of these conditions is true:
 
         - no inputs balance the forces; the message names the residual forces;
         - springs are too weak for their load, or Newton's method does not converge;

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.record import Design
-from fflin.base.validation import Array, as_double, instance, number, vector
+from fflin.base.validation import Array, instance, number, shaped, vector
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
@@ -315,9 +315,5 @@ def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array
 
 def _difference(name: str, given: ArrayLike | None, expected: Array) -> Array:
     """Return by how much a matrix of the caller is more than expected."""
-    array = expected if given is None else as_double(name, given)
-    if array.shape != expected.shape or not np.isfinite(array).all():
-        raise InputError(
-            f"{name} has shape {array.shape}, expected finite numbers of shape {expected.shape}"
-        )
+    array = expected if given is None else shaped(name, given, expected.shape)
     return np.asarray(array - expected)

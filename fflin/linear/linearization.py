@@ -57,7 +57,7 @@ class Prepared:
 
     @cached_property
     def fields(self) -> dict[str, Any]:
-        """Fields of a model at rest except B and q; some take as long to make as the dynamics."""
+        """Fields of a model at rest except B and q; expensive fields are computed on demand."""
         state = partial(_state_at, self)
         asked = {"x0": state, "y0": state, "_reference": partial(own_reference, self.robot)}
         other = {} if self.own_reference else {"_reference": self.reference}
@@ -195,8 +195,8 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
 class Linearizer:
     r"""Linearisation of one robot at many points; data common to all points are prepared once.
 
-    Threads may share a `Linearizer`, but only one thread computes at a time. Every copy, including
-    a pickled one, has its own work space.
+    Threads may share a `Linearizer`, but only one thread computes at a time. Every copy, also by
+    pickle, has a separate work space.
 
     At rest, with N = blkdiag(E3/2, E3, En) and the joint-space inertia M in state order,
 
@@ -207,9 +207,10 @@ class Linearizer:
     At other points :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
     :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`, then transformed to the chart and the
     velocity frame. The dynamics do not depend on the position and linear velocity of the base
-    (Galilean invariance). The evaluation sets both to zero, so that a large distance from the
-    origin does not reduce the accuracy. The equations are in docs/derivation.md. Section 14 of
-    this document is about a robot in orbit, whose rates are relative to the orbital frame.
+    (Galilean invariance). The evaluation sets the position and linear velocity of the base to
+    zero, so that a large distance from the origin does not reduce the accuracy. The equations are
+    in docs/derivation.md. Section 14 of this document is about a robot in orbit, whose rates are
+    relative to the orbital frame.
 
     Parameters
     ----------
@@ -228,12 +229,13 @@ class Linearizer:
           a steady spin, require a moving reference.
     engine : {"python", "compiled"}, optional
         Engine for the accelerations of points with velocity, springs or forces: Python by
-        default, or the compiled kernel of sweeps. Both engines agree to machine precision.
+        default, or the compiled kernel of sweeps. The Python engine and the compiled engine agree
+        to machine precision.
 
     Raises
     ------
     InputError
-        If one of these holds:
+        If one of these conditions is true:
 
         - the frame is unknown, or the reference is not a pin.SE3;
         - `moving` is given with a reference, or with a frame other than "local";

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError, MissingPackageError
-from fflin.base.validation import Array, FrozenArrays, frozen, number
+from fflin.base.validation import Array, FrozenArrays, frozen, number, positive
 from fflin.linear.sampling import held_exponential
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class LinearModel(StateSpace):
         Versions of the packages that made the model.
     verified : bool
         True for a model computed in this session, or read from a file with a valid SHA-256 digest.
-        False for a model read from a file without a digest, and for every result derived from it.
+        False for a model read from a file without a digest, and for every result of such a model.
     weights : mapping
         Default weights of `lqr`, in the form of `Robot.replace`.
     mean_motion : float
@@ -321,12 +321,10 @@ class LinearModel(StateSpace):
         InputError
             If `dt` is not positive or the model is already sampled.
         ModelError
-            If the robot's model was changed after it was made.
+            If the robot's model was changed after the robot was made.
         """
         self.require_unchanged()
-        dt = number("dt", dt)
-        if dt <= 0.0:
-            raise InputError(f"dt is {dt:g} s, expected a positive sampling time")
+        dt = positive("dt", dt, "s")
         if self.dt:
             raise InputError(
                 f"the model is already sampled, at dt = {self.dt:g} s; discretize the "
@@ -369,7 +367,7 @@ class LinearModel(StateSpace):
         MissingPackageError
             If python-control is not installed.
         ModelError
-            If the robot's model was changed after it was made.
+            If the robot's model was changed after the robot was made.
         """
         self.require_unchanged()
         matrices = (self.A, self.B, self.C, self.D)

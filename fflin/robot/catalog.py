@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
 
-from fflin.base.errors import FileError, InputError, UrdfError, unknown
+from fflin.base.errors import FileError, InputError, UrdfError, require_known, unknown
 
 # example-robot-data's talos_legs is talos cut off at the torso, done in its loader's code.
 _PRUNED = {"talos_legs": ("torso_1_joint",)}
@@ -53,7 +53,7 @@ def _example_robot_data() -> dict[str, RobotFile]:
 
 
 def list_robots() -> tuple[str, ...]:
-    """Return all robot names that `load` accepts: first bundled, then from example-robot-data.
+    """Return all robot names that `load` accepts: bundled, then from example-robot-data.
 
     Returns
     -------
@@ -91,8 +91,7 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
             "'cassie' exists only as SDF, which the packaged Pinocchio cannot read; load another "
             "robot, or build a pin.Model for fflin.from_model"
         )
-    if text not in _example_robot_data():
-        raise unknown("robot", text, list_robots())
+    require_known("robot", [text], list_robots())
     return _example_robot_data()[text]
 
 

@@ -222,14 +222,14 @@ class ReactionWheel(WrenchInput):
     Mass and inertia of the carrier in the URDF must include the wheel, as if it were welded.
 
     With an ``inertia`` J, the speed of the wheel is a state. The robot gets one more joint: a
-    continuous joint with the wheel's name. In the state vector, it comes after all joints that the
-    carrier carries. The inertia J a a^T is transferred from the carrier to the wheel; mass and
+    continuous joint with the wheel's name. In the state vector, the wheel comes after all joints
+    on its carrier. The inertia J a a^T is transferred from the carrier to the wheel; mass and
     transverse inertia stay with the carrier.
 
     If ``inertia`` is omitted, the wheel is modelled only by the torques on its carrier: the
     reaction -u a, and the gyroscopic torque :math:`-\omega \times h a` of the wheel's ``momentum``
-    h. This model is the limit of a small and fast wheel: h is constant even if u is nonzero, and
-    J is part of the carrier's inertia.
+    h. A wheel without inertia is the limit of a small and fast wheel: h is constant even if u is
+    nonzero, and J is part of the carrier's inertia.
 
     Parameters
     ----------
@@ -241,7 +241,8 @@ class ReactionWheel(WrenchInput):
         Moment of inertia J [kg m^2] about the axis. The carrier must have a larger inertia about
         the same axis.
     name : str, optional
-        Name of the input, and of the joint if there is one; wheel_1, wheel_2, ... by default.
+        Name of the input, and of the joint of a wheel with inertia; wheel_1, wheel_2, ... by
+        default.
     momentum : float
         Constant angular momentum h [N m s] along the axis, relative to the carrier; only if
         `inertia` is omitted.
@@ -301,7 +302,7 @@ KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, 
 
 
 def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
-    """Return three finite floats, or raise `InputError` that says what was given."""
+    """Return three finite floats, or raise `InputError` with the given value."""
     refuse_masked(what, value)
     try:
         x, y, z = (float(entry) for entry in value)

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, ModelError
+from fflin.base.validation import instance
 from fflin.base.writing import as_path, remember
 from fflin.robot.catalog import RobotFile, find_mesh, find_robot
 from fflin.robot.fields import FIELDS
@@ -46,10 +47,11 @@ def load(
         robot file is a TOML file that names a URDF and sets fields of the robot; see the guide.
         No mesh is loaded.
     lock : mapping or iterable of str, optional
-        Joints to weld: {joint: value [rad|m]} (None: at neutral), or their names. A name may be a
-        pattern, ``hinge_*``. The mimic joints of a locked joint are also welded.
+        Joints to weld: {joint: value [rad|m]} (None: at the neutral position), or names of
+        joints. A name may be a pattern, ``hinge_*``. The mimic joints of a locked joint are also
+        welded.
     package_dirs : sequence of path
-        Folders to search for ``package://`` meshes when the robot is drawn. These folders are
+        Folders to search for ``package://`` meshes when the robot is drawn. The given folders are
         searched before the folders that contain the URDF.
     **fields
         inputs, outputs, stiffness, damping, rest, gravity, orbit, limits, passive, weights, start:
@@ -178,7 +180,7 @@ def from_model(
     Raises
     ------
     ModelError
-        If one of these holds:
+        If one of these conditions is true:
 
         - the root is not a single free-flyer;
         - a joint has more than one degree of freedom;
@@ -194,8 +196,7 @@ def from_model(
     """
     if not isinstance(model, pin.Model):
         raise ModelError(f"the model has type {type(model).__name__}, expected a pin.Model")
-    if name is not None and not isinstance(name, str):
-        raise InputError(f"name has type {type(name).__name__}, expected a string")
+    instance("name", name, str | None, "a string")
     copy = model.copy()
     copy.gravity.setZero()
     name = name or model.name or "model"

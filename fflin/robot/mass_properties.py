@@ -1,4 +1,4 @@
-r"""Mass of each link as the URDF gives it, and bodies that stay physically realisable.
+r"""Mass of each link as in the URDF, and changes to physically realisable bodies.
 
 A body has mass m, centre of mass c and inertia I about c. With the identity matrix E, the second
 moments of its mass distribution are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The body is
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, listed, unknown
+from fflin.base.errors import InputError, listed, require_known
 from fflin.base.names import by_name
 from fflin.base.validation import Array, as_double, number, positive, vector, whole
 from fflin.base.validation import by_name as mapping
@@ -66,9 +66,7 @@ def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
             f"'{name}' has type {type(value).__name__}, expected {{'mass': m, 'com': (3,), "
             "'inertia': (3, 3)} or a pin.Inertia"
         )
-    for key in value:
-        if key not in _KEYS:
-            raise unknown("mass property", key, _KEYS)
+    require_known("mass property", value, _KEYS)
     mass = positive(f"mass {of}", value["mass"], "kg") if "mass" in value else old.mass
     com = vector(f"com {of}", value.get("com", old.lever), 3, "a point in the body's frame")
     if "inertia" not in value:

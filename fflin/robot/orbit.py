@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import KW_ONLY, asdict, dataclass
 from typing import Any
 
-from fflin.base.errors import FflinWarning, InputError, unknown
+from fflin.base.errors import FflinWarning, InputError, require_known
 from fflin.base.validation import number, positive
 
 # Gravitational parameter [m^3/s^2] and equatorial radius [m]: JPL DE440, IAU 2015.
@@ -35,13 +35,14 @@ class CircularOrbit:
     r"""Circular orbit about a central body.
 
     The robot is described relative to a frame whose origin moves along the orbit in free fall.
-    The frame rotates with the orbit. Its axes are one of
+    The frame rotates with the orbit. The axes of the rotating frame are one of
 
     - ``lvlh``: x along the orbit, y opposite to the orbit normal, z towards the central body;
     - ``hill``: x away from the central body, y along the orbit, z along the orbit normal.
 
-    This rotating frame is Pinocchio's world, and velocities are relative to this frame. The
-    gravity gradient is linear in the position x relative to the origin: the force per mass is
+    The rotating frame is Pinocchio's world, so that velocities are relative to the rotating
+    frame. The gravity gradient is linear in the position x relative to the origin: the force per
+    mass is
     :math:`n^2 (3 r r^T - E) x`, with the unit vector r away from the central body and the
     identity E. The relative error of this linearisation is of the order of ``|x|`` divided by the
     orbit's radius.
@@ -101,8 +102,8 @@ class CircularOrbit:
             raise InputError(
                 "only one of mu and body_radius is given; give both values, or leave both out"
             )
-        if self.mu is None and self.body not in BODIES:
-            raise unknown("central body", self.body, BODIES)
+        if self.mu is None:
+            require_known("central body", [self.body], BODIES)
         given = [value for value in (self.altitude, self.mean_motion) if value is not None]
         if len(given) != 1:
             said = "both are" if given else "neither is"
@@ -174,12 +175,10 @@ class CircularOrbit:
 
 
 def checked_orbit(value: Any) -> CircularOrbit | None:
-    """Return the orbit that a field says: one, its altitude [m], its parts by name, or none."""
+    """Return the orbit of a field: an orbit, an altitude [m], a mapping of parts, or None."""
     if value is None or isinstance(value, CircularOrbit):
         return value
     if not isinstance(value, Mapping):
         return CircularOrbit(number("orbit", value))
-    for name in value:
-        if name not in CircularOrbit.__dataclass_fields__:
-            raise unknown("part of orbit", name, CircularOrbit.__dataclass_fields__)
+    require_known("part of orbit", value, CircularOrbit.__dataclass_fields__)
     return CircularOrbit(**value)

@@ -7,7 +7,7 @@ Reference axes are the axes of the reference placement that the state is relativ
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError, require_known
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,8 @@ class Accelerometer(FrameOutput):
     """Output of an accelerometer: specific force (3,) [m/s^2] of a frame, in its own axes.
 
     The specific force is the acceleration of the frame's origin minus gravity. The specific force
-    is zero in free fall without rotation and thrust. At rest under gravity, it is +g upwards.
+    is zero in free fall without rotation and thrust. At rest under gravity, the specific force is
+    +g upwards.
 
     Parameters
     ----------
@@ -282,8 +283,7 @@ def parse_output(text: str) -> tuple[Output, ...]:
     """Read outputs as a command line has them: WORD, joints:NAME, pose:NAME, relative:NAME:TO."""
     word, colon, rest = text.partition(":")
     kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
-    if word not in kinds:
-        raise unknown("output", word, tuple(kinds))
+    require_known("output", [word], kinds)
     kind = kinds[word][0]
     if rest and issubclass(kind, JointOutput):
         return (kind((rest,)),)

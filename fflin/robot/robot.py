@@ -204,7 +204,7 @@ class Robot(Coordinates):
             `point`.
         limits : mapping
             {name, group or pattern of inputs or states: largest magnitude, or (least, largest)}.
-            These limits replace the limits of the URDF and of the inputs.
+            Limits given here replace the limits of the URDF and of the inputs.
 
         Returns
         -------
@@ -213,7 +213,7 @@ class Robot(Coordinates):
         Raises
         ------
         InputError
-            If one of these holds:
+            If one of these conditions is true:
 
             - a value is negative or not a number;
             - a wheel has a larger inertia than the link that carries it;
@@ -222,8 +222,8 @@ class Robot(Coordinates):
             If a field, a joint, a frame of an input or output, or a name in `limits` does not
             exist.
         ModelError
-            If dry friction is given (it is not differentiable at rest), or if the robot's model was
-            changed after the robot was made.
+            If dry friction is given, which is not differentiable at rest, or the robot's model
+            was changed after the robot was made.
         """
         self.require_unchanged()
         robot = self

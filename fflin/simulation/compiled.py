@@ -30,7 +30,7 @@ _log = logging.getLogger("fflin")
 
 
 def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> str:
-    """Return which loop does a plan, or many runs of it: as asked for, or by the rule.
+    """Return the engine for a plan or many runs of it: as requested, or by the rule.
 
     Many runs go by the compiled loop where it can run them; one does if it is long and the machine
     code is there already.
@@ -49,7 +49,7 @@ def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> s
 
 
 def _reason(plan: Plan, plant: Plant) -> str:
-    """Say what keeps a plan from the compiled loop; nothing where it can run it."""
+    """Return why the compiled loop cannot run a plan; empty if it can."""
     policy, robots = plan.policy, [plant.robot]
     if not numba_is_there():
         return "numba is not installed (pip install 'fflin[fast]')"

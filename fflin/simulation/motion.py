@@ -60,9 +60,9 @@ class Motion(Design):
         Angular momentum about the centre of mass [N m s], then linear momentum [N s], in world
         axes. In orbit, `momentum` is the momentum of the motion relative to the orbital frame.
     momentum_drift : ndarray (N,)
-        Difference between the momentum and its expected value: the initial momentum plus the
-        impulse since then. The difference is divided by the largest momentum that the kinetic
-        energy permits, see (11.5) of docs/derivation.md:
+        Difference between the momentum and its expected value, the initial momentum plus the
+        impulse of external forces. The difference is divided by the largest momentum that the
+        kinetic energy permits, see (11.5) of docs/derivation.md:
 
         - Linear part: the mass times the root-mean-square speed of the mass elements in the
           fastest row.
@@ -70,18 +70,19 @@ class Motion(Design):
           position, plus the momentum stored in wheels.
 
         Momentum is not conserved in orbit. In orbit, the drift is the difference between `energy`
-        and its expected value, relative to the largest terms of the energy. The expected value is
-        the initial energy plus the work since then.
+        and its expected value, relative to the largest terms of the energy. The expected energy
+        is the initial energy plus the work of inputs and disturbances.
     com_drift : ndarray (N,)
         Distance [m] of the centre of mass from the position predicted by its initial velocity and
-        the impulse since then. The array is empty in orbit, or if the file lacks these data.
+        the impulse of external forces. The array is empty in orbit, or if the file lacks these
+        data.
     state_names, input_names, state_units, input_units : tuple of str
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
     robot, urdf_sha256 : str
     stopped : str
         Reason why the run ended early; empty if the run was completed.
     wheels : tuple of str
-        Joints that are reaction wheels. Their angles are not included in the errors.
+        Joints that are reaction wheels. Wheel angles are not included in the errors.
     wheel_inertias : ndarray (k,)
         Inertias of the wheels about their axes [kg m^2]; empty if the file lacks the inertias.
     modes : tuple of str
@@ -91,7 +92,7 @@ class Motion(Design):
         Rotation [rad] of the structure per unit of each mode's amplitude; 0 if a mode causes no
         rotation. A mode of a flexible appendage rotates the appendage's mass by w and displaces
         it by v, at the distance c from the appendage's frame. The rotation is :math:`|w| + |v| /
-        |c|`. The second term is omitted if c is below 5 % of the radius of gyration of the
+        |c|`. The term with c is omitted if c is below 5 % of the radius of gyration of the
         carrying body.
     steered : tuple of str
         States that the policy feeds back; empty if these states are not known.
@@ -102,8 +103,8 @@ class Motion(Design):
     engine : str
         Engine that ran the loop, "compiled" or "python"; empty if the engine is not known.
     limits : ndarray (k, 2)
-        Lower and upper limits of `limit_names`; infinite if there is no limit on that side. All
-        limits are listed, also limits that the simulation does not enforce.
+        Lower and upper limits of `limit_names`; infinite if there is no limit. All limits are
+        listed, also limits that the simulation does not enforce.
     phases, starts : tuple of str, ndarray (k,)
         Names and start times [s] of the phases of a motion that `then` joined.
 
@@ -237,8 +238,8 @@ class Motion(Design):
         -------
         Motion
             Joined motion on one time axis, in the states and the chart of this motion. A jammed
-            joint is at rest. In each phase, energy and momentum are computed for the robot of
-            that phase.
+            joint is at rest. In each phase, energy and momentum are computed for the robot of the
+            phase.
 
         Raises
         ------
@@ -254,8 +255,8 @@ class Motion(Design):
         """Return the motion as a trajectory whose inputs are held or interpolated linearly.
 
         The interpolation of inputs between rows (held or linear) is the one that fits the
-        dynamics better. If inputs change continuously, the input at the last row is extrapolated,
-        because it is not recorded. A motion that was read from a file needs the `robot`.
+        dynamics better. If inputs change continuously, the input at the last row, which is not
+        recorded, is extrapolated. A motion that was read from a file needs the `robot`.
         """
         from fflin.linear.trajectory import along
 

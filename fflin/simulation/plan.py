@@ -1,8 +1,10 @@
 """The checked plan of a simulation: start, times, limits, method and events."""
 
-from collections.abc import Callable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -34,11 +36,40 @@ from fflin.simulation.plant import Disturbance, Plant
 from fflin.simulation.prediction import Predictor, predictor
 from fflin.simulation.times import Times, times_of
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 Event: TypeAlias = Callable[[float, Array, Array], float]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
+Limits: TypeAlias = "float | str | Mapping[str, Any] | Sequence[Any]"
 
 # A share of a step that is no longer part of what comes after it.
 _BEFORE = 1e-6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SimulationOptions:
+    """Options of a simulation as they are given; see `simulate` for the meaning of each."""
+
+    x0: ArrayLike | None = None
+    q0: ArrayLike | None = None
+    v0: ArrayLike | None = None
+    duration: float | None = None
+    dt: float | None = None
+    method: str = "cf4"
+    project: bool = True
+    sample: float | None = None
+    delay: float = 0.0
+    limits: Limits | None = None
+    disturbance: Disturbance | None = None
+    events: Sequence[Event] = ()
+    callback: Callback | None = None
+    linear: LinearModel | bool | None = None
+    target: LinearModel | ArrayLike | None = None
+    frame: Frame | None = None
+    reference: pin.SE3 | None = None
+    every: int | None = None
+    progress: bool | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,22 +96,22 @@ class Plan:
     target: Array | None  # the state (nx,) that is steered to, where one is known
     reference: Reference | None  # the motion that is followed, where there is one
     steered: tuple[str, ...]  # the states that are known to be fed back
-    notes: tuple[str, ...]  # what is to be said of the run
+    notes: Callable[[], tuple[str, ...]]  # returns the remarks for the report, which take a moment
     predictor: Predictor | TrajectoryFeedback | None  # of the linear motion under the same law
 
     @property
     def last_node(self) -> float:
-        """When in a step, of 1, its last stage asks: before a knot at its end where inputs jump."""
+        """Time of the last stage, relative to the step; below 1 if inputs jump at knots."""
         return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
 
     @property
     def repeatable(self) -> bool:
-        """Whether nothing that it calls is a function of the caller's, which may remember."""
+        """Whether the plan calls no user functions, which may have an internal state."""
         bound_anew = self.policy is None or hasattr(self.policy, "bind")
         return bound_anew and not self.events and self.callback is None
 
     def channel(self) -> Channel | None:
-        """Return the way of the law's commands to the inputs, with nothing on it yet."""
+        """Return the channel of the law's commands to the inputs, without pending commands."""
         if self.law is None:
             return None
         return Channel(
@@ -94,7 +125,11 @@ class Plan:
 
 
 def start_of(
-    state: StateMap, x0: Any, q0: Any, v0: Any, reference: Reference | None
+    state: StateMap,
+    x0: ArrayLike | None,
+    q0: ArrayLike | None,
+    v0: ArrayLike | None,
+    reference: Reference | None,
 ) -> tuple[Array, Array]:
     """Return the initial configuration and velocity (nq,), (nv,)."""
 
@@ -109,7 +144,7 @@ def start_of(
     return q, v
 
 
-def target_of(state: StateMap, target: Any) -> Array | None:
+def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array | None:
     """Return the state (nx,) that is given, or that a model's point is; None where none is."""
     if target is None:
         return None
@@ -136,52 +171,38 @@ def target_of(state: StateMap, target: Any) -> Array | None:
 
 
 def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law | None:
-    """Return the policy bound to the robot, of which nothing but inputs is taken."""
+    """Return the policy bound to the robot, with checked inputs."""
     if policy is None:
         return None
     within = (limits.low, limits.high)
     return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
 
 
-def planned(
-    robot: Robot,
-    policy: Any,
-    x0: Any = None,
-    q0: Any = None,
-    v0: Any = None,
-    duration: float | None = None,
-    dt: float | None = None,
-    method: str = "cf4",
-    project: bool = True,
-    sample: float | None = None,
-    delay: float = 0.0,
-    limits: Any = None,
-    disturbance: Disturbance | None = None,
-    events: Sequence[Event] = (),
-    callback: Callback | None = None,
-    linear: LinearModel | bool | None = None,
-    target: Any = None,
-    frame: Frame | None = None,
-    reference: pin.SE3 | None = None,
-    every: int | None = None,
-    progress: bool | None = None,
-) -> tuple[Plan, Plant]:
-    """Return the checked plan of `simulate` with these arguments, and the robot that moves."""
+def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan, Plant]:
+    """Return the checked plan of `simulate` with these options, and the robot that moves."""
     policy = followed(policy, robot)
-    times = times_of(policy, duration, dt, every, sample, delay)
+    times = times_of(
+        policy,
+        options.duration,
+        options.dt,
+        options.every,
+        options.sample,
+        options.delay,
+    )
     policy = followed(policy, robot, held=times.sample * times.dt)
     lin, _ = feedback_of(policy)
     follows = reference_of(policy)
-    state = _state_of(robot, policy, frame, reference)
-    plant = Plant(state, disturbance)
-    foresees = predictor(plant, policy, linear)
-    q, v = start_of(state, x0, q0, v0, follows)
+    state = _state_of(robot, policy, options.frame, options.reference)
+    plant = Plant(state, options.disturbance)
+    foresees = predictor(plant, policy, options.linear)
+    q, v = start_of(state, options.x0, options.q0, options.v0, follows)
     if plant.field:
         plant.field.require_near(q)
-    times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
-    acting, known = chosen_limits(robot, limits)
+    times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=options.dt is None)
+    acting, known = chosen_limits(robot, options.limits)
     within = saturation(robot, acting, q, times.dt, times.sample, pulsed=policy is not None)
     law = law_of(policy, plant, within, times)
+    target = options.target
     follows = follows if target is None else None
     goal = target_of(state, lin if target is None else target)
     initial = _initial_inputs(policy, plant, within)
@@ -196,18 +217,18 @@ def planned(
         limits=within,
         wheels=[robot.joint(name).idx_v for name in within.wheel_names],
         known=known,
-        method=_integrator_of(method, times),
-        project=truth("project", project) and robot.orbit is None,
+        method=_integrator_of(options.method, times),
+        project=truth("project", options.project) and robot.orbit is None,
         turning=_turning(robot),
         chart=None if lin is None else state,
-        events=_checked_functions(events, callback),
-        callback=callback,
-        progress=progress,
-        near=near if x0 is None else np.asarray(x0, dtype=float),
+        events=_checked_functions(options.events, options.callback),
+        callback=options.callback,
+        progress=options.progress,
+        near=near if options.x0 is None else np.asarray(options.x0, dtype=float),
         target=goal,
         reference=follows,
         steered=fed_back(policy),
-        notes=(*growing(policy), *notes_of(policy, robot), *times.notes),
+        notes=lambda: (*growing(policy), *notes_of(policy, robot), *times.notes),
         predictor=foresees,
     )
     return plan, plant

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,6 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
 from fflin.control.policies import Policy, StateFeedback
 from fflin.dynamics.state import Frame, state_history
 from fflin.linear.model import LinearModel
@@ -18,7 +17,7 @@ from fflin.robot.robot import Robot
 from fflin.simulation.compiled import carried_out, engine_of
 from fflin.simulation.conservation import conserved_by
 from fflin.simulation.motion import Motion
-from fflin.simulation.plan import Event, Plan, planned
+from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions, planned
 from fflin.simulation.plant import Disturbance, Plant
 from fflin.simulation.prediction import predict
 from fflin.simulation.run import Recording
@@ -47,10 +46,10 @@ def simulate(
     project: bool = True,
     sample: float | None = None,
     delay: float = 0.0,
-    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = None,
+    limits: Limits | None = None,
     disturbance: Disturbance | None = None,
     events: Sequence[Event] = (),
-    callback: Callable[[float, Array, Array, Array], None] | None = None,
+    callback: Callback | None = None,
     linear: LinearModel | bool | None = None,
     target: LinearModel | ArrayLike | None = None,
     frame: Frame | None = None,
@@ -91,11 +90,11 @@ def simulate(
     duration : float, optional
         Simulated time [s]; by default the duration of the followed trajectory.
     dt : float, optional
-        Step [s]; by default 0.01, or less if the loop's fastest pole or the samples require it. If
-        the default step diverges, the simulation is repeated with a quarter of it, up to three
-        times, and `Motion.notes` report this. A simulation with an event, a callback, a
-        disturbance or a custom Python policy is not repeated, because such a function may have an
-        internal state. If the input is neither sampled nor delayed, the step is adjusted to
+        Step [s]; by default 0.01, or less if the loop's fastest pole or the samples require a
+        shorter step. If the default step diverges, the simulation is repeated with a quarter of
+        it, up to three times, and `Motion.notes` report this. A simulation with an event, a
+        callback, a disturbance or a custom Python policy is not repeated, because such a function
+        may have an internal state. For continuous policies without delay, the step is adjusted to
         divide the duration.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
@@ -147,9 +146,10 @@ def simulate(
         Whether to show a progress bar on stderr; by default on a terminal, for long runs.
     engine : {"python", "compiled"}, optional
         Engine that runs the loop. The default is Python, except that a run of more than 20,000
-        steps uses the compiled engine if it has already been compiled. The compiled engine needs
-        numba. The compiled engine supports no orbits, and no policies, events, callbacks or
-        disturbances written in Python. Both engines agree to machine precision.
+        steps uses the compiled engine if this engine has already been compiled. The compiled
+        engine needs numba. The compiled engine supports no orbits, and no policies, events,
+        callbacks or disturbances written in Python. The Python engine and the compiled engine
+        agree to machine precision.
 
     Returns
     -------
@@ -186,33 +186,28 @@ def simulate(
     >>> motion.u.shape[1], float(motion.t[-1])
     (9, 5.0)
     """
-
-    def prepared(dt: float | None, every: int | None) -> tuple[Plan, Plant]:
-        return planned(
-            robot,
-            policy,
-            x0=x0,
-            q0=q0,
-            v0=v0,
-            duration=duration,
-            dt=dt,
-            method=method,
-            project=project,
-            sample=sample,
-            delay=delay,
-            limits=limits,
-            disturbance=disturbance,
-            events=events,
-            callback=callback,
-            linear=linear,
-            target=target,
-            frame=frame,
-            reference=reference,
-            every=every,
-            progress=progress,
-        )
-
-    plan, plant = prepared(dt, every)
+    options = SimulationOptions(
+        x0=x0,
+        q0=q0,
+        v0=v0,
+        duration=duration,
+        dt=dt,
+        method=method,
+        project=project,
+        sample=sample,
+        delay=delay,
+        limits=limits,
+        disturbance=disturbance,
+        events=events,
+        callback=callback,
+        linear=linear,
+        target=target,
+        frame=frame,
+        reference=reference,
+        every=every,
+        progress=progress,
+    )
+    plan, plant = planned(robot, policy, options)
     # A function of the caller's may remember what it was called with.
     again = dt is None and plan.repeatable and disturbance is None
     most, spent, coarse = _MOST_SPENT * plan.times.steps, 0, list[str]()
@@ -226,7 +221,8 @@ def simulate(
             if not again or last or not run.stopped.startswith("diverged"):
                 break
             coarse.append(f"{plan.times.dt:g}")
-            plan, plant = prepared(plan.times.dt / _FINER, plan.times.every * _FINER)
+            finer, every = plan.times.dt / _FINER, plan.times.every * _FINER
+            plan, plant = planned(robot, policy, replace(options, dt=finer, every=every))
         motion = motion_of(plan, plant, run.engine, run)
     except MemoryError:
         raise InputError(
@@ -243,7 +239,7 @@ def simulate(
 
 
 def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = None) -> Motion:
-    """Return the motion that a plan leads to, or led to where its run is given."""
+    """Return the motion of a plan, or of a given run of the plan."""
     state, robot = plant.state, plant.robot
     conserved = conserved_by(robot, plan.q, plant.field)
     run = run or carried_out(plan, plant, conserved, engine)
@@ -280,7 +276,7 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         modes=tuple(joint.name for joint in robot.modes),
         mode_rotations=np.array([joint.rotation for joint in robot.modes]),
         steered=plan.steered,
-        notes=(*plan.notes, *getattr(plan.law and plan.law.policy, "notes", ())),
+        notes=(*plan.notes(), *getattr(plan.law and plan.law.policy, "notes", ())),
         limit_names=tuple(plan.known),
         limits=np.array(list(plan.known.values())).reshape(-1, 2),
     )

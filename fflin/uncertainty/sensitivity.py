@@ -13,7 +13,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.record import Record, write_record
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array, FrozenArrays, as_double, instance, numbers, whole
+from fflin.base.validation import Array, FrozenArrays, instance, numbers, shaped, whole
 from fflin.base.writing import as_path
 from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel
@@ -182,9 +182,7 @@ class Sensitivity:
         """
         lin = self.lin
         K = np.zeros(lin.B.T.shape) if gain is None else getattr(gain, "K", gain)
-        K = as_double("gain", K)
-        if K.shape != lin.B.T.shape:
-            raise InputError(f"gain has shape {K.shape}, expected {lin.B.T.shape} (nu, nx)")
+        K = shaped("gain", K, lin.B.T.shape, " (nu, nx)")
         from scipy.linalg import eig
 
         poles, left, right = eig(lin.A - lin.B @ K, left=True)
@@ -275,7 +273,7 @@ class Sensitivity:
 
 
 def sensitivity_record(found: Sensitivity) -> Record:
-    """Return what a file holds of a `Sensitivity`."""
+    """Return the entries of a file for a `Sensitivity`."""
     every = found.parameters.values()
     return record_of(found.lin) | {
         "parameters": list(found.names),

@@ -193,14 +193,15 @@ class Uncertain:
     ) -> Worst:
         """Search the uncertainty set for the worst closed loop u = -K x, and bound the stable set.
 
-        The result is at least as bad as every corner and draw that was tried. Its gains are
-        accurate to five digits. With more samples and the same seed, the result is at least as
-        bad as with fewer samples, because the search first repeats the smaller search.
+        The result is at least as bad as every corner and draw that was tried. The gains of the
+        worst case are accurate to five digits. With more samples and the same seed, the result is
+        at least as bad as with fewer samples, because the search first repeats the smaller
+        search.
 
         Parameters
         ----------
         gain : Gain or array_like (nu, nx)
-            Gain K. It must stabilise the robot at the middle of the ranges.
+            Gain K, which must stabilise the robot at the middle of the ranges.
         q : array_like (nq,), optional
             Configuration, as in `lft`.
         samples : int
@@ -249,7 +250,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     UnknownNameError
         If a parameter does not exist.
     InputError
-        If one of these holds:
+        If one of these conditions is true:
 
         - a range is empty, or relative to a nominal value of 0;
         - the robot at the middle of the ranges is not physically realisable;

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
-from fflin.base.validation import Array, as_double
+from fflin.base.validation import Array, shaped
 from fflin.control.margins import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.singular_value import largest_bound
@@ -103,9 +103,7 @@ class Worst:
 @in_one_thread
 def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     """Do what `Uncertain.worst` does."""
-    K = as_double("gain", getattr(gain, "K", gain))
-    if K.shape != lft.B2.T.shape:
-        raise InputError(f"gain has shape {K.shape}, expected {lft.B2.T.shape} (nu, nx)")
+    K = shaped("gain", getattr(gain, "K", gain), lft.B2.T.shape, " (nu, nx)")
     size, loops = len(lft.repeats), Loops(lft, K)
     middle = np.zeros((1, size))
     if loops.undamped(middle)[0] >= 0.0:
@@ -210,9 +208,9 @@ class Loops:
 
 
 def _largest(figures: Figures, tried: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
-    """Climb a figure from the first that was tried, and from each that is worse than what is found.
+    """Maximise a figure from the first sample, and from each sample worse than the result.
 
-    So nothing that was tried is worse than what is returned, and rows after others only add to it.
+    The result is therefore at least as bad as every sample, and more samples never improve it.
     """
     best, at = _climbed(figures, tried[0], makes)
     ahead = tried[1:]

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.validation import instance
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import find_frame, frame_index
 from fflin.robot.robot import ROOT, Robot
@@ -15,6 +16,8 @@ from fflin.view.page import packed
 
 if TYPE_CHECKING:
     from fflin.campaign.campaign import Campaign
+    from fflin.campaign.funnel import Funnel
+    from fflin.simulation.motion import Motion
 
 # With these a page grows by no more than 1.2 MB.
 _RUNS, _ROWS = 240, 150
@@ -25,13 +28,11 @@ _COLORS = {"base": "#a9c4e8", "tool": "#ffb877"}
 _COUNT, _THIN = 160, 1e-3
 
 
-def drawn_robot(robot: Robot, cloud: Any, motion: Any) -> Robot:
+def drawn_robot(robot: Robot, cloud: Campaign, motion: Motion) -> Robot:
     """Return the robot of a motion shown with a cloud, with the bodies that its run drew."""
     from fflin.campaign.campaign import Campaign
 
-    if not isinstance(cloud, Campaign):
-        said = f"cloud has type {type(cloud).__name__}, expected a Campaign"
-        raise InputError(f"{said}, as fflin.monte_carlo returns it")
+    instance("cloud", cloud, Campaign, "a Campaign, as fflin.monte_carlo returns it")
     if cloud.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
             f"cloud is a campaign of '{cloud.robot}', expected a campaign of the given robot "
@@ -62,14 +63,12 @@ def cloud_of(robot: Robot, campaign: Campaign, tool: str | None) -> list[dict[st
 
 
 def tubes(
-    robot: Robot, funnel: Any, tool: str | None, size: float, colors: tuple[str, str]
+    robot: Robot, funnel: Funnel, tool: str | None, size: float, colors: tuple[str, str]
 ) -> list[dict[str, Any]]:
     """Return centres (N, 3) and half axes (N, 9) of the ellipsoids of tool and base."""
     from fflin.campaign.funnel import Funnel
 
-    if not isinstance(funnel, Funnel):
-        said = f"funnel has type {type(funnel).__name__}, expected a Funnel"
-        raise InputError(f"{said}, as fflin.funnel returns it")
+    instance("funnel", funnel, Funnel, "a Funnel, as fflin.funnel returns it")
     if funnel.robot.joint_names != robot.joint_names or funnel.q.shape[1] != robot.nq:
         raise InputError(f"the funnel belongs to '{funnel.robot.name}', expected '{robot.name}'")
     state, model, data = StateMap(robot, frame="local"), robot.model, robot.model.createData()

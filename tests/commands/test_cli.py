@@ -75,7 +75,7 @@ def test_warnings_are_one_line_each_on_stderr_and_in_info():
         capture_output=True,
         text=True,
     )
-    words = "planar_detumble: damping not modelled: 'joint_1', 'joint_2', 'joint_3'"
+    words = "planar_detumble: damping unused: 'joint_1', 'joint_2', 'joint_3'"
     assert done.returncode == 0
     assert done.stderr.startswith("fflin: warning: ") and done.stderr.count("\n") == 1
     assert words in done.stderr
@@ -260,7 +260,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
             "servicer_7dof",
         ): "'joint_1'",
         ("check", "cubesat", "--inputs", "cubesats"): "'cubesats'",
-        ("linearize", "ets_vii", "--dt", 0, "-o", output): "sampling",
+        ("linearize", "ets_vii", "--dt", 0, "-o", output): "dt is 0",
         ("check", "ets_vii", "--output", "pos:tool"): "'pos'",
         ("check", "ets_vii", "--output", "pose"): "'pose'",
         ("check", "ets_vii", "--output", "com:tool"): "com",

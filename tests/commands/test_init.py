@@ -44,7 +44,7 @@ def test_what_init_writes_of_a_bundled_robot_flies(tmp_path, name):
         warnings.simplefilter("ignore")
         plain = fflin.load(name)
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=".*(effort.* 0 of|damping not modelled)")
+        warnings.filterwarnings("error", message=".*(effort.* 0 of|damping unused)")
         robot = fflin.load(tmp_path / "own.toml")
     assert robot.urdf == plain.urdf and robot.model == plain.model
     assert robot.start["rpy"] == (10.0, 0.0, 0.0)

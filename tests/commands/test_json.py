@@ -178,3 +178,33 @@ def test_what_is_not_finite_is_null():
 
     assert plain({"a": np.array([1.0, np.inf]), "_b": 1}) == {"a": [1.0, None]}
     assert plain(np.array([1.0 + 2.0j])) == [{"real": 1.0, "imag": 2.0}]
+
+
+def test_info_has_the_momentum_of_the_wheels_and_the_authority_of_the_thrusters(tmp_path):
+    wheels = "".join(
+        f"[[input]]\ntype = 'reaction_wheel'\naxis = {axis}\ninertia = 1e-5\nmax_speed = 300.0\n"
+        for axis in np.eye(3).tolist()
+    )
+    thrusters = "".join(
+        f"[[input]]\ntype = 'thruster'\nframe = 'base'\nmax = 2.0\n"
+        f"position = {(0.5 * side * lever).tolist()}\ndirection = {(way * along).tolist()}\n"
+        for lever, along in zip(np.roll(np.eye(3), 1, axis=0), np.eye(3), strict=True)
+        for side in (1, -1)
+        for way in (1, -1)
+    )
+    text = f"urdf = 'cubesat.urdf'\n[point.velocity]\nwheel_1 = 100.0\n{wheels}{thrusters}"
+    urdf = fflin.load("cubesat").urdf
+    (tmp_path / "cubesat.urdf").write_bytes(urdf.read_bytes())
+    (tmp_path / "sat.toml").write_text(text)
+    code, out, err = run("info", "sat.toml", "--json", cwd=tmp_path)
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    momentum = found["wheel_momentum"]
+    assert momentum["wheels"] == momentum["axes"] == 3
+    assert momentum["total"] == pytest.approx([1e-3, 0.0, 0.0])
+    assert momentum["least"] == pytest.approx(3e-3)
+    reach = found["thruster_authority"]
+    assert (reach["thrusters"], reach["every_way"]) == (12, True)
+    assert reach["least_force"] == pytest.approx(4.0) and reach["least_torque"] == pytest.approx(
+        2.0
+    )

@@ -11,12 +11,19 @@ import fflin
 from fflin.control.authority import (
     least_reach,
     mass_properties,
+    point_properties,
     point_report,
+    thruster_properties,
     thruster_report,
     unreachable,
     wheel_momenta,
+    wheel_properties,
     wheel_report,
 )
+
+
+def thrusters_at(*point):
+    return thruster_report(thruster_properties(*point))
 
 
 def tilted(robot, **joints):
@@ -79,18 +86,18 @@ def test_a_box_of_thrusters_has_the_force_and_torque_of_its_pairs():
         ]
     robot = fflin.load("cubesat", inputs=nozzles)
     # A force needs one pair, which gives 4 N; so does a torque, of 2 N m.
-    report = thruster_report(robot, tilted(robot), np.zeros(3))
+    report = thrusters_at(robot, tilted(robot), np.zeros(3))
     assert "least 4 N without" in report and "2 N m without" in report
     # It is the centre of mass that counts.
     center = np.array([0.2, -0.3, 0.1])
     moved = [replace(each, position=tuple(each.position + center)) for each in nozzles]
     moved = robot.replace(inputs=moved)
-    assert thruster_report(moved, moved.neutral(), center) == report
-    assert thruster_report(moved, moved.neutral(), np.zeros(3)) != report
+    assert thrusters_at(moved, moved.neutral(), center) == report
+    assert thrusters_at(moved, moved.neutral(), np.zeros(3)) != report
     few = robot.replace(inputs=nozzles[:-1])
-    assert "not push every way" in thruster_report(few, few.neutral(), np.zeros(3))
+    assert "not push every way" in thrusters_at(few, few.neutral(), np.zeros(3))
     free = robot.replace(inputs=[fflin.Thruster("base", x.position, x.direction) for x in nozzles])
-    assert "limit" in thruster_report(free, free.neutral(), np.zeros(3))
+    assert "limit" in thrusters_at(free, free.neutral(), np.zeros(3))
     W = np.array([nozzle.wrench for nozzle in nozzles]).T[[3, 4, 5, 0, 1, 2]]
     assert unreachable(W) == {"torque": [], "force": []}
     assert unreachable(W[:, :4])["force"] == ["+y", "-y", "+z", "-z"]
@@ -111,14 +118,19 @@ def test_wheels_add_up_in_base_axes():
     axes, stored, largest = wheel_momenta(robot, q, v)
     np.testing.assert_allclose(axes @ stored, expected, atol=1e-12)
     assert largest.tolist() == [1.0, np.inf]
-    assert "only two" in wheel_report(robot, q, v)
+    found = wheel_properties(robot, q, v)
+    np.testing.assert_allclose(found["total"], expected, atol=1e-12)
+    assert found["axes"] == 2 and found["least"] is None
+    assert "only two" in wheel_report(found)
     three = [fflin.ReactionWheel(x, inertia=1e-5, max_speed=300.0) for x in np.eye(3).tolist()]
-    report = wheel_report(fflin.load("cubesat", inputs=three), *2 * [np.zeros(13)])
+    report = wheel_report(
+        wheel_properties(fflin.load("cubesat", inputs=three), *2 * [np.zeros(13)])
+    )
     assert "three axes" in report and "least 0.003 N m s" in report
 
 
 @pytest.mark.parametrize("name", ["cubesat", "planar_detumble", "dual_arm"])
 def test_the_report_fits_a_page(name):
     robot = fflin.load(name)
-    report = point_report(robot, robot.neutral(), np.zeros(robot.nv))
+    report = point_report(point_properties(robot, robot.neutral(), np.zeros(robot.nv)))
     assert max(map(len, report.splitlines())) <= 80 and "wheel" not in report

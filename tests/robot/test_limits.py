@@ -162,8 +162,8 @@ def test_efforts_and_velocities_of_zero_are_said_once_and_are_none(tmp_path):
         robot = fflin.load(path)
     said = [str(each.message) for each in told]
     assert said == [
-        "arm: effort 0 of joints 'hinge', 'elbow' taken as unlimited (or passive)",
-        "arm: velocity 0 of joint 'hinge' taken as unlimited (or passive)",
+        "arm: effort 0 of joints 'hinge', 'elbow': no limit (or passive)",
+        "arm: velocity 0 of joint 'hinge': no limit (or passive)",
     ]
     assert tuple(said) == robot.notes
     assert not {"tau_m.hinge", "tau_m.elbow", "qdot_m.hinge"} & set(limits_of(robot))

@@ -222,7 +222,7 @@ CASES = {
     URDF + "[stiffness]\n'hinge_*' = 1": ":3: 'hinge_*'",
     URDF + "[damping]\njoint_1 = inf": ":3: damping.joint_1",
     URDF + "damping = 'all'": ":2: 'all'",
-    URDF + "rest = 1": ":2: mapping",
+    URDF + "rest = 1": ":2: position",
     URDF + "lock = ['joint_1']\n[rest]\njoint_1 = 1": ":4: 'joint_1'",
     URDF + "weights = 3": ":2: weights",
     URDF + "[weights]\nQ.q_b = 3": ":3: 'Q'",

@@ -12,7 +12,7 @@ import fflin
 from fflin.kernel.compiled import ENGINES
 from fflin.simulation import compiled, lanes, packing, run
 from fflin.simulation.conservation import Conserved
-from fflin.simulation.plan import planned
+from fflin.simulation.plan import SimulationOptions, planned
 from fflin.simulation.plant import Plant
 from tests.support.measured import POSITIONS, designed
 from tests.support.motions import HOME, displaced
@@ -304,7 +304,7 @@ def test_eight_lanes_are_eight_runs(robots):
             )
         own = fflin.from_model(model, inputs=robot.inputs)
         options = {"x0": share * displaced(lin), "duration": 2.0, "dt": 0.01, "linear": False}
-        plan, plant = planned(own, policy, **options)
+        plan, plant = planned(own, policy, SimulationOptions(**options))
         count = len(plant.faults.gain)
         faults = plant.faults._replace(gain=np.full(count, gain))
         plans.append((plan, Plant(plant.state, faults=faults)))

@@ -75,8 +75,8 @@ class FlexibleAppendage(Appendage):
         Frequencies [Hz] of the clamped appendage.
     translation : array_like (3, k)
         Modal participation in translation [kg^0.5]: the linear momentum of each mode for a unit
-        modal rate, in the frame's axes. Its square is the effective mass of the mode along an
-        axis.
+        modal rate, in the frame's axes. The square of an entry is the effective mass of the mode
+        along the axis.
     rotation : array_like (3, k)
         Modal participation in rotation [kg^0.5 m]: the angular momentum about the frame's origin.
     damping : float or sequence of float (k,)
@@ -274,9 +274,9 @@ class Slosh(Appendage):
 
     The liquid is a point mass. With `frequency`, the mass moves on springs, with the coordinates
     NAME_x and NAME_y [m]. With `length`, the mass is a pendulum, with angles [rad] as
-    coordinates. A pendulum has no stiffness of its own. Its frequency is :math:`\sqrt{a/l}` under
-    an acceleration a along the axis, such as the acceleration by a thruster, see ``linearize(...,
-    moving=True)``. The link's inertia in the URDF must include the mass.
+    coordinates. A pendulum has no spring. The frequency of the pendulum is :math:`\sqrt{a/l}`
+    under an acceleration a along the axis, such as the acceleration by a thruster, see
+    ``linearize(..., moving=True)``. The link's inertia in the URDF must include the mass.
 
     Parameters
     ----------
@@ -294,7 +294,7 @@ class Slosh(Appendage):
     axis : sequence of float (3,)
         Axis of the tank in the frame's axes, from its bottom up. The directions x and y are
         perpendicular to `axis`. Direction x is the projection of the frame's x or y axis,
-        whichever is more nearly perpendicular to `axis`.
+        the one that is closer to perpendicular to `axis`.
     damping : float
         Damping ratio, from 0 to 1.
     name : str, optional
@@ -463,7 +463,7 @@ class Slosh(Appendage):
 
     @property
     def axes(self) -> Array:
-        """Directions x, y and the axis as columns (3, 3), in the frame's axes."""
+        """Unit vectors x, y and the axis as columns (3, 3), in the frame's axes."""
         z = np.array(self.axis)
         near = np.eye(3)[0 if abs(z[0]) < 0.9 else 1]
         x = near - (near @ z) * z

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable
 from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple, TypeVar
 
-from fflin.base.errors import unknown
+from fflin.base.errors import require_known, unknown
 from fflin.robot.urdf.links import (
     Link,
     Pose,
@@ -384,10 +384,8 @@ def _drop_world(links: dict[str, Link], joints: dict[str, JointElement]) -> None
 def _hanging_on(
     prune: Collection[str], links: Iterable[str], joints: dict[str, JointElement]
 ) -> set[str]:
-    """Return what hangs on joints, of links of which each comes after its parent."""
-    for name in prune:
-        if name not in joints:
-            raise unknown("joint to prune", name, joints)
+    """Return all links below the joints to prune; `links` has parents first."""
+    require_known("joint to prune", prune, joints)
     dropped = {joints[name].child for name in prune}
     parents = {joint.child: joint.parent for joint in joints.values()}
     for name in links:

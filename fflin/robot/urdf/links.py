@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.robot.urdf.xml import Element, named, nearest, quoted
+from fflin.robot.urdf.xml import Element, enumerated, named, nearest, quoted
 
 # Beyond it nothing is physical, and products of two such numbers stay far from overflow.
 _ABSURD = 1e30
@@ -38,7 +38,7 @@ INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class Pose(NamedTuple):
-    """Where a frame lies in another, as the file writes it."""
+    """Placement of a frame in another frame, as in the file."""
 
     xyz: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m]
     rpy: tuple[float, ...] = (0.0, 0.0, 0.0)  # roll, pitch, yaw about fixed axes [rad]
@@ -170,7 +170,7 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
     notes = (
         (negligible, f"{lost}negligible compared with the links it is fixed to"),
         # One principal moment is more than the sum of the others.
-        (unequal, f"inertia is not physically realisable: {named('link', unequal)}"),
-        (weightless, f"inertia, but no mass: {named('link', weightless)}"),
+        (unequal, f"unphysical inertia: {enumerated(unequal)}"),
+        (weightless, f"inertia without mass: {named('link', weightless)}"),
     )
     return [f"{origin}: {text}" for names, text in notes if names]
