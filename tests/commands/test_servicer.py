@@ -110,7 +110,7 @@ def test_a_servicer_goes_from_urdf_to_page_campaign_and_lft_with_eight_options(t
     assert not motion.passed and 0.0 <= motion.u[:, thrust].min()
     assert motion.engine == "compiled"
     page = (tmp_path / "motion.html").read_text(encoding="utf-8")
-    for name in (*robot.joint_names, *(each.title for each in robot.inputs[4:16])):
+    for name in (*robot.joint_names, *(each.name for each in robot.inputs[4:16])):
         assert f'"{name}"' in page, name
     campaign = fflin.Campaign.load(tmp_path / "runs.npz")
     assert len(campaign) == 8 and not campaign.stop.any()
