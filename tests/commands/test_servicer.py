@@ -114,7 +114,7 @@ def test_a_servicer_goes_from_urdf_to_page_campaign_and_lft_with_eight_options(t
         assert f'"{name}"' in page, name
     campaign = fflin.Campaign.load(tmp_path / "runs.npz")
     assert len(campaign) == 8 and not campaign.stop.any()
-    assert campaign.fraction("attitude < 0.1 deg and joint < 0.01 rad").value == 1.0
+    assert campaign.fraction("attitude < 0.1 deg and joints < 0.01 rad").value == 1.0
     assert {"base.mass", "panel_left.stiffness", "q_b.x"} <= {*campaign.names}
     lft = fflin.LFT.load(tmp_path / "lft.mat")
     lin = fflin.linearize(robot, fflin.configuration(robot, robot.point["joints"]))
