@@ -96,7 +96,7 @@ class Plan:
     target: Array | None  # the state (nx,) that is steered to, where one is known
     reference: Reference | None  # the motion that is followed, where there is one
     steered: tuple[str, ...]  # the states that are known to be fed back
-    notes: tuple[str, ...]  # what is to be said of the run
+    notes: Callable[[], tuple[str, ...]]  # returns the remarks for the report, which take a moment
     predictor: Predictor | TrajectoryFeedback | None  # of the linear motion under the same law
 
     @property
@@ -228,7 +228,7 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
         target=goal,
         reference=follows,
         steered=fed_back(policy),
-        notes=(*growing(policy), *notes_of(policy, robot), *times.notes),
+        notes=lambda: (*growing(policy), *notes_of(policy, robot), *times.notes),
         predictor=foresees,
     )
     return plan, plant

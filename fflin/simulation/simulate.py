@@ -276,7 +276,7 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         modes=tuple(joint.name for joint in robot.modes),
         mode_rotations=np.array([joint.rotation for joint in robot.modes]),
         steered=plan.steered,
-        notes=(*plan.notes, *getattr(plan.law and plan.law.policy, "notes", ())),
+        notes=(*plan.notes(), *getattr(plan.law and plan.law.policy, "notes", ())),
         limit_names=tuple(plan.known),
         limits=np.array(list(plan.known.values())).reshape(-1, 2),
     )

@@ -46,10 +46,8 @@ class Times(NamedTuple):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the recorded rows, for the report."""
-        said = f"one of {self.every} steps is recorded; every=1 (--every 1) "
-        notes: tuple[str, ...] = (
-            (f"{said}records all steps {self.steps:,} steps",) if self.thinned else ()
-        )
+        said = f"one of {self.every} steps is recorded; every=1 (--every 1) records all "
+        notes: tuple[str, ...] = (f"{said}{self.steps:,} steps",) if self.thinned else ()
         if self.sample and self.every % self.sample and self.sample % self.every:
             aside = (
                 f"a row is recorded every {self.every} steps, but the controller samples every "

@@ -22,7 +22,7 @@ def test_runs_of_up_to_100000_rows_are_recorded_step_by_step():
     asked = times.times_of(None, 1000.01, 0.01, 1, None, 0.0)
     assert asked.every == 1 and not asked.notes
     assert many.notes == (
-        "one in 11 of 100,001 steps is recorded; every=1 (--every 1) records all",
+        "one of 11 steps is recorded; every=1 (--every 1) records all 100,001 steps",
     )
 
 
