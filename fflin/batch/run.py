@@ -79,7 +79,9 @@ class Done(NamedTuple):
     reason: str
 
 
-def check_workers(executor: Any, workers: Any, threads: Any, chunk: Any, progress: Any) -> None:
+def check_workers(
+    executor: object, workers: object, threads: object, chunk: object, progress: object
+) -> None:
     """Raise `InputError` if an option for the execution of the chunks is wrong."""
     if executor is not None and workers is not None:
         raise InputError("executor and workers are both given; give only one of them")

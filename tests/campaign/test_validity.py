@@ -391,6 +391,7 @@ def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
     assert said.endswith(b"\r\x1b[2Kfflin: stopped\r\n")
 
 
+@pytest.mark.compiled
 @pytest.mark.exhaustive
 def test_frames_are_compared_in_the_same_linear_loop():
     """What is fed back in base axes is that of `Loop` in that frame, run by run."""
