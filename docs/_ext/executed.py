@@ -31,6 +31,18 @@ def forget(app: Sphinx, env: BuildEnvironment, page: str) -> None:
     shutil.rmtree(kept(app) / page, ignore_errors=True)
 
 
+def spread(app: Sphinx, env: BuildEnvironment, pages: list[str]) -> None:
+    """Spread the tutorials, which take longest, over the batches that are read side by side."""
+    run = [page for page in pages if page.startswith("tutorials/")]
+    run.sort(key=lambda page: page != "tutorials/tracking")  # the longest begins first
+    others = [page for page in pages if page not in run]
+    pages.clear()
+    for k, page in enumerate(run):
+        share = slice(k * len(others) // len(run), (k + 1) * len(others) // len(run))
+        pages += [page, *others[share]]
+    pages += [] if run else others
+
+
 def announce(app: Sphinx, page: str, source: list[str]) -> None:
     """Pass the name of the page to the kernel that runs it."""
     os.environ["FFLIN_DOCS_PAGE"] = page
@@ -46,6 +58,8 @@ def deliver(app: Sphinx, error: Exception | None) -> None:
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register with Sphinx."""
+    # Read and write pages on all cores, without -j auto: running the tutorials takes longest.
+    app.parallel = max(app.parallel, os.cpu_count() or 1)
     # Files that Sphinx keeps for its next build are not part of the site.
     app.doctreedir = app.srcdir / "_build"
     here = str(Path(__file__).parent)
@@ -57,6 +71,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     os.environ["FFLIN_DOCS_KEPT"] = str(kept(app))
     app.connect("builder-inited", keep_pictures, priority=900)  # after myst_nb has chosen
     app.connect("env-purge-doc", forget)
+    app.connect("env-before-read-docs", spread)
     app.connect("source-read", announce)
     app.connect("build-finished", deliver)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

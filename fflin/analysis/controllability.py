@@ -209,7 +209,7 @@ def controllability(lin: LinearModel) -> Controllability:
 
 
 class _Part(NamedTuple):
-    """The split of what is left without the conserved momenta, in its own coordinates."""
+    """Split of the model without its conserved momenta, in reduced coordinates."""
 
     controllable: Array  # (2 r, d), a basis
     rows: Array  # (2 r - d, 2 r) with rows @ z what no input acts on

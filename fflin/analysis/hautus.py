@@ -91,7 +91,7 @@ def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
 
 
 class Split(NamedTuple):
-    """The state space of a model, split into what its inputs reach and the rest."""
+    """State space of a model, split into a controllable and an uncontrollable part."""
 
     inside: Array  # (nx, d), basis of the controllable subspace
     outside: Array  # (nx, nx - d), basis of a complement; the unobservable subspace of a dual pair
@@ -295,7 +295,7 @@ def _root(system: SecondOrder, shape: Values, near: complex) -> complex:
 
 
 def _simple(system: SecondOrder, shapes: Values, pole: complex) -> bool:
-    """Whether a pole has as many eigenvectors as its multiplicity, beyond rounding."""
+    """Return whether a pole has as many eigenvectors as its multiplicity."""
     change = shapes.T @ (2.0 * pole * system.M + system.D.values) @ shapes
     size = np.abs(shapes).T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(system.D.values))
     least = np.linalg.svd(change, compute_uv=False)[-1]

@@ -80,7 +80,7 @@ def rate_matrix(lin: LinearModel) -> Array:
 
 
 def floating_inertia(M: Array, kept: NDArray[np.intp], others: NDArray[np.intp]) -> Array:
-    """Return what coordinates feel while the others float: the Schur complement of M."""
+    """Return the Schur complement of M: the inertia of coordinates with the others free."""
     across = M[np.ix_(others, kept)]
     return M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(others, others)], across)
 
@@ -100,7 +100,7 @@ class SecondOrder:
         return np.sqrt(self.M.diagonal())
 
     def restricted(self, R: Array) -> SecondOrder:
-        """Return the system of the motions R z; what holds them to it does no work."""
+        """Return the system of the motions R z, whose constraint forces do no work."""
         M = R.T @ self.M @ R
         K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
         return SecondOrder(M, K, D, self.S.after(R.T))
@@ -112,7 +112,7 @@ class SecondOrder:
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether springs are symmetric, and dampers are and all take energy, or all give it."""
+        """Whether springs and dampers are symmetric, and all dampers have the same sign."""
         units = np.outer(self.size, self.size)
         for matrix in (self.K.values / units, self.D.values / units):
             if np.abs(matrix - matrix.T).max(initial=0.0) > _SYMMETRIC * np.abs(matrix).max():
@@ -122,7 +122,7 @@ class SecondOrder:
 
     @cached_property
     def poles(self) -> tuple[Values, Margin]:
-        """The poles that are not zero, one of each pair, as eigenvalues approximate them."""
+        """Approximate nonzero poles, one of each conjugate pair."""
         rigid, margin = self._null(self.K, self.D)
         unloaded, other = self._null(self.K)
         R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
@@ -150,7 +150,7 @@ class SecondOrder:
 
 
 def second_order(lin: LinearModel) -> SecondOrder:
-    """Return the forces of a continuous model, or those that a sampled one shows as it stands."""
+    """Return the second-order form of a model, continuous or sampled."""
     # The product with M leaves rounding where there is no spring, damper or input. It is put to
     # zero by one floor for springs and one for dampers, per unit of energy, and one for each input.
     nv, M, X = len(lin.M), lin.M, rate_matrix(lin)
@@ -198,7 +198,7 @@ def rates_of_positions(X: Array) -> Array:
 
 @dataclass(frozen=True)
 class ConservedMomenta:
-    """The momenta that no input, spring or damper changes, and what follows from them."""
+    """Conserved momenta, which no input, spring or damper changes, and the kept coordinates."""
 
     # W (k, nv) with W M nu conserved, in echelon form: a unit vector is one coordinate's momentum.
     weights: Array

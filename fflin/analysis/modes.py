@@ -327,7 +327,7 @@ def modes(lin: LinearModel) -> Modes:
 
 
 def _percents(energy: Mapping[str, float], room: int) -> str:
-    """Name the bodies with 1 % of the energy or more, and sum up those that are left out."""
+    """Name the bodies with 1 % of the energy or more, and sum up all other bodies."""
     words = [f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01]
     text = ""
     for count in range(len(words), 0, -1):

@@ -27,7 +27,7 @@ _FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 
 class Decision(NamedTuple):
-    """Whether a singular value counts: where its ratio to the tolerance is above 1."""
+    """Return whether a singular value is nonzero: its ratio to the tolerance is above 1."""
 
     ratio: float
     at: Values = np.zeros(0)  # its direction; empty if there was nothing to decide
@@ -42,12 +42,12 @@ class Margin(NamedTuple):
 
     @property
     def kept(self) -> float:
-        """The smallest singular value that counted, relative to its tolerance."""
+        """Smallest singular value counted as nonzero, relative to its tolerance."""
         return self.counted.ratio
 
     @property
     def dropped(self) -> float:
-        """The largest singular value that did not count, relative to its tolerance."""
+        """Largest singular value counted as zero, relative to its tolerance."""
         return self.left_out.ratio
 
     def __and__(self, other: Margin) -> Margin:
@@ -86,7 +86,7 @@ def decided(ratio: float, direction: Values, states: int = 1) -> Margin:
 
 
 class FixedPoles(NamedTuple):
-    """The poles of what inputs do not reach, or outputs do not show."""
+    """Poles of the uncontrollable or unobservable part."""
 
     poles: Values = np.zeros(0)  # (k,) [1/s], or of the sampled model
     decays: bool = True  # whether all of them do, beyond rounding
@@ -189,7 +189,7 @@ def image(matrix: Array, tolerance: float) -> tuple[Array, Array]:
 
 
 def unit_columns(matrix: Array) -> Array:
-    """Scale columns to unit length; those that are rounding of the others are left out."""
+    """Scale columns to unit length; omit columns that depend on others within rounding error."""
     sizes = np.linalg.norm(matrix, axis=0)
     real = sizes > 1e2 * EPS * sizes.max(initial=0.0)
     return matrix[:, real] / sizes[real]

@@ -266,7 +266,7 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
-    """Return the wheels (k,) that a design leaves out (9.5)."""
+    """Return the wheels (k,) that a design does not regulate (9.5)."""
     # Inputs that turn nothing at rest may still spin wheels: as many as they do so independently
     # can be momenta. By default these stay where something else turns the base.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
@@ -322,7 +322,7 @@ def damped_wheels(part: LinearModel) -> str:
 
 
 def rigid_forces(body: LinearModel) -> Noisy:
-    """Return what the inputs do to the rigid motions (r, nu), which no spring holds."""
+    """Return the input matrix (r, nu) of the rigid motions, on which no spring acts."""
     system = second_order(body)
     motions = null_space(system.K.T @ np.diag(1.0 / system.size))[0] / system.size[:, None]
     return system.S.after(motions.T)
@@ -347,7 +347,7 @@ def _balanced(lin: LinearModel) -> LinearModel:
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
-    """Return the model of some states, of the inertia M, and of the outputs that see no others."""
+    """Return the model of some states, with the inertia M and the outputs of these states."""
     S = selection(names, lin.state_names)
     seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
     values |= {"C": seen @ values["C"], "D": seen @ lin.D, "y0": seen @ lin.y0}

@@ -171,7 +171,7 @@ def relative_equilibria(
 
 
 def _libration(moments: Array, n: float) -> tuple[Complex, float]:
-    """Return the poles (6,) of a body's attitude, and the least of what stability asks for."""
+    """Return the poles (6,) of a body's attitude, and the smallest stability condition."""
     radial, along, normal = moments.tolist()
     pitch = 3.0 * (along - radial) / normal
     k_a, k_r = (normal - radial) / along, (normal - along) / radial

@@ -30,7 +30,7 @@ _RANK = 1e-7
 
 
 def require_stabilizable(lin: LinearModel) -> None:
-    """Raise `StabilizabilityError` that names what no input can hold."""
+    """Raise `StabilizabilityError` that names the states that inputs cannot stabilise."""
     if len(lin.A) < 2 * len(lin.M):  # with speeds of wheels without their angles
         missed = f"the inputs cannot stabilise {{}}{damped_wheels(lin) or '; add inputs'}"
         try:
@@ -82,7 +82,7 @@ def require_detectable(lin: LinearModel) -> None:
 def _conclude(
     kind: type[FflinError], words: str, notes: Sequence[str], margin: Margin, depth: int = 4
 ) -> None:
-    """Raise the error that words say, with what is undecided, or warn of that alone."""
+    """Raise the error of given words with undecided ranks, or warn of undecided ranks."""
     doubts = [note for note in notes if note.startswith("undecided")]
     if words:
         error: Any = kind("; ".join((words, *doubts)))
@@ -93,7 +93,7 @@ def _conclude(
 
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
-    """Raise `InputError` that names the modes on the boundary of stability that Q leaves out."""
+    """Raise `InputError` that names the marginally stable modes without a weight in Q."""
     missed = "Q has no weight on {}, which do not decay by themselves; give these states weights"
     _check_reach(lin, A.T, _root(Q), "weighted by Q", missed)
 
@@ -198,7 +198,7 @@ _BASE_WORDS = (("base attitude", slice(0, 3)), ("base position", slice(3, 6)))
 
 
 def _dominant(vectors: Values, names: Sequence[str]) -> str:
-    """Name the states that vectors (k, nx) stand on most, one each at least."""
+    """Name the largest states of vectors (k, nx), at least one for each vector."""
     sizes = np.abs(vectors)
     large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)
     words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)

@@ -247,7 +247,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def _visible(name: str) -> str:
-    """Quote a name whose blanks at an end would not be seen."""
+    """Quote a name that begins or ends with a blank."""
     return name if name == name.strip() else repr(name)
 
 

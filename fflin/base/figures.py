@@ -50,12 +50,12 @@ def cycle(count: int) -> list[str]:
 
 
 def letters_of(count: float, room: float) -> float:
-    """Size of letters [pt] with which so many lines stand in a room [pt] without touching."""
+    """Font size [pt] at which a number of lines fit into a height [pt]."""
     return min(8.0, 0.75 * room / max(1, count))
 
 
 def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float) -> None:
-    """Scale an axis so that values of very different sizes are told apart, but for rounding."""
+    """Scale an axis so that values of very different sizes are distinguishable."""
     sizes = [abs(value) for value in values.tolist() if abs(value) > 1e-9 * unit]
     if not sizes or max(sizes) < 10.0 * min(sizes):
         return

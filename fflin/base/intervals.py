@@ -21,7 +21,7 @@ class Estimate(NamedTuple):
 
 
 def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
-    """Return the share of successes, exact for any count."""
+    """Return the fraction of successes, exact for any count."""
     from scipy.special import betaincinv
 
     tail, failures = (1.0 - confidence) / 2.0, count - successes
@@ -57,7 +57,7 @@ def quantile(values: Array, p: float, confidence: float) -> Estimate:
 
 
 def mean(values: Array, confidence: float) -> Estimate:
-    """Return the mean with Student's interval, which takes it for normal."""
+    """Return the mean with Student's interval, which assumes a normal distribution."""
     from scipy.special import stdtrit
 
     count, middle = len(values), float(values.mean())

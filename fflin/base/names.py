@@ -1,4 +1,4 @@
-"""Names GROUP.ENTRY of states and inputs; groups, entries and patterns that stand for them."""
+"""Names GROUP.ENTRY of states and inputs; groups, entries and patterns that match them."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -70,7 +70,7 @@ def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
 
 
 def stands_for_any(key: str, names: Sequence[str]) -> bool:
-    """Whether a key stands for any of the names, or for entries of several groups."""
+    """Return whether a key matches any of the names, or entries of several groups."""
     try:
         return bool(matching("name", key, names))
     except UnknownNameError:

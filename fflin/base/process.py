@@ -64,7 +64,7 @@ def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
 
 
 def same_folder(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> bool:
-    """Whether two names lead to one folder; an empty one is the working folder's."""
+    """Return whether two paths are the same folder; an empty path is the working folder."""
     try:
         return os.path.samefile(first or os.curdir, second or os.curdir)
     except (OSError, ValueError):  # one of them does not exist

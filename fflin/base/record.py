@@ -70,7 +70,7 @@ def read_record(path: Path) -> tuple[Record, bool]:
 
 
 def decoded(suffix: str, content: bytes) -> tuple[Record, bool]:
-    """Return the record that the content of a file holds, and whether it is verified."""
+    """Return the record in the content of a file, and whether the record is verified."""
     return _CODECS[suffix][1](content)
 
 
@@ -164,7 +164,7 @@ def _from_npz(content: bytes) -> tuple[Record, bool]:
 
 
 def verify_checksum(record: Record) -> bool:
-    """Take the digest out of the entries of .npz; return whether there is one, and it holds."""
+    """Remove the digest from the entries of .npz; return whether it exists and is valid."""
     checksum = record.pop(CHECKSUM, None)
     if checksum is not None and text(checksum) != content_digest(record):
         raise ValueError(DAMAGED)
@@ -324,7 +324,7 @@ def _saved(cls: type[Design]) -> list[Field[Any]]:
 
 
 def _value(cls: type[Design], item: Field[Any], raw: Any) -> Any:
-    """Return a field's value; its annotation says what it is."""
+    """Return a field's value, with the type of its annotation."""
     for kind, of_kind in (("float", figure), ("str", text), ("tuple", texts)):
         if str(item.type).startswith(kind):
             return of_kind(raw)

@@ -39,7 +39,7 @@ def quaternion_product(a: Array, b: Array) -> Array:
 
 
 def product_matrix(a: Array) -> Array:
-    """Return the matrix (4, 4) that takes a quaternion b to the product a b."""
+    """Return the matrix (4, 4) that maps a quaternion b to the product a b."""
     x, y, z, w = a.tolist()
     return np.array(((w, -z, y, x), (z, w, -x, y), (-y, x, w, z), (-x, -y, -z, w)))
 

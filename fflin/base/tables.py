@@ -43,7 +43,7 @@ def first_paragraph(report: str) -> str:
 
 
 def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[str]]:
-    """Return the head and the first rows of a long table; `rest` says where the others are."""
+    """Return the head and the first rows of a long table; `rest` refers to the other rows."""
     left = len(rows) - 1 - MOST_ROWS
     if left <= _SPARE:
         return list(rows)
@@ -51,7 +51,7 @@ def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[st
 
 
 def dim(text: str) -> str:
-    """Text that stands back on a terminal that shows colours."""
+    """Text that is dimmed on a terminal with colours."""
     if _on_terminal() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb":
         return f"\x1b[2m{text}\x1b[0m"
     return text

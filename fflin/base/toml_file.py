@@ -104,7 +104,7 @@ class TomlFile:
                 raise self.error(message, *place)
 
     def line(self, *place: str | int) -> int:
-        """Return the line number of a key, or of the table that holds it."""
+        """Return the line number of a key, or of the table that contains it."""
         way = ".".join(map(str, place))
         while way and way not in self._lines:
             way = way.rpartition(".")[0]
@@ -162,7 +162,7 @@ def flat(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _values(record: Mapping[str, Any]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-    """Yield (place, value) of all that is neither table nor array, however deep."""
+    """Yield (place, value) of all values that are not tables or arrays, at any depth."""
     left: list[tuple[tuple[str | int, ...], Any]] = [((), record)]
     while left:
         place, value = left.pop()
@@ -203,7 +203,7 @@ def _lines_of(text: str) -> dict[str, int]:
 
 
 def _explain(path: Path, text: str, problem: str) -> str:
-    """Put the place that a TOML error names at its end in front of it."""
+    """Move the line and column of a TOML error to the front of its message."""
     found = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", problem)
     what, line, column = found.groups() if found else (problem, None, None)
     if line is None:

@@ -56,7 +56,7 @@ def shaped(name: str, value: ArrayLike, shape: tuple[int, ...], hint: str = "") 
 
 
 def number(name: str, value: Any) -> float:
-    """Return a finite float, or raise `InputError` that says what was given."""
+    """Return a finite float, or raise `InputError` with the given value."""
     refuse_masked(name, value)
     if isinstance(value, bool | np.bool_):
         raise InputError(f"{name} is {value}, expected a number")
@@ -87,14 +87,14 @@ def share(name: str, value: Any) -> float:
 
 
 def refuse_masked(name: str, value: Any) -> None:
-    """Raise `InputError` if an entry is masked, which NumPy makes NaN or takes as it is."""
+    """Raise `InputError` if an entry is masked, because NumPy may ignore the mask."""
     ma: Any = sys.modules.get("numpy.ma")  # what is masked has loaded it
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
 
 
 def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
-    """Return what is of a kind, or raise `InputError` that says what was given and expected."""
+    """Return a value of the expected type, or raise `InputError` with the given type."""
     if not isinstance(value, kind):
         raise InputError(f"{name} has type {type(value).__name__}, expected {expected}")
     return value
@@ -106,7 +106,7 @@ def truth(name: str, value: Any) -> bool:
 
 
 def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
-    """Return a whole number within limits, or raise `InputError` that says what was given."""
+    """Return a whole number within limits, or raise `InputError` with the given value."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise InputError(f"{name} is {value!r}, expected a whole number of at least {least}")
     if not least <= value <= largest:

@@ -47,7 +47,7 @@ def check_ending(path: Path, endings: tuple[str, ...]) -> None:
 
 
 def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
-    """Return what a regular file of at most `limit` bytes holds, or raise `FileError`."""
+    """Return the content of a regular file of at most `limit` bytes, or raise `FileError`."""
     what = f"; give the path of a {kind} file"
     try:
         # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
@@ -122,7 +122,7 @@ def write_atomically(contents: Mapping[Path, bytes]) -> None:
 
 @contextmanager
 def replacing(*targets: Path) -> Iterator[list[Path]]:
-    """Yield a new file for each target; it replaces the target if all goes well."""
+    """Yield a new file for each target, which replaces the target on success."""
     written: dict[Path, Path] = {}
     target = Path()
     try:
@@ -144,7 +144,7 @@ def replacing(*targets: Path) -> Iterator[list[Path]]:
 
 
 def install(temporary: Path, target: Path) -> None:
-    """Let a file that is whole take the place of its target."""
+    """Replace a target by its complete new file."""
     real = followed_path(target)
     if real.exists():
         os.chmod(temporary, real.stat().st_mode & 0o777)
@@ -201,7 +201,7 @@ def check_distinct(*targets: Path | None) -> None:
 
 
 def reserve(path: Path) -> None:
-    """Give a file the room on the disk that its size says, or raise `OSError`."""
+    """Reserve disk space for the full size of a file, or raise `OSError`."""
     if hasattr(os, "posix_fallocate"):
         with path.open("r+b") as file:
             os.posix_fallocate(file.fileno(), 0, path.stat().st_size)

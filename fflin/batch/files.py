@@ -50,7 +50,7 @@ def hdf5() -> Any:
 
 
 def is_constant(array: Array) -> bool:
-    """Whether all rows of an array are one row, held once."""
+    """Return whether all rows of an array are one row that is stored once."""
     return array.strides[0] == 0 and array.size > 0
 
 

@@ -1,4 +1,4 @@
-"""Run of a job over rows, chunk by chunk, into a store that may already hold some chunks.
+"""Run of a job over rows, chunk by chunk, into a store that may already contain chunks.
 
 Chunks run on threads of this process, or on the workers of an executor; a chunk is repeated if its
 worker dies. This module is independent of the meaning of the rows and of the job's results.
@@ -47,14 +47,14 @@ Progress = Callable[[int, int], object]
 
 
 class Span(NamedTuple):
-    """The rows of a chunk, start up to but not including stop."""
+    """Rows of a chunk, from start to stop - 1."""
 
     start: int
     stop: int
 
 
 class ChunkResult(NamedTuple):
-    """The result of a chunk: its arrays by name, and the warnings on the way."""
+    """Result of a chunk: its arrays by name, and its warnings."""
 
     arrays: dict[str, Array]
     notes: list[str]
@@ -79,7 +79,9 @@ class Done(NamedTuple):
     reason: str
 
 
-def check_workers(executor: Any, workers: Any, threads: Any, chunk: Any, progress: Any) -> None:
+def check_workers(
+    executor: object, workers: object, threads: object, chunk: object, progress: object
+) -> None:
     """Raise `InputError` if an option for the execution of the chunks is wrong."""
     if executor is not None and workers is not None:
         raise InputError("executor and workers are both given; give only one of them")
@@ -103,10 +105,12 @@ def run_chunks(
     threads: int = 1,
     progress: Progress | None = None,
     upto: int | None = None,
+    all_needed: bool = False,
 ) -> list[Done]:
-    """Do the chunks that a store has not yet, keep what comes of them, return those that failed."""
+    """Compute the missing chunks of a store, save the results, and return failed chunks."""
     # `rows(start, stop)` is a named tuple, which the store keeps of what it has a name for. Only
     # chunks that begin before `upto` are done; threads are of this process, without an executor.
+    # If all chunks are needed, the first that fails is the last.
     size = store.chunk
     spans = [Span(at, min(at + size, store.count)) for at in range(0, store.count, size)]
     left = [span for span in spans if not store.finished(*span)]
@@ -123,6 +127,8 @@ def run_chunks(
     ):
         if done.result is None:
             failed.append(done)
+            if all_needed:
+                break
         else:
             store.write(*done.span, {**rows(*done.span)._asdict(), **done.result.arrays})
             notes += done.result.notes
@@ -268,7 +274,7 @@ class Dispatch:
         return done
 
     def _lost(self, span: Span, reason: str) -> Iterator[Done]:
-        """Put a chunk back whose worker died, or give it up."""
+        """Queue a chunk again whose worker died, or report its failure."""
         if self._attempts[span] < _ATTEMPTS:
             self._waiting.append(span)
         else:

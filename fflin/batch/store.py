@@ -39,7 +39,7 @@ class MemoryStore:
         self._written: set[int] = set()
 
     def finished(self, start: int, stop: int) -> bool:
-        """Whether a chunk is there."""
+        """Return whether a chunk is in the file."""
         return start in self._written
 
     def read(self, stop: int) -> dict[str, Array]:
@@ -148,7 +148,7 @@ class FileStore:
             raise FileError(f"{self.part}: cannot be written: {reason(error)}") from None
 
     def finished(self, start: int, stop: int) -> bool:
-        """Whether a chunk is there, and is what was written."""
+        """Return whether a chunk is in the file and matches its checksum."""
         with self._readable():
             kept = self._file[CHUNK_CHECKSUMS][start // self.chunk]
             return bool(kept.any()) and kept.tobytes() == chunk_checksum(
@@ -195,7 +195,7 @@ class FileStore:
 
 
 def _reserve(file: Any, name: str, shape: tuple[int, ...]) -> None:
-    """Create a dataset of doubles whose place in the file is settled and that is not filled."""
+    """Create a dataset of doubles with allocated space and without a fill value."""
     h5py = hdf5()
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_layout(h5py.h5d.CONTIGUOUS)
@@ -215,7 +215,7 @@ def output_path(out: str | Path) -> Path:
 
 
 def part_of(path: Path) -> Path:
-    """Return the file that a result grows in until it is whole, beside what a link leads to."""
+    """Return the path NAME.part of an unfinished result, next to the target of a link."""
     real = Path(os.path.realpath(path)) if os.path.islink(path) else path
     return real.with_name(real.name + ".part")
 

@@ -44,7 +44,7 @@ _FACTORS = {  # from the unit of a condition to the unit of a figure
 
 
 class Bound(NamedTuple):
-    """Comparison in a condition, and which runs (N,) meet it."""
+    """Comparison in a condition, and the mask (N,) of runs that meet the condition."""
 
     name: str
     sign: str

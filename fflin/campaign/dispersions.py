@@ -327,7 +327,7 @@ class Dispersions:
 
     @property
     def _springs_of(self) -> tuple[str, ...]:
-        """Which of stiffness and damping are dispersed."""
+        """Dispersed properties among stiffness and damping."""
         if "frequency" in self._kinds:
             return _OF_SPRINGS
         return tuple(kind for kind in _OF_SPRINGS if kind in self._kinds)

@@ -138,7 +138,7 @@ def monte_carlo(
     executor, workers, threads, progress : optional
         As in `sweep`. The workers of an executor must be able to import the policy's modules.
     chunk : int, optional
-        Number of runs per chunk, a multiple of 8. If `until` is given, this number must divide 256.
+        Number of runs per chunk: a multiple of 8, and a divisor of 256 if `until` is given.
     histories : int, optional
         Number of evenly spaced times at which the errors and inputs of each run are recorded. The
         bands of `plot_campaign` require histories.
@@ -305,7 +305,7 @@ def _request_of(path: Path) -> str:
 def _found(
     job: CampaignJob, path: Path | None, request: str, header: dict[str, Any]
 ) -> Campaign | None:
-    """Return the campaign of a file that holds all runs of this call; its goals may differ."""
+    """Return the campaign of a file with all runs of this call; its goals may differ."""
     if path is None or path.suffix != ".h5" or not path.is_file() or _request_of(path) != request:
         return None
     try:

@@ -269,7 +269,7 @@ def expect(
 
 
 def _remade(arguments: tuple[Any, ...], engine: str) -> CampaignJob:
-    """Make a job in a worker, whose warnings nobody would see."""
+    """Make a job in a worker, with warnings suppressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         job = CampaignJob(*arguments)
@@ -299,7 +299,15 @@ def completed(
     threads = (threads or available_cores()) if compiled else 1
     size = chunk_size(count, workers or threads, LANES if compiled else 1)
     store = MemoryStore(count, size, job.shapes)
-    failed = run_chunks(job, rows, store, executor=executor, threads=threads, progress=progress)
+    failed = run_chunks(
+        job,
+        rows,
+        store,
+        executor=executor,
+        threads=threads,
+        progress=progress,
+        all_needed=True,
+    )
     if failed:
         died = "a worker process died: " if executor else ""
         raise FflinError(f"{died}{failed[0].reason}")

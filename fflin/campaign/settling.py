@@ -65,7 +65,7 @@ class Loop:
 
     @cached_property
     def watched(self) -> Array:
-        """Which of its entries are the model's states."""
+        """Mask of the entries of the whole state that are states of the model."""
         names = self.state.names
         return np.array([names.index(name) for name in self.lin.state_names], dtype=np.intp)
 
@@ -211,7 +211,7 @@ class Settling:
 
     @property
     def over(self) -> NDArray[np.bool_]:
-        """Which runs may end before their time."""
+        """Mask of the runs that may end early."""
         return (self._code > 0) & (self._step is None)
 
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:

@@ -27,7 +27,7 @@ _EXPECTED = (
 
 
 class DispersionFile(dict[str, Any]):
-    """{name, group or pattern: spread} of a file, and the lines on which they stand."""
+    """{name, group or pattern: spread} of a file, and their line numbers."""
 
     def __init__(self, document: TomlFile) -> None:
         super().__init__()
@@ -190,7 +190,7 @@ def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
 
 
 def is_closed_form(inverse: Callable[[Array], Array]) -> bool:
-    """Whether an inverse is one of this module; those of SciPy may take long."""
+    """Return whether an inverse is from this module; inverses of SciPy may be slow."""
     return isinstance(inverse, partial) or inverse is whole_number
 
 

@@ -148,7 +148,7 @@ def require_own_kind(arguments: argparse.Namespace) -> None:
 
 
 def kind_of(path: Path) -> str:
-    """Return the name of the class whose result a file holds; "" if it is not known."""
+    """Return the name of the class of a file's result; "" if it is not known."""
     try:
         names, kind = _entries(path)
     except Exception:  # each decoder has its own

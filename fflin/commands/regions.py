@@ -1,4 +1,4 @@
-"""The commands `validity` and `funnel`: regions in which a model or a regulator holds."""
+"""The commands `validity` and `funnel`: regions in which a model or a regulator is valid."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]
 
 
 def thruster_report(properties: Mapping[str, Any]) -> str:
-    """Show whether the thrusters push every way, and their least force and torque."""
+    """Report whether the thrusters push in every direction, with least force and torque."""
     if not properties["thrusters"]:
         return ""
     text = f"{counted(properties['thrusters'], 'thruster')} alone"
@@ -163,7 +163,7 @@ def thruster_report(properties: Mapping[str, Any]) -> str:
 
 
 def unreachable(W: Array) -> dict[str, list[str]]:
-    """Return the directions of pure torque and pure force that no thrusts u >= 0 give as W u."""
+    """Return the pure torques and forces that W u does not reach with thrusts u >= 0."""
     from scipy.optimize import nnls
 
     size = np.linalg.norm(W, axis=0)
@@ -177,13 +177,13 @@ def unreachable(W: Array) -> dict[str, list[str]]:
 
 
 def gives_every_wrench(W: Array, pushing: NDArray[np.bool_]) -> bool:
-    """Whether columns W (6, k), of which some only push, together give every wrench."""
+    """Return whether columns W (6, k), some of them only positive, produce every wrench."""
     both = np.hstack((W, -W[:, ~pushing]))
     return not any(unreachable(both).values())
 
 
 def thrusters_give_every_wrench(robot: Robot) -> bool:
-    """Whether a robot has thrusters that, with what else acts on its base, push it every way."""
+    """Return whether thrusters and other base inputs of a robot can push in every direction."""
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust")
     if thrusters is None:

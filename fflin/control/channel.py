@@ -122,7 +122,7 @@ def warn_beyond(
     low: Array,
     high: Array,
 ) -> None:
-    """Warn of inputs that are asked, in any of the rows (N, nu), for more than their limits."""
+    """Warn of inputs whose commands in rows (N, nu) exceed their limits."""
     bounds = np.where(asked > 0.0, high, low)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
@@ -201,7 +201,7 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
 
 
 class Channel:
-    """The way of the commands of `law` to the inputs, by the rules of the kernel.
+    """Channel from the commands of `law` to the inputs, by the rules of the kernel.
 
     `law` is called with the arguments of `begin` or `ask`. `speeds` (k,) of these arguments are
     the speeds of the wheels whose speed is limited.
@@ -236,7 +236,7 @@ class Channel:
 
     @property
     def continuous(self) -> bool:
-        """Whether the law is asked at every stage."""
+        """Whether the law is evaluated at every stage."""
         return not self._rules.sample
 
     @property

@@ -1,9 +1,8 @@
 """Weights of a regulator by a rule: from the limits of the URDF, or by name."""
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
@@ -17,12 +16,18 @@ from fflin.analysis.reduction import (
     selection,
     without,
 )
-from fflin.base.errors import FflinWarning, InputError, listed, unknown
-from fflin.base.names import input_keys
-from fflin.base.validation import Array, Complex, Values
-from fflin.control.channel import warn_beyond
-from fflin.control.optimal.riccati import rates_of, solve
-from fflin.control.weights import GivenWeight, sampled_cost, weights_of
+from fflin.base.errors import InputError, listed, unknown
+from fflin.base.validation import Array
+from fflin.control.loop_limits import (
+    NOT_ENOUGH,
+    Limit,
+    efforts_left,
+    growth,
+    largest_use,
+    limits_on,
+    slowed,
+)
+from fflin.control.weights import GivenWeight, reweighed, sampled_cost, weights_of
 from fflin.linear.model import LinearModel
 
 # The bandwidth [rad/s] of a loop that no limit slows: it settles in about thirty seconds. With
@@ -32,10 +37,6 @@ BANDWIDTH, _HELD = 0.2, 0.3
 # Displacements from which the robot must return within its limits: a rotation of the base [deg], an
 # offset of the base in radii of gyration, and a joint's [rad], [m], or this fraction of its range.
 ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
-
-# A loop with springs or gravity is slowed at most this many times. The fastest loop is taken that
-# leaves the efforts at least this fraction of the best.
-_TRIALS, _IN_VAIN = 8, 0.9
 
 # What grows is held by a loop of at least this fraction of its rate of growth, and of the second
 # fraction where the efforts have less. A slower one lets light joints swing by radians.
@@ -48,13 +49,8 @@ _LEAST_REACH = 1e-3
 # No input acts on a coordinate if the inputs' effect, relative to its inertia, is below this.
 _IDLE = 1e-12
 
-# The report names a mode whose decay is below this fraction of the decay at rest.
-_AS_SLOW = 0.9
-
 # Iterations for the bandwidth of a robot with dampers, whose effect depends on the bandwidth.
 _PASSES = 4
-
-_NOT_ENOUGH = "is too small for all displacements"
 
 
 class Weights(NamedTuple):
@@ -79,16 +75,6 @@ class Pace(NamedTuple):
 AT_A_POINT = Pace()
 
 
-_Costs: TypeAlias = Callable[[float], tuple[Array, Array]]
-
-
-class _Limit(NamedTuple):
-    """The largest bandwidth that a limit leaves, and what limits it."""
-
-    bandwidth: float
-    what: str
-
-
 def default_weights(
     lin: LinearModel, pace: Pace = AT_A_POINT, momenta: Mapping[str, float] | None = None
 ) -> Weights:
@@ -104,7 +90,7 @@ def default_weights(
     for _ in range(_PASSES if damping.any() else 1):
         found = _of_inertia(lin, lin.M + damping / w, np.linalg.inv(N), pace, momenta or {})
         w, before = found.bandwidth, w
-        if _NOT_ENOUGH in found.rule or w > 0.97 * before:
+        if NOT_ENOUGH in found.rule or w > 0.97 * before:
             break
     return found
 
@@ -158,21 +144,21 @@ def _of_inertia(
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
     motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta]
     taken = np.vstack((T, added[motors]))
-    use = _largest(gain, size, lin.state_names)
+    use = largest_use(gain, size, lin.state_names)
     limits = [
-        _Limit(pace.bandwidth, ""),
-        *_limits("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0),
-        *_limits("effort", _efforts(lin), use, 2.0),
+        Limit(pace.bandwidth, ""),
+        *limits_on("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0),
+        *limits_on("effort", efforts_left(lin), use, 2.0),
     ]
     limit, achieved = min(limits), ""
     rate = rate_matrix(lin)
     loaded = rate[m:].any() or rate[:m, :m].any()
     if loaded:
-        grows = _growth(lin)
+        grows = growth(lin)
         limit = max(limit, grows._replace(bandwidth=_OF_GROWTH * grows.bandwidth))
     if pace.hold or lin.dt:
         fastest = pace.held / ((pace.hold or lin.dt) * rates[-1])
-        limit = min(limit, _Limit(float(fastest), "the sampling time"))
+        limit = min(limit, Limit(float(fastest), "the sampling time"))
     damped = (lin.M != M).any()
     on_velocities = _on_velocities(lin, S, cost, D / unit, damped) if loaded else None
 
@@ -186,7 +172,7 @@ def _of_inertia(
     if loaded:
         driven = (S**2 / cost).sum(axis=1) > _IDLE * D / unit
         least = min(grows._replace(bandwidth=_LEAST_OF_GROWTH * grows.bandwidth), limit)
-        limit, achieved = _slowed(lin, costs, size, size * driven, limit, least)
+        limit, achieved = slowed(lin, costs, size, size * driven, limit, least)
     rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION) + (
         "; joint damping is included" if damped else ""
     )
@@ -245,16 +231,6 @@ def _radius_of_gyration(M: Array) -> float:
     return math.sqrt(max(float(moment) / (2.0 * mass), 1e-300))
 
 
-def _largest(K: Array, size: Array, names: tuple[str, ...]) -> Array:
-    """Return the largest K d of all displacements d: the base's in any direction, joints' signs."""
-    groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
-    scaled = K[..., : len(size)] * size
-    total: Array = np.abs(scaled[..., ~np.isin(groups, ("q_b", "r_b"))]).sum(axis=-1)
-    for group in ("q_b", "r_b"):
-        total += np.linalg.norm(scaled[..., groups == group], axis=-1)
-    return total
-
-
 def _reach(S: Array, cost: Array, D: Array) -> Array:
     """Return S R^-1 S' (m, m), and D where no input acts."""
     reach = (S / cost) @ S.T
@@ -281,136 +257,10 @@ def _fastest(
     if (mass < 1.0).any():
         fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
         moving = (rates**2 * (slow - fast) / root).real
-    return _largest(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
+    return largest_use(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
 
 
-def _limits(what: str, room: Mapping[str, float], used: Array, power: float) -> list[_Limit]:
-    """Return what is left of a bandwidth of 1, with a power of which what is used grows."""
-    return [
-        _Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
-        for (name, most), size in zip(room.items(), used.tolist(), strict=True)
-        if 0.0 < most < math.inf and size > 0.0
-    ]
-
-
-def _efforts(lin: LinearModel) -> dict[str, float]:
-    """Return what the limits of the inputs leave beside what the point asks for."""
-    inputs = zip(lin.input_names, lin.u0.tolist(), strict=True)
-    return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
-
-
-def _growth(lin: LinearModel) -> _Limit:
-    """Return the largest rate of growth [1/s] of the model, and which mode has it."""
-    poles, modes = np.linalg.eig(lin.A)
-    growth = rates_of(poles, lin.dt).real
-    fastest, k = float(growth.max()), int(growth.argmax())
-    moving = listed(_moving_most(lin, modes[:, [k]]))
-    return _Limit(fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})")
-
-
-class _Trial(NamedTuple):
-    """A loop that was tried: its limit, its gain and modes, and what its inputs require."""
-
-    limit: _Limit
-    left: float  # factor on the bandwidth that the efforts allow, as far as it is below 1
-    effort: str  # the input that allows the least
-    K: Array
-    rates: Values  # of the modes (nx,) [1/s]
-    modes: Complex
-    required: Array  # largest inputs (nu,)
-
-
-def _slowed(
-    lin: LinearModel, costs: _Costs, size: Array, driven: Array, limit: _Limit, least: _Limit
-) -> tuple[_Limit, str]:
-    """Slow a loop with springs or gravity until it respects the limits; report what it achieves.
-
-    The loop is slowed down to `least` and no further. Displacements `size` (m,) require efforts at
-    the start, and displacements `driven` also on the way back. The latter omit joints without a
-    motor, which springs or gravity move.
-    """
-    trials = list[_Trial]()
-    for _ in range(_TRIALS):
-        Q, R = costs(limit.bandwidth)
-        try:
-            K = solve(lin.A, lin.B, Q, R, None, lin.dt).K
-        except np.linalg.LinAlgError:
-            break
-        poles, modes = np.linalg.eig(lin.A - lin.B @ K)
-        rates = rates_of(poles, lin.dt)
-        time = np.geomspace(0.1 / np.abs(rates).max(), 3.0 / np.abs(rates).min(), 60)
-        decaying = (K @ modes) * np.exp(rates * time[:, None])[:, None]
-        later = (decaying @ np.linalg.inv(modes)[:, : len(size)]).real
-        use = np.maximum(
-            _largest(K, size, lin.state_names),
-            _largest(later, driven, lin.state_names).max(axis=0),
-        )
-        left, what = min(_limits("effort", _efforts(lin), use, 2.0), default=_Limit(1.0, ""))
-        trials.append(_Trial(limit, left, what, K, rates, modes, np.abs(lin.u0) + use))
-        if left >= 1.0 - 1e-6:
-            return limit, _achieved(lin, trials[-1])
-        if limit.bandwidth <= least.bandwidth:
-            break
-        # What springs and gravity require remains, however slow the loop is.
-        slower = _Limit(min(max(left, 0.3), 0.8) * limit.bandwidth, what)
-        limit = max(slower, least)
-    if not trials:
-        return limit, ""  # the regulator raises with the reason
-    most = max(trial.left for trial in trials)
-    trial = next(x for x in trials if x.left >= _IN_VAIN * most)
-    limit, effort = trial.limit, trial.effort
-    high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
-    where = "to return from the displacements of the default weights"
-    required = trial.required[None]
-    warn_beyond(lin.robot, where, lin.input_names, lin.input_units, required, -high, high)
-    held = limit.what == least.what  # a slower loop loses an unstable mode
-    what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
-    return limit._replace(what=what), _achieved(lin, trial)
-
-
-def _achieved(lin: LinearModel, trial: _Trial) -> str:
-    """Return a report of a loop's bandwidth and decay, and of modes slower than at rest."""
-    decay, fast = -trial.rates.real, np.abs(trial.rates)
-    said = f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} 1/s, "
-    said += f"damping ratio at least {(decay / fast).min():.2g}"
-    slow = np.flatnonzero(decay < _AS_SLOW * math.sqrt(0.5) * trial.limit.bandwidth)
-    if vibrating := _vibrations(lin, trial, slow.tolist()):
-        said += (
-            "; decaying by their own damping only: "
-            f"{listed(list(dict.fromkeys(vibrating.values())))}"
-        )
-    slow = np.setdiff1d(slow, list(vibrating)).astype(int)
-    if names := _moving_most(lin, trial.modes[:, slow]):
-        said += f"; slowed by springs, gravity or motion: {listed(names)}"
-    return said
-
-
-def _vibrations(lin: LinearModel, trial: _Trial, slow: list[int]) -> dict[int, str]:
-    """Return {index: mode of an appendage} of the slow modes of a loop that vibrate with it."""
-    robot, m = lin._robot, len(lin.M)
-    if robot is None or not robot.modes:
-        return {}
-    names = [name.removeprefix("q_m.") for name in lin.state_names[:m]]
-    stiffness = np.array([robot.stiffness.get(name, 0.0) for name in names])
-    of_modes = np.isin(names, [joint.name for joint in robot.modes])
-    found = {}
-    for k in slow:
-        energy = stiffness * np.abs(trial.modes[:m, k]) ** 2
-        rate = trial.rates[k]
-        if energy[of_modes].sum() > 0.5 * energy.sum() and abs(rate.imag) > 2.0 * abs(rate.real):
-            found[k] = names[int((energy * of_modes).argmax())]
-    return found
-
-
-def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
-    """Return the coordinates that modes (nx, k) move most, weighed by inertia."""
-    m = len(lin.M)
-    large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
-    among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
-    return [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]
-
-
-def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: float) -> str:
+def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: float) -> str:
     groups = [name.partition(".")[0] for name in lin.state_names[: len(size)]]
     base = [f"{turn:g} deg"] * ("q_b" in groups)
     if "r_b" in groups:
@@ -425,7 +275,7 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, achieved: str, turn: flo
         from_where.append(f"{sizes} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
     slow = f"; bandwidth limited by {limit.what}" if limit.what else ""
-    if beyond := [name for name, room in _efforts(lin).items() if room <= 0.0]:
+    if beyond := [name for name, room in efforts_left(lin).items() if room <= 0.0]:
         slow += f"; already at or beyond the URDF limit at the operating point: {listed(beyond)}"
     pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"
     return f"from {source}, for displacements of {' and '.join(from_where)}: {pace}{slow}"
@@ -438,9 +288,6 @@ _BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
 
 # The speeds of wheels come back at this fraction of the bandwidth.
 _SPEEDS = 0.1
-
-# A weight that is given and this many times apart from that of the rule is on another scale.
-_APART = 1e4
 
 
 def pace_along(duration: float, hold: float) -> Pace:
@@ -480,7 +327,7 @@ def rule_weights(
         given_weights |= weights
         named |= dict.fromkeys(names)
     if named:
-        Q, R = _reweighed(lin, Q, R, terms, given_weights)
+        Q, R = reweighed(lin, Q, R, terms, given_weights)
         rule = f"{', '.join(named)} as given, the others {rule}"
         rule += " (with this rule alone)" if terms.any() else ""
     if source.dt == lin.dt:
@@ -522,34 +369,3 @@ def _of_regulated(
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
         rule = f"{rule}; wheel speeds at {slow:.3g} rad/s"
     return Q, R, rule, terms
-
-
-def _reweighed(
-    lin: LinearModel, Q: Array, R: Array, terms: Array, given: Mapping[int, GivenWeight]
-) -> tuple[Array, Array]:
-    """Return Q and R, scaled to the largest values that are given, with what is given in them.
-
-    A common factor of Q and R does not change the gain. The rule's weights are scaled so that the
-    largest values of the named states and inputs cost 1, as in Bryson's rule.
-    """
-    costs = [terms[index] for index, each in given.items() if each.largest and terms[index]]
-    scale = math.exp(-np.log(costs).mean()) if costs else 1.0
-    Q, R, nx, apart = scale * Q, scale * R, len(Q), dict[str, str]()
-    names = (*lin.state_names, *input_keys(lin))
-    for index, (value, largest) in given.items():
-        matrix, at = (Q, index) if index < nx else (R, index - nx)
-        own = float(matrix[at, at])
-        if terms.any() and not largest and value > 0.0 and own > 0.0:
-            ratio = value / own
-            if not 1.0 / _APART < ratio < _APART:
-                apart[names[index]] = f"{names[index]} is {value:.3g}, the rule gives {own:.3g}"
-        matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
-    if apart:
-        warnings.warn(
-            f"the weights given differ in scale from the rule's weights: {listed(apart.values())}; "
-            "one of the two groups will dominate the cost, so give largest acceptable values "
-            "(bryson) instead of weights",
-            FflinWarning,
-            stacklevel=4,
-        )
-    return Q, R

@@ -101,13 +101,13 @@ class Loop(NamedTuple):
 
     @property
     def phase(self) -> float:
-        """Lag or lead [deg] that it bears; infinite where its gain is never one."""
+        """Phase margin [deg] for lag or lead; infinite if the loop gain is never 1."""
         each = (abs(math.remainder(angle - 180.0, 360.0)) for _, angle in self.crossings)
         return min(each, default=math.inf)
 
     @property
     def gain(self) -> tuple[float, float]:
-        """Factors between which its gain may lie."""
+        """Gain factors between which the loop is stable."""
         factors = [1.0 / size if size else math.inf for _, size in self.turns]
         low = max((each for each in factors if _NOTHING < each < 1.0), default=0.0)
         return low, min((each for each in factors if each > 1.0), default=math.inf)

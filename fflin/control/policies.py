@@ -202,7 +202,7 @@ class AllocatedPolicy:
 
 
 class Clock:
-    """The samples of a controller that remembers, each `dt` [s] after the last."""
+    """Samples of a controller with an internal state, every `dt` [s]."""
 
     def __init__(self, dt: float) -> None:
         self._dt, self._last = dt, -np.inf

@@ -19,7 +19,7 @@ _NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # the names that signals have of the
 
 
 class System(NamedTuple):
-    """A, B, C, D; dt [s], 0 in continuous time, -1 not known, None not said; names or none."""
+    """A, B, C, D, dt and names; dt [s] is 0 if continuous, -1 if unknown, None if not given."""
 
     A: Array
     B: Array
@@ -31,7 +31,7 @@ class System(NamedTuple):
 
 
 def system_of(given: Any) -> System:
-    """Return the system that is given in any of the ways that `LinearController` takes."""
+    """Return the system that is given in any form of `LinearController`."""
     if isinstance(given, System):
         return given
     if isinstance(given, str | Path):

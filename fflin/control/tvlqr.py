@@ -155,7 +155,7 @@ def asks_steady(value: Any, name: str = "Qf", kind: str = "a weight") -> bool:
 def held_stages(
     traj: LinearTrajectory, dt: float, Q: Array, R: Array
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield the samples that `samples_back` takes, from first to last."""
+    """Yield the samples for `samples_back`, from first to last."""
     nx, W = len(Q), block_diag(Q, R)
     for steps, whole in transitions(traj, dt):
         total, way = np.zeros_like(W), np.eye(len(W))

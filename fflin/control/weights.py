@@ -1,12 +1,14 @@
 """Weights of a quadratic cost, given as matrices, diagonals, numbers or names."""
 
+import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import Array, dimension, instance, number, positive, shaped, vector
 from fflin.linear.linear_trajectory import LinearTrajectory
@@ -17,6 +19,9 @@ Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 
 # What rounding may leave of symmetry and of semidefiniteness, relative to the largest entry.
 _ROUNDING = 1e-9
+
+# A weight that is given and this many times apart from that of the rule is on another scale.
+_APART = 1e4
 
 
 def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) -> Array:
@@ -290,3 +295,34 @@ def weights_of(
     nx = len(lin.x0)
     shifted = {nx + index: each for index, each in of_inputs.items()}
     return by_name("state", q, lin.state_names) | shifted, [*q, *r]
+
+
+def reweighed(
+    lin: LinearModel, Q: Array, R: Array, terms: Array, given: Mapping[int, GivenWeight]
+) -> tuple[Array, Array]:
+    """Return Q and R, scaled to the largest values that are given, with what is given in them.
+
+    A common factor of Q and R does not change the gain. The rule's weights are scaled so that the
+    largest values of the named states and inputs cost 1, as in Bryson's rule.
+    """
+    costs = [terms[index] for index, each in given.items() if each.largest and terms[index]]
+    scale = math.exp(-np.log(costs).mean()) if costs else 1.0
+    Q, R, nx, apart = scale * Q, scale * R, len(Q), dict[str, str]()
+    names = (*lin.state_names, *input_keys(lin))
+    for index, (value, largest) in given.items():
+        matrix, at = (Q, index) if index < nx else (R, index - nx)
+        own = float(matrix[at, at])
+        if terms.any() and not largest and value > 0.0 and own > 0.0:
+            ratio = value / own
+            if not 1.0 / _APART < ratio < _APART:
+                apart[names[index]] = f"{names[index]} is {value:.3g}, the rule gives {own:.3g}"
+        matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
+    if apart:
+        warnings.warn(
+            f"the weights given differ in scale from the rule's weights: {listed(apart.values())}; "
+            "one of the two groups will dominate the cost, so give largest acceptable values "
+            "(bryson) instead of weights",
+            FflinWarning,
+            stacklevel=4,
+        )
+    return Q, R

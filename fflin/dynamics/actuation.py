@@ -92,7 +92,7 @@ class Actuation:
         return columns
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
-        """Return u (.., nu) with what is held in reference axes in base axes."""
+        """Return u (.., nu) with reference-frame wrenches in base axes."""
         if not self.held:
             return u
         return chart.to_base(self.held, u[..., None])[..., 0]

@@ -78,11 +78,11 @@ class Chart:
         return 2.0 * by_turn if self.standing else product(by_turn, self.J)
 
     def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Turn parts of x (.., m, k), three rows each, by R where they stand."""
+        """Rotate parts of x (.., m, k), three rows each, by R in place."""
         _turn(self.R, () if self.standing else parts, x)
 
     def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Turn parts of x (.., k, m), three columns each, by R^T where they stand."""
+        """Rotate parts of x (.., k, m), three columns each, by R^T in place."""
         for columns in () if self.standing else parts:
             x[..., columns] = product(x[..., columns], self._back)
 

@@ -118,7 +118,7 @@ class Inertia:
         )
 
     def _judge(self, coupling: float, M: Array, inverse: Array) -> None:
-        """Refuse or warn of an M whose inverse has lost its digits; name what moves with it."""
+        """Refuse a singular M, or warn of an ill-conditioned M, by coordinate names."""
         name, scale = self._state.robot.name, np.sqrt(np.maximum(M.diagonal(), 0.0))
         scale[scale == 0.0] = 1.0
         lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # or NaN
@@ -198,7 +198,7 @@ def inertia_bounds(model: pin.Model) -> Array | None:
 
 
 def rotor_names(robot: Robot) -> tuple[str, ...]:
-    """Return the names of the joints whose turning changes no inertia and that carry nothing."""
+    """Return the names of rotors: symmetric joints that carry no other joint."""
     model = robot.model
     index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
     named = set(robot.used_frames)
@@ -213,7 +213,7 @@ def rotor_names(robot: Robot) -> tuple[str, ...]:
 
 
 def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
-    """Whether the body behind a joint stays as it is when the joint turns."""
+    """Return whether the body of a joint is symmetric about the joint axis."""
     if joint.prismatic:
         return False
     pin_joint = robot.model.joints[index]

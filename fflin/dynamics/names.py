@@ -32,7 +32,7 @@ def unknown_frame(frame: object) -> InputError:
 
 
 def frame_of(robot: Robot, frame: object) -> Frame:
-    """Return the frame that is asked for, or a robot's default one; it has to suit an orbit."""
+    """Return the requested frame, or a robot's default frame, checked against its orbit."""
     if frame is None:
         return ORBITAL[0] if robot.orbit else "hybrid"
     if not isinstance(frame, str) or frame not in get_args(Frame):

@@ -59,7 +59,7 @@ class OrbitField:
         self._reach = sum(float(np.linalg.norm(x)) for x in (*steps, *self._lever))
 
     def base(self, q: Array) -> tuple[Array, Array]:
-        """Return attitude (3, 3) and place (3,) of the base."""
+        """Return attitude (3, 3) and position (3,) of the base."""
         base = self._root * pin.XYZQUATToSE3(q[:7])
         return base.rotation, base.translation
 
@@ -77,7 +77,7 @@ class OrbitField:
             warnings.warn(said, FflinWarning, stacklevel=7)
 
     def absolute(self, q: Array, v: Array) -> Array:
-        """Return the velocity (nv,) in axes that stand still of one relative to the orbit's."""
+        """Return the velocity (nv,) in inertial axes from one relative to the orbital frame."""
         R, place = self.base(q)
         found = v.copy()
         found[PIN_LINEAR] += R.T @ (self._turning @ place)

@@ -89,7 +89,7 @@ def start_of(robot: Robot) -> tuple[Array, Array]:
 def point_of(
     state: StateMap, x0: Any, q0: Any, v0: Any, default: Callable[[], tuple[Array, Array]]
 ) -> tuple[Array, Array]:
-    """Return the configuration (nq,) and velocity (nv,) that a caller gives, as x or as q and v."""
+    """Return the configuration (nq,) and velocity (nv,) from x or from q and v."""
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:

@@ -48,7 +48,7 @@ class Case(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Law:
-    """What every exported law has."""
+    """Properties common to all exported laws."""
 
     title: str
     frame: Any

@@ -288,7 +288,7 @@ def _whole(values: Iterable[Any]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text that may stand in a comment and in a string of C."""
+    """Return a text that is valid in a comment and in a string of C."""
     return re.sub(r"[^\w .,+^()\[\]/-]", "_", text, flags=re.ASCII)
 
 

@@ -44,7 +44,7 @@ _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 class LeastSquares(
     namedtuple("LeastSquares", "least most columns given A Q R b y wanted x s low high state order")
 ):
-    """The x (k,) within `least` and `most` (k,) that makes the sum of columns nearest to a force.
+    """Solve for x (k,) between `least` and `most` (k,) so that columns @ x is nearest to a force.
 
     `columns` has the k columns of an input's unit force, one after the other, and then the force.
     What follows is work space: the `given` columns of a lane; `A`, the same divided by their norm;
@@ -265,7 +265,7 @@ def _fit(problem, size, free, kept):
 
 @inlined
 def _subtract_bound(problem, size):
-    """Write what is wanted, less what the inputs at bounds give, into b."""
+    """Write the wanted force minus the force of the inputs at bounds into b."""
     x, b, state = problem.x, problem.b, problem.state
     b[:] = 0.0
     write_scaled(problem.wanted, 0, 1.0, b[:size])
@@ -292,7 +292,7 @@ def _orthogonalise(problem, size, at):
 
 @called
 def _steepest(problem, size):
-    """Return the untried input at a bound that best leaves it; -1 where none does."""
+    """Return the untried input at a bound that is best to release; -1 if there is none."""
     best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
     row_products(problem.A, size, b, slopes)
     for j in range(len(state)):

@@ -35,7 +35,7 @@ _NOTHING = work_space(0)
 
 
 class Struct:
-    """The type of a named tuple's words: each field is of one kind but for others."""
+    """Return the type of a named tuple of kernel arguments with one kind for most fields."""
 
     def __init__(self, made: Any, kind: Any = REALS, name: str = "", /, **others: Any) -> None:
         self.made = made

@@ -1,4 +1,4 @@
-"""The way of a command to the actuators: limits, sample and hold, delay, pulses and wheel speeds.
+"""Actuator channel: limits, sample and hold, delay, pulses and wheel speeds.
 
 Both engines call these functions, see `control.channel`.
 """
@@ -77,7 +77,7 @@ def limit(channel, u):
 
 @inlined
 def is_asked(channel, step):
-    """Whether the policy is asked for a command at the start of a step."""
+    """Return whether the policy is evaluated at the start of a step."""
     return channel.sample == 0 or step % channel.sample == 0
 
 
@@ -121,7 +121,7 @@ def _arrive(channel, step, u):
 
 @inlined
 def _begin_pulses(channel, step, u):
-    """Fire the command of a sample, and carry the rest of its impulse to the next sample."""
+    """Fire the pulse of a sample, and add the remaining impulse to the next sample."""
     pulses, sample, fresh = channel.pulses, channel.sample, load(channel.fresh, 0)
     for index in range(len(pulses.at)):
         most, least = load(pulses.most, index), load(pulses.least, index)

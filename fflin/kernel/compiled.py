@@ -1,4 +1,4 @@
-"""The compiled kernel: whether it pays, and its functions."""
+"""The compiled kernel: its functions, and whether compiling is worthwhile."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _TURN, _COMPILING = Lock(), RLock()
 
 
 def available_cores() -> int:
-    """How many cores this process may use, by its affinity and its share in a container."""
+    """Return the number of cores of this process, by CPU affinity and container quota."""
     if not hasattr(os, "sched_getaffinity"):
         return os.cpu_count() or 1
     cores = len(os.sched_getaffinity(0))
@@ -155,7 +155,7 @@ def is_kept(module: str, name: str) -> bool:
 
 
 def _kept(folder: Path, module: str, name: str) -> list[Path]:
-    """Return what is kept of a function and not older than any source."""
+    """Return a function's stored machine code if no source is newer."""
     # numba compares with the function's own file, not with those of the functions that it calls.
     source = max(file.stat().st_mtime for file in _sources())
     entries = _entries(folder, module, name)

@@ -1,4 +1,4 @@
-r"""Momentum and centre of mass as the impulse from outside takes them, and their keeping.
+r"""Momentum and centre of mass from the external impulse, and their projection.
 
 .. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
 
@@ -23,7 +23,7 @@ SUMS = 18
 
 
 class MomentumReference(namedtuple("MomentumReference", "start weight per_mass sums")):
-    """What is kept; each array of doubles may have a second axis of eight lanes.
+    """Reference of the conserved quantities; arrays of doubles may have a second axis of lanes.
 
     `start` (12,): momentum, centre of mass, and the point that both are seen from; weight (3,); and
     `sums` (18,): the impulse (6,), and the shift (3,) of the centre of mass beyond the one of its
@@ -82,7 +82,7 @@ def kept_at(reference, t):
 
 @inlined
 def start_at(work, robot, reference, point):
-    """Write what is to be kept from a point on, whose M must be there."""
+    """Write the conserved quantities at a point whose M is already computed."""
     axes, tree = axes_of(point.q), robot.tree
     lever = vec.get3(work, tree.inertias + 1)
     nothing = vec.minus(lever, lever)

@@ -57,7 +57,7 @@ from fflin.kernel.vectors import get6, minus6, put6, times6
 
 @inlined
 def _coriolis(work, at, w):
-    """Return 2 B w, moment and force, of what a joint carries."""
+    """Return 2 B w, moment and force, of the bodies that a joint carries."""
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     moment = vec.minus(vec.times(w, trace), vec.product(G, w))
@@ -178,7 +178,7 @@ def differentiate(work, tree, layout, loads):
 
 @inlined
 def _invert(work, robot):
-    """Write M^-1, and what tells whether it is sound."""
+    """Write M^-1, and the values that show its accuracy."""
     tree, size = robot.tree, len(robot.tree.row)
     inertia.invert_factor(work, tree)
     inertia.multiply(work, tree, robot.judged)

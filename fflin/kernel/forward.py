@@ -37,14 +37,14 @@ class Mechanics(
 
 
 class ActuatorFaults(namedtuple("ActuatorFaults", "gain bias until turn")):
-    """Faults: a command u gives the input gain u + bias (nu,), and zero from `until` [s] on.
+    """Actuator faults: the input is gain u + bias (nu,) for a command u, and 0 after `until` [s].
 
     `turn` has the columns (9,) along which the three inputs of each vector on the base act.
     """
 
 
 class Point(namedtuple("Point", "q nu u pushing wrench")):
-    """Where a robot is, q (nq,) and nu (6 + n,) in base axes, and the inputs (nu,) there.
+    """Point of a robot: q (nq,) and nu (6 + n,) in base axes, and the inputs (nu,).
 
     `u` is as it is commanded, `pushing` in base axes; `wrench` (6,) is what the inputs of the last
     acceleration are at the base's origin, moment and force.
@@ -98,13 +98,13 @@ def joint_position(robot, q, joint):
 
 @inlined
 def seen(robot, q):
-    """Return the base's quaternion seen from the reference."""
+    """Return the base's quaternion relative to the reference."""
     return quaternion_times(attitude(robot.origin), attitude(q))
 
 
 @inlined
 def apply_faults(faults, triads, t, u, given):
-    """Write the inputs that faulty actuators give of a command u at a time."""
+    """Write the inputs of faulty actuators for a command u at a time."""
     for index in range(len(faults.gain)):
         value = load(faults.gain, index) * load(u, index) + load(faults.bias, index)
         store(given, index, chosen(t, load(faults.until, index), value, 0.0))
@@ -115,7 +115,7 @@ def apply_faults(faults, triads, t, u, given):
 
 @inlined
 def turn_held(robot, point):
-    """Turn inputs that are held in reference axes to base axes."""
+    """Rotate reference-frame inputs to base axes."""
     pushing = point.pushing
     for index in range(len(robot.held)):
         at = robot.held[index]

@@ -83,7 +83,7 @@ def _inertia(work, at, place, bodies, first):
 
 @inlined
 def _carry(work, at, above, place):
-    """Add a composite inertia, seen from the parent's joint, to the parent's."""
+    """Add a composite inertia, expressed at the parent's joint, to the parent's inertia."""
     m = load(work, at)
     h = vec.get3(work, at + 1)
     xx, xy, xz = vec.get3(work, at + 4)

@@ -109,7 +109,7 @@ def _negative(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
 
 
 def _held(array: Any) -> Any:
-    """Return the type of what an array holds."""
+    """Return the type of an array's entries."""
     return lanes if array.ndim == 2 else double
 
 
@@ -230,7 +230,7 @@ def chosen(typing: Any, left: Any, right: Any, less: Any, other: Any) -> Any:
 
 @intrinsic
 def below(typing: Any, value: Any, bound: Any) -> Any:
-    """Whether a number, or every lane, is less than a bound; not where one is no number."""
+    """Return whether a number, or every lane, is less than a bound; false for NaN."""
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         value, bound = _alike(builder, arguments)

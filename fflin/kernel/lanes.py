@@ -72,7 +72,7 @@ def chosen(left: Any, right: Any, less: Any, other: Any) -> Any:
 
 
 def below(value: Any, bound: Any) -> Any:
-    """Whether a number, or every lane, is less than a bound; false where one is NaN."""
+    """Return whether a number, or every lane, is less than a bound; false for NaN."""
     return value < bound
 
 

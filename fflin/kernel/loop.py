@@ -43,9 +43,9 @@ class Method(namedtuple("Method", "h origin shift speed nodes weights moments ta
 
 
 class StopConditions(namedtuple("StopConditions", "squares sign")):
-    """When to stop: squares of rates (6 + n,), and the sign (1,) of q0 in the chart, or 0.
+    """Stop condition: squared rate bounds (6 + n,), and the sign (1,) of q0 in the chart.
 
-    The engine in Python has the rates in the order of v (nv,).
+    The sign is 0 if there is no chart. The engine in Python has the rates in the order of v (nv,).
     """
 
 
@@ -59,7 +59,7 @@ class Stages(namedtuple("Stages", "rates along total first second u")):
 class Arguments(
     namedtuple("Arguments", "robot method law channel reference project pushed stop point stages")
 ):
-    """What `advance` reads; also whether to `project`, and whether anything pushes from outside."""
+    """Arguments of `advance`, with the switches for the projection and for external forces."""
 
 
 ARGUMENTS = Struct(

@@ -48,7 +48,7 @@ class _NoEnvironments:
 
 
 class PartLibrary(CPUCodeLibrary):
-    """The code of a part, and which others it calls."""
+    """Source code of a part, and the other parts that it calls."""
 
     def __init__(self, codegen: Any, name: str) -> None:
         super().__init__(codegen, name)
@@ -56,7 +56,7 @@ class PartLibrary(CPUCodeLibrary):
 
     @property
     def codegen(self) -> Any:
-        """What makes code of it."""
+        """Compiler of this part."""
         return _NoEnvironments(self._codegen)
 
     def finalize(self) -> None:
@@ -82,7 +82,7 @@ class PartLibrary(CPUCodeLibrary):
                     library._called(found)
 
     def _own_module(self) -> Any:
-        """Return the code without that of what it calls."""
+        """Return the source code without the code of called functions."""
         return super()._get_module_for_linking()
 
     def _get_module_for_linking(self) -> Any:

@@ -96,7 +96,7 @@ def _placed(knots, time):
 
 @inlined
 def _follow(robot, path, t):
-    """Write what is followed at a time of the run, u in base axes; return if it is over."""
+    """Write the followed trajectory at a time, u in base axes; return whether it has ended."""
     point, last, knots = path.point, len(path.t) - 2, path.t
     time, after = knots[0] + max(t, 0.0), path.ends and t > path.over
     k, s = _placed(knots, time)
@@ -124,7 +124,7 @@ def _follow(robot, path, t):
 
 @inlined
 def error(robot, path, point):
-    """Write the error from what is followed, in its axes."""
+    """Write the error relative to the followed trajectory, in its axes."""
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
     (x, y, z), w = attitude(there.q)
     vector, scalar = quaternion_times(((-x, -y, -z), w), attitude(q))
@@ -250,7 +250,7 @@ def read_state(robot, law, point, row):
 
 @inlined
 def _turn_gyros(work, robot, gyros, nu, x, first):
-    """Write what gyroscopes measure from an entry on."""
+    """Write the gyroscope outputs, starting at an entry."""
     move_bodies(work, robot.tree, robot.layout, nu)
     for index in range(len(gyros.body)):
         body = gyros.body[index]
@@ -261,7 +261,7 @@ def _turn_gyros(work, robot, gyros, nu, x, first):
 
 @inlined
 def _measure(work, robot, law, point, count):
-    """Write the outputs, with what is added to those of a sample."""
+    """Write the outputs, with the noise of a sample added."""
     outputs = len(law.measured)
     if len(law.gyros.body) > 0:
         _turn_gyros(work, robot, law.gyros, point.nu, law.x, 2 * len(point.nu))
@@ -281,7 +281,7 @@ def _times(matrix, row, x):
 
 @inlined
 def command(work, robot, law, point, t, count, stage):
-    """Write the inputs that a policy asks for, at a sample of that count or a stage of a step."""
+    """Write the commands of a policy at a sample of that number or at a stage of a step."""
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
         return
@@ -296,7 +296,7 @@ def command(work, robot, law, point, t, count, stage):
 
 @inlined
 def _feed_back_between(robot, law, point):
-    """Write what the gains between the points of a grid make of the state, lane by lane."""
+    """Write the commands of gains interpolated on a grid, lane by lane."""
     grid, y, u = law.grid, law.y, law.u
     inputs, size = len(u), len(y)
     for axis in range(len(grid.joint)):
@@ -333,7 +333,7 @@ def _corner(grid, corner, lane):
 
 @called
 def _filter(by, y, u, row, stage):
-    """Write what a linear law asks for, and bring it up to the next sample or write its rate."""
+    """Write the commands of a linear law, and its next state or state derivative."""
     size, outputs, inputs = len(by.z), len(y), len(u)
     along = len(by.rates) > size
     first = (1 + stage) * size if along else 0

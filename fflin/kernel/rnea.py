@@ -103,7 +103,7 @@ def load_carried(work, tree, layout, loads, u):
 
 @inlined
 def load_momenta(work, tree, layout, loads):
-    """Write the momenta of the bodies, each alone, and nothing of what c does."""
+    """Write the momenta of the single bodies, without velocity-product terms."""
     zero = splat(work, 0.0)
     for body in range(len(tree.parent)):
         at = layout.load + body * LOAD

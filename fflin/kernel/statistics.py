@@ -84,7 +84,7 @@ def _compare(stats, step):
 
 @listed
 def note(stats, rows, first, count):
-    """Do the work of `take`, on opened arguments."""
+    """Record the statistics of `take`, on opened arguments."""
     at, sizes, kept = stats.at, stats.sizes, 0
     width, inputs = len(at.q) + len(at.nu), len(stats.largest_u)
     while kept < len(stats.steps) and stats.steps[kept] < first:

@@ -54,7 +54,7 @@ class Tree(
 
 
 class Layout(namedtuple("Layout", "motion load bias c columns lower held size")):
-    """Where the parts of the kernel's work space begin, beyond those of the tree; its size."""
+    """Offsets of the arrays in the kernel's work space after the tree's arrays, and its size."""
 
 
 class Loads(namedtuple("Loads", "body wrench input stored_body stored stiffness damping")):
@@ -144,7 +144,7 @@ def _tree(robot: Robot) -> Tree | None:
 
 
 def _screw(model: pin.Model, joint: Any) -> tuple[pin.SE3, float, float] | None:
-    """Return the frame whose z is a joint's axis, and what a unit of it turns and slides."""
+    """Return the frame with z along a joint's axis, and rotation and translation per unit."""
     data = joint.createData()
     q, v = pin.neutral(model), np.zeros(model.nv)
     joint.calc(data, q)
@@ -174,7 +174,7 @@ def _coordinates(robot: Robot) -> tuple[list[int], list[float]]:
 
 
 def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> Array:
-    """Return what the rotors of all joints that move with each coordinate add to M."""
+    """Return the rotor inertias that all joints of each coordinate add to M."""
     of_joints = model.armature
     armature = np.zeros(1 + max(coordinate))
     armature[:3], armature[3:6] = of_joints[PIN_ANGULAR], of_joints[PIN_LINEAR]

@@ -185,7 +185,7 @@ def inertia_matrix(robot: Robot, lin: LinearModel, state: StateMap | None = None
 
 
 def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
-    """Return M^-1 (6 + n, 6 + n) as it stands in B of a linear model, in the frame's axes."""
+    """Return M^-1 (6 + n, 6 + n) from B of a linear model, in the frame's axes."""
     nv = 6 + state.robot.n
     inverse: Array = np.empty((nv, nv))
     Inertia(state, state.robot.create_data()).invert(lin.q, inverse)

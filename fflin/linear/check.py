@@ -223,7 +223,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 
 
 def held_to(tolerance: float | None, found: Check) -> Check:
-    """Return what was found with a tolerance of every figure in place of its own, if any."""
+    """Return the errors with one tolerance for all errors, if given."""
     if tolerance is None:
         return found
     rows = tuple(row._replace(tolerance=share("tolerance", tolerance)) for row in found.rows)
@@ -317,7 +317,7 @@ def _point_errors(
 def _output_rows(
     model: Nonlinear, lin: LinearModel, steps: tuple[Array, Array], tolerance: float
 ) -> list[Row]:
-    """Rows of C, D and y0 against differences of what the nonlinear model measures."""
+    """Rows of C, D and y0 compared with differences of the nonlinear outputs."""
     state = model.state
     outputs = (lin.output_names, lin.output_units)
     require_same(

@@ -52,7 +52,7 @@ FORMATS = (*record.FORMATS, ".csv")
 
 
 def record_of(lin: Any) -> Record:
-    """Return what a file holds of a `LinearModel`."""
+    """Return the entries of a file for a `LinearModel`."""
     entries: Record = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS, "q", "v")}
     entries["reference"] = lin.placement
     entries["drift"] = np.zeros(0) if lin.drift is None else lin.drift
@@ -142,7 +142,7 @@ def _check_size(key: str, size: int, expected: int) -> None:
 
 
 def given(value: Any, _: object) -> Any:
-    """Return what a file holds, whichever model asks for it."""
+    """Return the content of a file for any kind of model."""
     return value
 
 

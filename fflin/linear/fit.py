@@ -50,7 +50,7 @@ def sensed(state: StateMap) -> Signals:
 
 
 def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signals) -> None:
-    """Raise `InputError` that says which names and units differ from the robot's."""
+    """Raise `InputError` that lists names and units that differ from the robot's."""
     mine, others = (dict(zip(*each, strict=True)) for each in (own, there))
     lacking, beside = ([n for n in a if n not in b] for a, b in ((mine, others), (others, mine)))
     if names := lacking or beside:

@@ -267,7 +267,7 @@ class Steps(NamedTuple):
 
 
 def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
-    """Yield the steps of each sample, and what they do to the error and du (nx, nx + nu)."""
+    """Yield the steps of each sample, and their transition matrices (nx, nx + nu)."""
     times = traj.samples(dt)
     if times[-1] != traj.t[-1]:
         duration = traj.t[-1] - traj.t[0]

@@ -57,7 +57,7 @@ class Prepared:
 
     @cached_property
     def fields(self) -> dict[str, Any]:
-        """Fields of a model at rest except B and q; some take as long to make as the dynamics."""
+        """Fields of a model at rest except B and q; expensive fields are computed on demand."""
         at_rest = partial(_state_at_rest, self.map)
         asked = {"x0": at_rest, "y0": at_rest, "_reference": partial(own_reference, self.robot)}
         other = {} if self.own_reference else {"_reference": self.reference}

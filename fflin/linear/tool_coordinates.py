@@ -167,7 +167,7 @@ class ToolCoordinates:
         return quaternion, turning.rotation_matrix(quaternion)
 
     def _rotated(self, R: Array, *, rates: bool = False) -> Array:
-        """Return the matrix (6, 6) that takes a twist or wrench in base axes to the tool's."""
+        """Return the matrix (6, 6) from a twist or wrench in base axes to the tool's axes."""
         rotation = np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
         if rates:
             rotation[ANGULAR, ANGULAR] = _of_angles(_angles(R))[0]

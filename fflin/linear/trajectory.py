@@ -334,7 +334,7 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
 
 
 def along(motion: Any, robot: Robot | None) -> Trajectory:
-    """Return a motion by knots, its inputs held or linear, whichever has the least residual."""
+    """Return a motion by knots, with held or linear inputs, whose residual is smaller."""
     if motion.phases:
         raise InputError(
             "the motion has several phases, each with its own robot; convert each of its phases "

@@ -52,7 +52,7 @@ def write_table(path: Path, names: Sequence[str], rows: Array) -> None:
 
 
 def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dict[str, Any]:
-    """Return what `Trajectory` takes of a file, see `Trajectory.load`."""
+    """Return the arguments of `Trajectory` from a file, see `Trajectory.load`."""
     check_ending(source, FORMATS)
     state = StateMap(robot)
     with reading(source, "trajectory"):
@@ -72,7 +72,7 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
 def arguments(
     entries: Record, robot: Robot, hold: str | None, frame: Any, verified: bool
 ) -> dict[str, Any]:
-    """Return what `Trajectory` takes of named entries, t, u and q, v or x."""
+    """Return the arguments of `Trajectory` from named entries: t, u, and q, v or x."""
     states = "q" in entries and "v" in entries
     if not {"t", "u"} <= {*entries} or not (states or "x" in entries):
         found = ", ".join(sorted(entries))

@@ -302,7 +302,7 @@ KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, 
 
 
 def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
-    """Return three finite floats, or raise `InputError` that says what was given."""
+    """Return three finite floats, or raise `InputError` with the given value."""
     refuse_masked(what, value)
     try:
         x, y, z = (float(entry) for entry in value)

@@ -54,7 +54,7 @@ class Joint(NamedTuple):
 
     @property
     def mode(self) -> bool:
-        """Whether it is a degree of freedom of a flexible appendage or of slosh."""
+        """Whether the joint is a degree of freedom of a flexible appendage or of slosh."""
         return self.kind != "joint"
 
     def oscillation(self, stiffness: float, damping: float) -> tuple[float, float]:
@@ -275,7 +275,7 @@ class Coordinates:
 
 
 def change_in(model: pin.Model, made: pin.Model) -> str:
-    """Say what A, B and C depend on and was changed; not frames added, nor limits."""
+    """Name a changed part of the model on which A, B and C depend; not limits or new frames."""
     for what, key in {"its joints": "names", "the parents of its joints": "parents"}.items():
         if getattr(model, key).tolist() != getattr(made, key).tolist():
             return what

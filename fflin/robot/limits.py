@@ -18,7 +18,7 @@ _OPEN: Range = (-math.inf, math.inf)
 
 
 def limits_of(robot: Robot) -> dict[str, Range]:
-    """Return {name of an input or state: (least, largest)} of what has a limit."""
+    """Return {name of an input or state: (least, largest)} for all limits."""
     # Of the URDF, where zero, which exporters write for none, is none; before it go the inputs'
     # own limits, and before those `Robot.limits`.
     found: dict[str, Range] = {}
@@ -47,7 +47,7 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
 
 
 def chosen_limits(robot: Robot, limits: Any) -> tuple[dict[str, Range], dict[str, Range]]:
-    """Return what cuts the inputs of a run, by the limits of `simulate`, and all known limits."""
+    """Return the saturation of the inputs by the limits of `simulate`, and all known limits."""
     own, cutting = limits_of(robot), dict[str, Range]()
     given: dict[str, Range] = {}
     several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)

@@ -1,4 +1,4 @@
-r"""Mass of each link as the URDF gives it, and bodies that stay physically realisable.
+r"""Mass of each link as in the URDF, and changes to physically realisable bodies.
 
 A body has mass m, centre of mass c and inertia I about c. With the identity matrix E, the second
 moments of its mass distribution are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The body is

@@ -61,7 +61,7 @@ def joint_of(model: pin.Model, index: int) -> Joint:
 
 
 def check_order(model: pin.Model, name: str) -> None:
-    """Refuse joints of which one hangs neither on the one before it nor on what that hangs on."""
+    """Refuse joints that are not in depth-first order."""
     above: list[int] = []
     for joint, parent in enumerate(model.parents.tolist()):
         while above and above[-1] != parent:
@@ -91,7 +91,7 @@ def _of_parent(model: pin.Model, index: int) -> Iterator[str]:
 
 
 def _of_joint(model: pin.Model, index: int) -> Iterator[str]:
-    """Say what is wrong with the placement, the body or the armature of a joint."""
+    """Yield faults of the placement, the body or the armature of a joint."""
     placement, body = model.jointPlacements[index], model.inertias[index]
     if not np.isfinite(placement.homogeneous).all():
         yield "has a placement that is not finite"

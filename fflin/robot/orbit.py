@@ -175,7 +175,7 @@ class CircularOrbit:
 
 
 def checked_orbit(value: Any) -> CircularOrbit | None:
-    """Return the orbit that a field says: one, its altitude [m], its parts by name, or none."""
+    """Return the orbit of a field: an orbit, an altitude [m], a mapping of parts, or None."""
     if value is None or isinstance(value, CircularOrbit):
         return value
     if not isinstance(value, Mapping):

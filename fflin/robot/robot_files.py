@@ -138,7 +138,7 @@ def _leaves(value: Any, *place: str) -> Iterator[tuple[Any, ...]]:
 
 
 def _without(gone: list[str], left: tuple[str, ...], value: Any) -> Any:
-    """Return a field of a robot without what is of joints alone that are gone."""
+    """Return a field of a robot without entries for removed joints."""
     if isinstance(value, dict) and gone:
         kept = {key: x for key, x in value.items() if _kept(key, gone, left)}
         return {key: _without(gone, left, x) for key, x in kept.items()}
@@ -177,7 +177,7 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
                         ``momentum`` [N m s]: `ReactionWheel`
     every type          optional: ``max`` and ``min`` [N m | N], the largest and
                         the least value. The default of ``min`` is -max, for a
-                        thruster 0. Base inputs take one number or three
+                        thruster 0. For base inputs: one number, or three
     ==================  =========================================================
 
     Parameters

@@ -101,7 +101,7 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
 
 
 def _masses(robot: Robot) -> list[float]:
-    """Return the mass [kg] of the body behind each joint, with what its modes move."""
+    """Return the mass [kg] of the body of each joint, including its modes."""
     model = robot.model
     masses = [body.mass for body in model.inertias.tolist()]
     for index in sorted((model.getJointId(joint.name) for joint in robot.modes), reverse=True):
@@ -127,7 +127,7 @@ def _appendages(robot: Robot) -> list[str]:
 
 
 def _settings(robot: Robot) -> list[str]:
-    """Show what was set beside the URDF, but inputs and orbit."""
+    """Show settings in addition to the URDF, except inputs and orbit."""
     outputs = [":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ()))) for y in robot.outputs]
     modes = {joint.name for joint in robot.modes}
     stiffness, damping = (
@@ -172,7 +172,7 @@ def _limit(value: float) -> str:
 
 
 def draft(robot: Robot, urdf: str) -> str:
-    """Return the text of a robot file for a robot whose URDF, named `urdf`, says all."""
+    """Return the text of a robot file for a robot that is defined by its URDF `urdf` alone."""
     from importlib.resources import files
 
     model = robot.model

@@ -30,7 +30,7 @@ Lock = Mapping[str, float | None] | Iterable[str]
 
 
 def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
-    """Return a robot with joints welded at values, and wheels to what carries them."""
+    """Return a robot with joints welded at values, and wheels welded to their carriers."""
     bare, gone = robot._bare, {*values}
     mimics = {f.joint.name: Mimic(f.leader.name, *f[2:]) for f in bare.followers}
     at = {name: x for name, x in values.items() if name not in robot.wheels}
@@ -69,7 +69,7 @@ def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
 
 
 def _without(of: Any, gone: set[str]) -> Any:
-    """Return a mapping, and those in it, without what is named NAME or GROUP.NAME."""
+    """Return a mapping and its nested mappings without the keys NAME and GROUP.NAME."""
     if not isinstance(of, Mapping):
         return of
     named = {f"{group}{name}" for name in gone for group in _GROUPS}
@@ -79,7 +79,7 @@ def _without(of: Any, gone: set[str]) -> Any:
 def locked_model(
     model: pin.Model, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
 ) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
-    """Weld joints and what mimics them; return the model, the mimics left, and what was welded."""
+    """Weld joints and their mimic joints; return model, other mimic joints and welded joints."""
     movable = list(model.names)[ROOT + 1 :]
 
     def found(name: str) -> str:
@@ -112,7 +112,7 @@ def locked_model(
 
 
 def _asked(lock: Any) -> dict[str, float | None]:
-    """Return {joint or pattern: value, or None at neutral} of what a caller locks."""
+    """Return the locks of a caller as {joint or pattern: value, or None at neutral}."""
     try:
         names = [lock] if isinstance(lock, str) else list(lock)
     except TypeError:
@@ -201,7 +201,7 @@ def _require_new_names(robot: Robot, prefix: str) -> None:
 def _joined(
     model: pin.Model, joint: int, other: pin.Model, placement: pin.SE3, prefix: str
 ) -> pin.Model:
-    """Return the model, in whose tree the other's joints come after all that the joint carries."""
+    """Return the model with the other's joints after all joints on the grasping joint."""
     bodies = model.inertias.tolist()
     bodies[joint] = bodies[joint] + placement.act(other.inertias[ROOT])
     names = [f"{prefix}.{name}" for name in other.names]

@@ -22,9 +22,6 @@ _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 # Steps beyond which a single run goes by the compiled loop, if its machine code is there.
 LONG = 20_000
-# Steps beyond which it is compiled first, since Python would take minutes, and the steps that an
-# allocation of inputs takes in Python.
-_ENDLESS, _ALLOCATION = 150_000, 8
 # A run in Python of more than so many seconds is followed by a line on the compiled loop, which
 # takes about this fraction of the time and must be compiled once.
 _LONG_RUN, _FRACTION, _COMPILING = 20.0, 0.1, 30.0
@@ -33,10 +30,10 @@ _log = logging.getLogger("fflin")
 
 
 def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> str:
-    """Return which loop does a plan, or many runs of it: as asked for, or by the rule.
+    """Return the engine for a plan or many runs of it: as requested, or by the rule.
 
     Many runs go by the compiled loop where it can run them; one does if it is long and the machine
-    code is there already, or if Python would take minutes.
+    code is there already.
     """
     if checked_engine(engine) == "python":
         return "python"
@@ -47,15 +44,12 @@ def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> s
                 f"engine='compiled' is not possible, because {reason}; leave engine out"
             )
         return "compiled"
-    steps = cost = plan.times.steps
-    if isinstance(plan.policy, Allocation):
-        cost += _ALLOCATION * (steps // plan.times.sample if plan.times.sample else 4 * steps)
-    wanted = many or cost > _ENDLESS or (steps > LONG and is_kept("loop", "advance"))
+    wanted = many or (plan.times.steps > LONG and is_kept("loop", "advance"))
     return "compiled" if wanted and not reason else "python"
 
 
 def _reason(plan: Plan, plant: Plant) -> str:
-    """Say what keeps a plan from the compiled loop; nothing where it can run it."""
+    """Return why the compiled loop cannot run a plan; empty if it can."""
     policy, robots = plan.policy, [plant.robot]
     if not numba_is_there():
         return "numba is not installed (pip install 'fflin[fast]')"

@@ -66,7 +66,7 @@ class Conserved:
         return total
 
     def impose(self, q: Array, v: Array, momentum: Array, center: Array) -> None:
-        """Shift the base of `q` and set its velocity in `v`, in place, so that both are kept."""
+        """Shift the base of `q` and set its velocity in `v` in place, to conserve both."""
         # r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m); the velocity is corrected by
         # what the momentum lacks, so that rounding is of the second order. M is in base axes, and
         # a shift leaves it as it is.
@@ -89,7 +89,7 @@ class Conserved:
         v_b += dposv(self._M_bb, lack, 0, 0, 1)[1]
 
     def histories(self, q: Array, v: Array) -> Histories:
-        """Return what is conserved at each row of q (N, nq) and v (N, nv)."""
+        """Return the conserved quantities at each row of q (N, nq) and v (N, nv)."""
         model, data = self._model, self._data
         rows, q = len(q), q.copy()
         q[:, :7] -= self._start
@@ -131,13 +131,13 @@ class Conserved:
         return total
 
     def _base(self, q: Array) -> pin.SE3:
-        """Return the placement of the base, seen from the point."""
+        """Return the placement of the base relative to the point."""
         placement = _placement(q[:7] - self._start)
         return placement if self._free else self._root * placement
 
 
 class MomentumReference:
-    """Momentum and centre of mass as the impulse from outside takes them, step by step: (11.2)."""
+    """Momentum and centre of mass from the external impulse, step by step (11.2)."""
 
     momentum: Array  # (6,) about the point
     wrenches: tuple[Array, ...]  # (6,) of the stages of a step, about the point, to be written
@@ -160,7 +160,7 @@ class MomentumReference:
         self._after = np.array([[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]])
 
     def center(self, t: float) -> Array:
-        """Return where the centre of mass is (3,), seen from the point."""
+        """Return the centre of mass (3,) relative to the point."""
         self._time[1] = t
         place: Array = self._line.dot(self._time)
         return place
@@ -188,7 +188,7 @@ class Jacobi(Conserved):
         return push
 
     def histories(self, q: Array, v: Array) -> Histories:
-        """Return what there is at each row, with the energies of tide and turning frame."""
+        """Return energies at each row, with the gravity gradient and the rotating frame."""
         found, potential = super().histories(q, v), np.empty(len(q))
         for i, q_i in enumerate(q):
             pin.forwardKinematics(self._model, self._data, q_i)
@@ -203,5 +203,5 @@ class Jacobi(Conserved):
 
 
 def conserved_by(robot: Robot, start: Array, field: OrbitField | None) -> Conserved:
-    """Return what a robot's motion from a configuration (nq,) conserves."""
+    """Return the conserved quantities of a robot's motion from a configuration (nq,)."""
     return Conserved(robot, start) if field is None else Jacobi(robot, start, field)

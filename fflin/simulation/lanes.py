@@ -46,7 +46,7 @@ def noises(plan: Plan, size: int, step: int, last: int) -> tuple[NDArray[np.intp
 
 
 class Statistics(Protocol):
-    """What is kept of eight parallel runs, slice by slice."""
+    """Records of eight parallel runs, slice by slice."""
 
     FIELDS: ClassVar[tuple[str, ...]]  # names of the outcomes
     every: int  # steps from one row to the next
@@ -54,7 +54,7 @@ class Statistics(Protocol):
 
     @property
     def over(self) -> NDArray[np.bool_]:
-        """Which runs (LANES,) may end before their time."""
+        """Mask (LANES,) of the runs that may end early."""
 
     def reset(self) -> None:
         """Begin with eight other runs."""
@@ -112,11 +112,11 @@ class LaneLoop:
         return work_space(max(1, min(most, _MEMORY // (8 * LANES * self.width))) * self.width)
 
     def advance(self, clock: NDArray[np.intp], last: int, every: int, rows: Array) -> None:
-        """Go on up to a step, see `kernel.loop.advance`."""
+        """Advance to a step, see `kernel.loop.advance`."""
         self._advance(self._words, clock, last, every, rows, self._work)
 
     def split(self, raw: Array) -> list[Array]:
-        """Return what rows hold, each (rows, LANES, size)."""
+        """Return the recorded arrays, each (rows, LANES, size)."""
         by_row = raw.reshape(-1, self.width, LANES).transpose(0, 2, 1)
         return [by_row[..., part] for part in self.columns]
 
@@ -182,7 +182,7 @@ class LaneLoop:
         return self._sensors(runs, of_lane)
 
     def _sensors(self, runs: Runs, of_lane: NDArray[np.intp]) -> Callable[[int, int], None]:
-        """Return what writes the errors of all that is sensed from a step up to another."""
+        """Return a function that writes the sensor errors between two steps."""
         law, size = self.parts.law, len(self.parts.law.y)
         rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
         nothing = np.zeros((LANES, size))

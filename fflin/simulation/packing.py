@@ -28,7 +28,7 @@ SLOTS = 128  # samples whose noise is there at a time, and steps of a campaign
 
 
 def packed(plan: Plan, plant: Plant) -> loop.Arguments:
-    """Return what `kernel.loop.advance` reads of a plan whose policy and method it knows."""
+    """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports."""
     h, state, method = plan.times.dt, plant.state, plan.method
     tree, conserved = batch_tree(plant.robot), conserved_by(plant.robot, plan.q, plant.field)
     assert tree is not None
@@ -130,7 +130,7 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> policies.Law
 
 
 def no_law(state: StateMap, u: Array) -> policies.Law:
-    """Return the law that asks for nothing, and reads states and errors."""
+    """Return the law without commands, which reads states and errors."""
     law = empty(policies.LAW)
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
@@ -146,7 +146,7 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
 
 
 def noise_of(plan: Plan) -> Any:
-    """Return noise(t) of what a plan's policy measures, or None."""
+    """Return the measurement noise(t) of a plan's policy, or None."""
     policy = plan.policy.policy if isinstance(plan.policy, Allocation) else plan.policy
     known = isinstance(policy, LinearController | TrajectoryOutputFeedback)
     return policy.noise if known else None

@@ -61,7 +61,7 @@ def _require_met(
 
 
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return another robot's rows in this robot's coordinates; joints that it lacks stand still."""
+    """Return another robot's rows in this robot's coordinates; missing joints are at rest."""
     own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
     for name in list(robot.model.names)[ROOT:]:
         if other.model.existJointName(name):

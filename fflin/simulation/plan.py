@@ -96,22 +96,22 @@ class Plan:
     target: Array | None  # the state (nx,) that is steered to, where one is known
     reference: Reference | None  # the motion that is followed, where there is one
     steered: tuple[str, ...]  # the states that are known to be fed back
-    notes: tuple[str, ...]  # what is to be said of the run
+    notes: Callable[[], tuple[str, ...]]  # returns the remarks for the report, which take a moment
     predictor: Predictor | TrajectoryFeedback | None  # of the linear motion under the same law
 
     @property
     def last_node(self) -> float:
-        """When in a step, of 1, its last stage asks: before a knot at its end where inputs jump."""
+        """Time of the last stage, relative to the step; below 1 if inputs jump at knots."""
         return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
 
     @property
     def repeatable(self) -> bool:
-        """Whether nothing that it calls is a function of the caller's, which may remember."""
+        """Whether the plan calls no user functions, which may have an internal state."""
         bound_anew = self.policy is None or hasattr(self.policy, "bind")
         return bound_anew and not self.events and self.callback is None
 
     def channel(self) -> Channel | None:
-        """Return the way of the law's commands to the inputs, with nothing on it yet."""
+        """Return the channel of the law's commands to the inputs, without pending commands."""
         if self.law is None:
             return None
         return Channel(
@@ -171,7 +171,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
 
 
 def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law | None:
-    """Return the policy bound to the robot, of which nothing but inputs is taken."""
+    """Return the policy bound to the robot, with checked inputs."""
     if policy is None:
         return None
     within = (limits.low, limits.high)
@@ -228,7 +228,7 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
         target=goal,
         reference=follows,
         steered=fed_back(policy),
-        notes=(*growing(policy), *notes_of(policy, robot), *times.notes),
+        notes=lambda: (*growing(policy), *notes_of(policy, robot), *times.notes),
         predictor=foresees,
     )
     return plan, plant

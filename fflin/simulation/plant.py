@@ -104,7 +104,7 @@ class Plant:
         return rate, push
 
     def isolated(self, *, driven: bool) -> bool:
-        """Whether nothing pushes from outside, whatever the inputs are or where none acts."""
+        """Return whether no external force acts; with `driven`, the inputs count too."""
         driven = driven or bool(self.faults.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         outside = self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit

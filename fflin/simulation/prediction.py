@@ -24,7 +24,7 @@ _WHY_NOT = {Allocation: "an Allocation is not linear, as its thrusters cannot pu
 
 
 class Predictor(NamedTuple):
-    """A linear model, and what makes the law that it is under, which remembers nothing yet.
+    """Linear model, and a factory of its law in the initial state.
 
     States of a controller that are integrated along stand behind the robot's.
     """
@@ -34,7 +34,7 @@ class Predictor(NamedTuple):
 
 
 def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryFeedback | None:
-    """Return what predicts a run: the policy's own model, or the one that is given."""
+    """Return the predictor of a run: the policy's own model, or the given model."""
     if isinstance(linear, np.bool_):
         linear = bool(linear)
     if linear is False:
@@ -82,7 +82,7 @@ def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
 
 
 def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
-    """Return what makes a policy's law of the deviation from a model's point, if it is linear."""
+    """Return a factory of a policy's law in deviations from a point, if the policy is linear."""
     if policy is None:
         return lambda: lambda _: np.zeros(len(lin.u0))
     if isinstance(policy, LinearController):

@@ -77,7 +77,7 @@ class Saturated(NamedTuple):
 
 
 def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:
-    """Return what went beyond its limit, that first which did so by the largest share of it."""
+    """Return the limit violations, with the largest relative violation first."""
     found = []
     for name, values, unit, limits in histories:
         size = float(np.abs(limits[np.isfinite(limits)]).max())
@@ -92,7 +92,7 @@ def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:
 
 
 def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
-    """Return what was at a limit other than zero, that first which was longest."""
+    """Return signals at a nonzero limit, with the longest saturation first."""
     held = np.diff(t, append=t[-1:])
     found = [
         Saturated(name, limit, unit, float(held[near].sum() / held.sum()))
@@ -138,7 +138,7 @@ def settled_at(sizes: Array) -> NDArray[np.intp]:
 
 
 def is_late(settled: Array | NDArray[np.intp] | int, count: int) -> Any:
-    """Whether errors settle so late in a run of `count` rows that they count as not settled.
+    """Return whether errors settle too late in a run of `count` rows to count as settled.
 
     An error that passes through zero is small for a moment.
     """
@@ -155,12 +155,12 @@ class ErrorHistory(NamedTuple):
 
     @property
     def settled(self) -> int:
-        """The row from which on it has settled; N where it has not."""
+        """First row from which the error is settled; N if the error has not settled."""
         return int(settled_at(self.size))
 
     @property
     def late(self) -> bool:
-        """Whether it has not settled."""
+        """Whether the error has not settled."""
         return bool(is_late(self.settled, len(self.size)))
 
     @property
@@ -310,12 +310,12 @@ def courses(motion: Any) -> list[ErrorHistory]:
 
 
 def pushed(of: Any) -> bool:
-    """Whether of a motion's inputs, or of what else has their names, one is a force on the base."""
+    """Return whether an input of a motion or similar object is a force on the base."""
     return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
 
 def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
-    """Return one line: whether a motion settled at its target, and what prevented it."""
+    """Return one line: whether a motion settled at its target, and why not."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
@@ -356,7 +356,7 @@ def _and(words: list[str]) -> str:
 
 
 def _largest_modes(motion: Any) -> str:
-    """Return the largest amplitude of each mode, and the rotation that it stands for."""
+    """Return the largest amplitude of each mode, and the corresponding rotation."""
     rows = [["mode", "unit", "largest", "rotation [deg]", "at [s]"]]
     far = []
     for name, rotation in zip(motion.modes, motion.mode_rotations.tolist(), strict=True):

@@ -136,7 +136,7 @@ def stop_conditions(plan: Plan) -> StopConditions:
 
 
 def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array], str]:
-    """Return a function that gives the reason for which a run ends; empty if it continues."""
+    """Return a function that returns why a run ends; empty if the run continues."""
     # The entries of a list are read faster than the entries of an array.
     stop = stop._replace(squares=stop.squares.tolist())
     anywhere = stop._replace(sign=[0.0])

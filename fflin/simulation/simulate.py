@@ -239,7 +239,7 @@ def simulate(
 
 
 def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = None) -> Motion:
-    """Return the motion that a plan leads to, or led to where its run is given."""
+    """Return the motion of a plan, or of a given run of the plan."""
     state, robot = plant.state, plant.robot
     conserved = conserved_by(robot, plan.q, plant.field)
     run = run or carried_out(plan, plant, conserved, engine)
@@ -276,7 +276,7 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         modes=tuple(joint.name for joint in robot.modes),
         mode_rotations=np.array([joint.rotation for joint in robot.modes]),
         steered=plan.steered,
-        notes=(*plan.notes, *getattr(plan.law and plan.law.policy, "notes", ())),
+        notes=(*plan.notes(), *getattr(plan.law and plan.law.policy, "notes", ())),
         limit_names=tuple(plan.known),
         limits=np.array(list(plan.known.values())).reshape(-1, 2),
     )

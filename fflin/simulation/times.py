@@ -45,11 +45,9 @@ class Times(NamedTuple):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on the recorded rows, for the report."""
-        said = f"one of {self.every} steps is recorded; every=1 (--every 1) "
-        notes: tuple[str, ...] = (
-            (f"{said}records all steps {self.steps:,} steps",) if self.thinned else ()
-        )
+        """Notes on the recorded rows, for the report."""
+        said = f"one of {self.every} steps is recorded; every=1 (--every 1) records all "
+        notes: tuple[str, ...] = (f"{said}{self.steps:,} steps",) if self.thinned else ()
         if self.sample and self.every % self.sample and self.sample % self.every:
             aside = (
                 f"a row is recorded every {self.every} steps, but the controller samples every "
@@ -60,11 +58,11 @@ class Times(NamedTuple):
 
     @property
     def slow(self) -> float:
-        """Square of the velocity up to which no turn within a step is too large."""
+        """Square of the largest velocity at which the rotation per step is small enough."""
         return float((LARGEST_TURN / self.dt) ** 2)
 
     def require_room(self, width: int, *, chosen: bool) -> None:
-        """Refuse too many rows of so many numbers, or steps; warn of many that were `chosen`."""
+        """Refuse too many rows or steps; warn of many steps that were `chosen` automatically."""
         forced = chosen and self.fastest * _STEP > 1.0
         most = _ENDLESS if self.thinned else _MOST_STEPS
         if self.rows * width > _MOST_ENTRIES or self.steps > most:

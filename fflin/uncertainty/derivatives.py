@@ -108,7 +108,7 @@ class ModelDerivatives:
         return A, B, C, D, f0, y0[..., 0]
 
     def _seen(self, parameters: Sequence[Parameter], rates: AccelerationDerivatives) -> Array:
-        """Return dC, dD and dy0 side by side (P, ny, ..), of outputs that feel or weigh."""
+        """Return dC, dD and dy0 side by side (P, ny, ..) of outputs that depend on masses."""
         # The robot's mass times such an output is quadratic in a parameter, with rates that are
         # linear in it: of three values the derivative is exact, whatever the step.
         lin, now = self.lin, self._rates
@@ -330,7 +330,7 @@ def derivatives_of(
 
 
 def _of_force(parameter: Parameter, at: BodyDerivatives, u: Array) -> AccelerationDerivatives:
-    """Return the derivatives over what changes the forces alone: F_p, F_qp, F_nup and B_p."""
+    """Return derivatives for parameters of forces only: F_p, F_qp, F_nup and B_p."""
     state, rates, size = at.state, at.rates, len(at.inverse)
     F: Array = np.zeros(size)
     B = np.zeros_like(rates.by_u)

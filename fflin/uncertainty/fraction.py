@@ -188,7 +188,7 @@ class _Form:
         self.force += J.T @ (back - D @ now)
 
     def add_alone(self, at: int) -> None:
-        """Add what a parameter of a joint, a thruster or a wheel changes."""
+        """Add the effect of a parameter of a joint, a thruster or a wheel."""
         one = self.ranges[at].parameter
         _, x, u, _ = np.split(self.unit, self.ends[:-1])
         if one.spring >= 0:

@@ -1,4 +1,4 @@
-"""Named parameters of a robot, what a unit of each changes, and robots with other values."""
+"""Named parameters of a robot, their effect per unit, and robots with other values."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Parameters(dict[str, Parameter]):
         super().__init__((each.name, each) for each in found)
 
     def find(self, key: str) -> list[str]:
-        """Return the names that a name or pattern stands for; a pattern, of links before bodies."""
+        """Return the names that match a name or pattern; links take precedence over bodies."""
         bodies = [body for body in self._link_of if str(key).startswith(f"{body}.")]
         if key not in self and bodies:
             body = max(bodies, key=len)
@@ -76,14 +76,14 @@ class Parameters(dict[str, Parameter]):
         return [names[i] for i in matching("parameter", key, names)]
 
     def ranked(self, only: str | None) -> list[str]:
-        """Return what a name, part or pattern stands for, without bodies beside their links."""
+        """Return the matches of a name, part or pattern, without bodies whose links match."""
         found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
         found = found or self.find(str(only))
         return [name for name in found if self[name].of not in self._sums] or found
 
 
 def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
-    """Return the links and bodies that a name or pattern stands for, by their names in `pieces`."""
+    """Return the links and bodies that match a name or pattern, by names in `pieces`."""
     pieces, link_of = robot.pieces, robot.link_of
     if key in pieces or key in link_of:
         return [key if key in pieces else link_of[key]]
@@ -140,7 +140,7 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
 
 
 def _of_mode(joint: Joint, index: int, stiffness: float, damping: float) -> Iterator[Parameter]:
-    r"""Give frequency and damping ratio of a mode with the inertia I, whose link stands still.
+    r"""Return frequency and damping ratio of a mode with inertia I and a clamped link.
 
     The stiffness is :math:`I \omega^2` and the damping :math:`2 \zeta I \omega`.
     """

@@ -273,7 +273,7 @@ class Sensitivity:
 
 
 def sensitivity_record(found: Sensitivity) -> Record:
-    """Return what a file holds of a `Sensitivity`."""
+    """Return the entries of a file for a `Sensitivity`."""
     every = found.parameters.values()
     return record_of(found.lin) | {
         "parameters": list(found.names),

@@ -208,9 +208,9 @@ class Loops:
 
 
 def _largest(figures: Figures, tried: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
-    """Climb a figure from the first that was tried, and from each that is worse than what is found.
+    """Maximise a figure from the first sample, and from each sample worse than the result.
 
-    So nothing that was tried is worse than what is returned, and rows after others only add to it.
+    The result is therefore at least as bad as every sample, and more samples never improve it.
     """
     best, at = _climbed(figures, tried[0], makes)
     ahead = tried[1:]

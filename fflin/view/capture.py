@@ -119,7 +119,7 @@ def _shots(
 
 @contextmanager
 def _browser(program: str, patience: float) -> Iterator[_Browser]:
-    """Run a browser, for so many seconds at the most, and leave nothing of it behind."""
+    """Run a browser for a limited time, and remove its temporary files."""
     with tempfile.TemporaryDirectory(prefix="fflin-", ignore_cleanup_errors=True) as folder:
         root = ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
         command = [program, *_ARGUMENTS, *root, f"--user-data-dir={folder}", "about:blank"]
@@ -170,7 +170,7 @@ class _Browser:
         self._session: dict[str, str] = {}
 
     def tell(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Give a command and return what it is answered by."""
+        """Send a command and return the answer."""
         self._number += 1
         command = {"id": self._number, "method": method, "params": parameters, **self._session}
         with suppress(BrokenPipeError):  # seen when it is read

@@ -169,7 +169,7 @@ class Live:
             self._server.send(command)
 
     def _asked(self, message: Any) -> None:
-        """Do what a browser asks: {"joints": {name: value}}, {"neutral": _}, {"random": _}."""
+        """Execute a browser's request: {"joints": {name: value}}, {"neutral": _}, {"random": _}."""
         q = self.q.copy()
         if message.get("neutral"):
             q[7:] = self.robot.neutral()[7:]
@@ -185,7 +185,7 @@ class Live:
 
 
 def _joints(robot: Robot) -> list[dict[str, Any]]:
-    """Return name and range of the slider of every joint; nobody sees a wheel turn."""
+    """Return name and range of the slider of every joint except wheels."""
     model = robot.model
     found = []
     for joint in robot.joints:

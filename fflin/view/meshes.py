@@ -99,7 +99,7 @@ def _triangles(path: Path) -> tuple[Array, Indices]:
 
 
 def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]:
-    """Let vertices in one cell of a grid be one, where they first stand; drop what collapses."""
+    """Merge the vertices in each cell of a grid; drop collapsed triangles."""
     if not cell:
         return vertices[:0].astype(np.float32), faces[:0].astype(np.uint32)
     _, first, inverse = np.unique(

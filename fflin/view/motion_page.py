@@ -186,7 +186,7 @@ def chart_of(robot: Robot, motion: Motion) -> StateMap:
 
 
 def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
-    """Return where a motion is steered to (k, nq): nowhere, one place, or one a frame."""
+    """Return the targets (k, nq) of a motion: none, one, or one for each frame."""
     states = motion.target.reshape(-1, state.nx)
     states = states[shown] if len(states) > 1 else states
     return np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, state.robot.nq)

@@ -137,7 +137,7 @@ def _message(lowered: Lowered) -> bytes:
 
 
 def subtitle(robot: Robot) -> str:
-    """Return what the page says of a robot below its name."""
+    """Return the text below a robot's name on the page."""
     wheels = len(robot.wheels)
     parts = [counted(robot.n - wheels, "joint"), *[counted(wheels, "wheel")] * bool(wheels)]
     orbit = [f"{robot.orbit.altitude / 1e3:.6g} km over {robot.orbit.body}"] if robot.orbit else []
@@ -173,7 +173,7 @@ def stage_info(
     frame: str | None = None,
     held: Sequence[Drawing] = (),
 ) -> dict[str, Any]:
-    """Return what the page's stage needs, of the first frame's poses (njoints - 1, 7)."""
+    """Return the page's stage parameters from the poses (njoints - 1, 7) of the first frame."""
     points = corner_points(drawing, poses)
     low, high = points.min(axis=0), points.max(axis=0)
     centre = (low + high) / 2.0

@@ -10,7 +10,7 @@ import pinocchio as pin
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.simulation.curves import Curve, curves, resting_from
+from fflin.simulation.plots import Curve, curves, resting_from
 from fflin.view.page import packed
 
 if TYPE_CHECKING:

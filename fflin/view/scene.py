@@ -135,7 +135,7 @@ def _link(robot: Robot, shape: Shape) -> list[float]:
 
 
 class Animation(SetAnimation):
-    """The animation of all that moves, as it is sent."""
+    """Animation of all moving nodes, in the form that is sent."""
 
     def __init__(self, clips: Sequence[dict[str, Any]]) -> None:
         self._clips = list(clips)

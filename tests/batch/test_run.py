@@ -88,6 +88,14 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
         assert np.array_equal(arrays[key], value)
 
 
+@pytest.mark.filterwarnings("ignore:tired")
+def test_where_all_chunks_are_needed_the_first_that_fails_is_the_last():
+    told, store = [], MemoryStore(COUNT, CHUNK, STORED)
+    how = {"all_needed": True, "progress": lambda done, _: told.append(done)}
+    failed = run_chunks(Walks(endless=20), seeds, store, **how)
+    assert [done.span for done in failed] == [(16, 24)] and told == [8, 16]
+
+
 def test_in_memory_the_error_has_what_is_made_of_the_rest():
     store = MemoryStore(COUNT, CHUNK, STORED)
     with pytest.warns(fflin.FflinWarning, match="tired"):

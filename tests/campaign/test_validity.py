@@ -170,6 +170,8 @@ def test_what_the_counts_say(robots):
 def test_both_engines_say_the_same(robots, name):
     pytest.importorskip("numba")
     lin, gain = held(robots[name], dt=0.5 * (name == "cubesat"))
+    if name == "planar_detumble":  # whose light joints have a pole at -160 by the other weights
+        gain = fflin.lqr(lin)
     options = {"attitude": 170.0, "samples": 9, "seed": 5}
     one, two = (
         fflin.validity(robots[name], lin, gain, engine=engine, **options)
@@ -338,15 +340,12 @@ def test_progress_is_told_up_to_every_run(robots):
         fflin.validity(robot, lin, gain, progress=3)
 
 
-def die(*_):
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 @pytest.mark.process
 def test_a_process_that_dies_is_one_line(robots, monkeypatch):
     robot = robots["cubesat"]
     lin, gain = held(robot)
-    monkeypatch.setattr(Loop, "__reduce__", lambda _: (die, ()))
+    # A function of Python's own, for which a worker imports nothing.
+    monkeypatch.setattr(Loop, "__reduce__", lambda _: (signal.raise_signal, (signal.SIGKILL,)))
     workers = OwnWorkers(1)
     for executor in (workers, ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
         with executor, pytest.raises(fflin.FflinError, match="died"):
@@ -392,6 +391,7 @@ def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
     assert said.endswith(b"\r\x1b[2Kfflin: stopped\r\n")
 
 
+@pytest.mark.compiled
 @pytest.mark.exhaustive
 def test_frames_are_compared_in_the_same_linear_loop():
     """What is fed back in base axes is that of `Loop` in that frame, run by run."""

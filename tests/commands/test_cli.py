@@ -260,7 +260,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
             "servicer_7dof",
         ): "'joint_1'",
         ("check", "cubesat", "--inputs", "cubesats"): "'cubesats'",
-        ("linearize", "ets_vii", "--dt", 0, "-o", output): "sampling",
+        ("linearize", "ets_vii", "--dt", 0, "-o", output): "dt is 0",
         ("check", "ets_vii", "--output", "pos:tool"): "'pos'",
         ("check", "ets_vii", "--output", "pose"): "'pose'",
         ("check", "ets_vii", "--output", "com:tool"): "com",

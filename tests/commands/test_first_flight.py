@@ -23,6 +23,7 @@ pendulum = false
 """
 
 
+@pytest.mark.compiled  # as a long flight is where numba is installed
 @pytest.mark.exhaustive
 def test_the_inspector_flies_within_its_limits_at_the_first_try(tmp_path):
     code, out, err = run("simulate", TOML, "--html", "a.html", "-o", "a.npz", cwd=tmp_path)

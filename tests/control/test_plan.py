@@ -10,6 +10,7 @@ import fflin
 from fflin.control.optimal.shooting import Shooting
 from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
+from tests.support.speeds import largest_speeds
 
 
 def turned(robot, angle, axis=(0.0, 0.0, 1.0), joints=None, at=(0.0, 0.0, 0.0)):
@@ -140,9 +141,11 @@ def test_what_is_planned_is_flown(servicer, tmp_path):
 
 @pytest.mark.exhaustive
 def test_joints_keep_within_their_speeds_and_travels():
-    robot = fflin.load("servicer_7dof", lock=["panel_*"])
+    moving = ("joint_1", "joint_3", "joint_4")
+    locked = [f"joint_{i}" for i in range(1, 8) if f"joint_{i}" not in moving]
+    robot = fflin.load("servicer_7dof", lock=["panel_*", *locked])
     goal = turned(robot, 0.5, (1, 0, 0), {"joint_1": 1.5, "joint_4": -1.0})
-    options = {"knots": 31, "limits": ["urdf", {"tau_b": 60.0, "F_b": 40.0}]}
+    options = {"knots": 21, "limits": ["urdf", {"tau_b": 60.0, "F_b": 40.0}]}
     motion = fflin.plan(robot, (goal, None), 10.0, **options)
     speeds = np.abs(motion.v[:, 6:])
     assert (speeds <= robot.model.velocityLimit[6:] + 1e-6).all()
@@ -219,17 +222,6 @@ def test_limits_that_cannot_hold_between_knots_hold_at_knots(one_joint):
     assert missed(robot, motion, goal) < 1e-6
 
 
-def largest_speeds(motion, parts=64):
-    """Return the largest speeds of the joints (n,) of the motion integrated between knots."""
-    largest = np.abs(motion.v[:, 6:]).max(axis=0)
-    for k in range(len(motion.t) - 1):
-        q, v = motion.q[k], motion.v[k]
-        for part in range(parts):
-            q, v = motion.flow.end(k, 1, q, v, (part / parts, (part + 1) / parts))
-            largest = np.maximum(largest, np.abs(v[6:]))
-    return largest
-
-
 @pytest.mark.parametrize("knots", [4, 5, 31])
 def test_few_knots_keep_limits_between_them(one_joint, knots):
     robot, goal = one_joint
@@ -241,13 +233,13 @@ def test_few_knots_keep_limits_between_them(one_joint, knots):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("knots", [31, 41])
-def test_a_light_arm_keeps_its_speeds_between_knots(knots):
-    """Held for 1.5 s or 2 s, its torques take light joints far beyond their speeds and back."""
+def test_a_light_arm_keeps_its_speeds_between_knots():
+    """Held for 2 s, its torques take light joints far beyond their speeds and back."""
+    # The same slew with 41 knots is on the page of the guide about tracking.
     robot = fflin.load("servicer_7dof", lock=["panel_*"], limits={"tau_b": 60.0, "F_b": 40.0})
     goal = turned(robot, 1.2, joints={"joint_2": 0.6, "joint_4": -1.1})
-    motion = fflin.plan(robot, (goal, None), 60.0, knots=knots)
-    assert len(motion.t) == knots
+    motion = fflin.plan(robot, (goal, None), 60.0, knots=31)
+    assert len(motion.t) == 31
     assert (largest_speeds(motion) <= 1.01 * robot.model.velocityLimit[6:]).all()
     assert missed(robot, motion, goal) < 1e-6 and motion.residual.max() < 1e-6
 
@@ -307,9 +299,11 @@ def test_starts_and_goals_are_given_in_every_form():
 @pytest.mark.parametrize("held", [True, False])
 def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     robot, v, goal = servicer
-    shooting = Shooting(robot, np.linspace(0.0, 8.0, 41), held)
+    t = np.linspace(0.0, 8.0, 41)
+    q, v, u = Shooting(robot, t, held).guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
+    u = u[:4]  # the start of the motion
+    shooting = Shooting(robot, t[:4], held)
     shooting.steps = 64
-    q, v, u = shooting.guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
     q, v = shooting.flown((q[0], v[0]), u)
     A, B, D, inside = shooting.jacobians(q, v, u, 4)
     h, nx = 1e-5, A.shape[1]
@@ -322,7 +316,7 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
         return tuple(each[1, 2] for each in shooting.parts(*shooting.moved(q, v, z), u, 4))
 
     for i in range(nx):
-        z = np.zeros((41, nx))
+        z = np.zeros((4, nx))
         z[1, i] = h
         slope = (ends(z, 0.0) - ends(-z, 0.0))[1] / (2 * h)
         assert slope == pytest.approx(A[1][:, i], abs=1e-8)
@@ -332,7 +326,7 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
         for row, maps in ((1, B), (2, D)):
             du = np.zeros_like(u)
             du[row, i] = 1e-3
-            slope = (ends(np.zeros((41, nx)), du) - ends(np.zeros((41, nx)), -du))[1] / 2e-3
+            slope = (ends(np.zeros((4, nx)), du) - ends(np.zeros((4, nx)), -du))[1] / 2e-3
             assert slope == pytest.approx(maps[1][:, i], abs=1e-8)
 
 

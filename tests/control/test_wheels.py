@@ -224,7 +224,7 @@ def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
     robot = fflin.load("cubesat").replace(inputs=added)
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin)
-    assert re.search("set by the speed of wheel_[12]$", gain.weights)
+    assert re.search("limited by the speed of wheel_[12]$", gain.weights)
     turn = pin.SE3(pin.exp3(np.radians(30.0) * unit(axis)), np.zeros(3))
     motion = fflin.simulate(
         robot,
@@ -352,7 +352,7 @@ def test_damping_of_wheels_is_said_to_be_why_nothing_is_held():
     """Their speeds stay in the model with it, and the momentum of all that no input changes."""
     names = [f"wheel_{k}" for k in (1, 2, 3)]
     lin = fflin.linearize(wheeled(ORTHOGONAL).replace(damping=dict.fromkeys(names, 1e-7)))
-    words = "damping of wheel_1, wheel_2, wheel_3; remove it"
+    words = "damping of wheel_1, wheel_2, wheel_3 keeps .*remove"
     reduced = fflin.momentum_reduction(lin)
     for model in (lin, lin.discretize(0.1), reduced):
         for weights in ((), (1.0, 1.0)):

@@ -288,22 +288,6 @@ def test_a_long_run_goes_compiled_if_its_machine_code_is_there(robots, monkeypat
         assert fflin.Motion.load(tmp_path / "motion.npz").engine == engine
 
 
-def test_an_endless_run_in_python_is_compiled_first(robots, monkeypatch):
-    """An allocation at each of the four stages of a step counts 32 steps more."""
-    bare = robots["cubesat"]
-    feed = feedback(bare)
-    law = fflin.Allocation(feed, bare)
-    monkeypatch.setattr(compiled, "is_kept", lambda *_: False)
-    for policy, sample, engine in (
-        (feed, None, "python"),
-        (law, None, "compiled"),
-        (law, 0.1, "python"),
-    ):
-        options = {"duration": 50.0, "dt": 0.01, "sample": sample, "linear": False}
-        plan, plant = planned(bare, policy, progress=False, **options)
-        assert compiled.engine_of(None, plan, plant) == engine
-
-
 def test_eight_lanes_are_eight_runs(robots):
     """Each with a start, masses and forces of its own."""
     jet = fflin.Thruster("link_2", (0.2, 0.1, 0.0), (1.0, 0.5, 0.2), "jet")

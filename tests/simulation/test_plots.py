@@ -10,7 +10,7 @@ import pytest
 
 import fflin
 from fflin.dynamics.state import moved_by
-from fflin.simulation.curves import resting_from
+from fflin.simulation.plots import resting_from
 from tests.support.motions import tracked
 from tests.support.weights import unit_weights
 

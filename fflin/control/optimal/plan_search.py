@@ -63,7 +63,7 @@ class Trial(NamedTuple):
 
 
 class Search(NamedTuple):
-    """Search for the inputs of least effort that lead from a start to an end."""
+    """Search for the inputs of least effort from a start to an end."""
 
     # The Hessian is that of Gauss and Newton. Steps of the states also cost something, which
     # falls while whole steps succeed (Levenberg and Marquardt).
@@ -78,7 +78,7 @@ class Search(NamedTuple):
     parts: int  # states are limited at the ends of so many equal parts of each interval
 
     def best(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return q, v and u at knots of the least effort, or that lead nearest to the end.
+        """Return q, v and u at the knots with least effort, or closest to the end.
 
         The search begins at the given knots and inputs.
         """
@@ -145,7 +145,7 @@ class Search(NamedTuple):
     def _step(
         self, trial: Trial, limited: Flags, near: Array, effort: Array
     ) -> tuple[Array, Array, Array, float] | None:
-        """Return the best step of knots and inputs, its multipliers and what it leaves outside."""
+        """Return the best step of knots and inputs, its multipliers and its violations."""
         u, nx = trial.u, self.shooting.state.nx
         if not max(trial.outside(limited), trial.gap) < np.inf:
             return None
@@ -170,7 +170,7 @@ class Search(NamedTuple):
         return *found, float(excess(trial.knots - found.x).sum() + excess(left).sum())
 
     def _closed(self, trial: Trial, limited: Flags, near: Array) -> Trial:
-        """Return a trial whose intervals meet, by the least changes, as one motion if possible."""
+        """Return a trial without gaps between intervals, by least changes, if possible."""
         shooting, last = self.shooting, _NEARLY
         shooting.refine(trial.q, trial.v, trial.u, _FLIES)
         trial = self._trial(*trial[:3])

@@ -20,7 +20,7 @@ Point = tuple[Array, Array]
 
 
 class Shooting:
-    """The knots at times t (N + 1,) as the starts of N motions that are to meet."""
+    """Knots at times t (N + 1,): initial points of N motions with continuity constraints."""
 
     # Steps between configurations and velocities are z = (theta_b, r_b, q_m, nu) (nx,) in base
     # axes, those of the linear models with the rotation vector for twice q_b.
@@ -144,7 +144,7 @@ class Shooting:
         return A, B, D, np.array(inside).reshape(parts - 1, *Z.shape).swapaxes(0, 1)
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
-        """Return knots on cubics from a point to another, and inputs near to what these take."""
+        """Return knots on cubics between two points, and approximate inputs for them."""
         model, T = self.state.robot.model, self.t[-1]
         s, rates = self.t[:, None] / T, np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))

@@ -13,7 +13,7 @@ _ACCURACY = 1e-10
 
 
 class StageSolution(NamedTuple):
-    """The least cost's states and inputs, and the multipliers of the equations."""
+    """Optimal states and inputs, and the multipliers of the equality constraints."""
 
     x: Array  # (N + 1, nx)
     u: Array  # (N + 1, nu)
@@ -37,7 +37,7 @@ class StageRows(NamedTuple):
 
 
 class StageQP(NamedTuple):
-    r"""The least cost of w = (x, u) over N stages, every variable within bounds.
+    r"""Quadratic program in w = (x, u) over N stages, with bounds on every variable.
 
     .. math::
         \min \sum_{k=0}^N \tfrac12 w_k^T H_k w_k + g_k^T w_k + \mathrm{soft}_k^T s_k, \quad
@@ -61,7 +61,7 @@ class StageQP(NamedTuple):
     scale: Array  # (nx + nu,), sizes that variables may have, in fractions of which it is solved
 
     def solve(self) -> StageSolution | None:
-        """Return the solution; None where the hard bounds leave none, or it is not found."""
+        """Return the solution; None if the hard bounds are infeasible, or no solution is found."""
         import scipy.sparse as sp
 
         try:

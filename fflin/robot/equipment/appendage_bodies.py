@@ -1,4 +1,4 @@
-r"""Modes of appendages as bodies on joints, taken out of the links that carry them.
+r"""Modes of appendages as bodies on joints, subtracted from the links that carry them.
 
 Each mode is equivalent to one ball on one screw joint, whose spatial inertia I and twist S for a
 unit of the amplitude satisfy I S = L and S^T I S = 1, with the participation L of the mode. The
@@ -40,7 +40,7 @@ _NONE = 1e-14
 
 
 class _Modes(NamedTuple):
-    """An appendage as seen by the body that carries it: participation L (6, k) in its frame."""
+    """Appendage on the body that carries it: participation L (6, k) in the body's frame."""
 
     appendage: Appendage
     joint: int
@@ -225,7 +225,7 @@ class _Ball(NamedTuple):
 
     @property
     def rotation(self) -> float:
-        r"""Rotation [rad] that a unit of the amplitude stands for.
+        r"""Rotation [rad] of the structure per unit of the amplitude.
 
         The ball turns by w, and moves by v at its distance c from the appendage's frame; the
         rotation is at most :math:`|w| + |v| / |c|`.

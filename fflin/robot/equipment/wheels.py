@@ -34,7 +34,7 @@ def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[in
 def mounted_wheels(
     model: pin.Model, bodies: list[pin.Inertia], inputs: Sequence[Input]
 ) -> list[Mounted]:
-    """Return the wheels with an inertia, and take each out of the body that carries it."""
+    """Return the wheels with an inertia, and subtract each wheel from its body."""
     parts = []
     for name, wheel in named_wheels(inputs):
         if not wheel.inertia:
@@ -62,7 +62,7 @@ def mounted_wheels(
 
 
 def turned_to(axis: Array) -> Array:
-    """Return a rotation (3, 3) that takes z to an axis, without rounding if it is x, y or z."""
+    """Return a rotation (3, 3) that maps z to an axis, exact for x, y and z."""
     beside = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
     beside /= np.linalg.norm(beside)
     return np.column_stack((beside, np.cross(axis, beside), axis))

@@ -384,7 +384,7 @@ def _drop_world(links: dict[str, Link], joints: dict[str, JointElement]) -> None
 def _hanging_on(
     prune: Collection[str], links: Iterable[str], joints: dict[str, JointElement]
 ) -> set[str]:
-    """Return what hangs on joints, of links of which each comes after its parent."""
+    """Return all links below the joints to prune; `links` has parents first."""
     require_known("joint to prune", prune, joints)
     dropped = {joints[name].child for name in prune}
     parents = {joint.child: joint.parent for joint in joints.values()}

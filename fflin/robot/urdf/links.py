@@ -38,7 +38,7 @@ INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class Pose(NamedTuple):
-    """Where a frame lies in another, as the file writes it."""
+    """Placement of a frame in another frame, as in the file."""
 
     xyz: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m]
     rpy: tuple[float, ...] = (0.0, 0.0, 0.0)  # roll, pitch, yaw about fixed axes [rad]

@@ -74,12 +74,12 @@ class Description(NamedTuple):
 
 
 def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
-    """Read a URDF, or a xacro, as a robot that floats free; what hangs on `prune` is cut off."""
+    """Read a URDF, or a xacro, as a free-flying robot without the subtrees of `prune`."""
     return describe(read_document(path), path, prune)
 
 
 def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Description:
-    """Do what `read_urdf` does with the bytes of a file; `path` names it in errors."""
+    """Read a URDF from the bytes of a file; `path` is its name in errors."""
     root = parse(document, str(path))
     notes: list[str] = []
     # The marks of xacro, and of what may stand for them.
@@ -125,7 +125,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
 
 
 def read_document(path: Path) -> bytes:
-    """Return what the file of a URDF holds, or raise `FileError`."""
+    """Return the content of a URDF file, or raise `FileError`."""
     return read_file(path, "URDF", _SIZE_LIMIT)
 
 
@@ -162,7 +162,7 @@ def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> p
 
 
 def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
-    """Make a call that recurses along the tree on a stack that holds it."""
+    """Call a function that recurses along the tree, with a large enough stack."""
     if depth <= _SHALLOW:
         return call()
     from concurrent.futures import ThreadPoolExecutor
@@ -177,7 +177,7 @@ def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
 
 
 def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
-    """Write what moves, to the last bit; `counted` joints are revolute, for their turns count."""
+    """Write a URDF of the moving parts, bit for bit; `counted` joints become revolute."""
     # urdfdom reads quat_xyzw from version 1.1 on; 1.2 would require limits.
     lines = [f'<robot name={_quoted(urdf.name)} version="1.1">']
     for link in urdf.links.values():
@@ -243,7 +243,7 @@ def first_xacro(root: Element) -> Element | None:
 
 
 def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
-    """Return a xacro document as plain URDF, and what xacro said; `first` is for errors."""
+    """Return a xacro document as plain URDF, and xacro's messages; `first` is for errors."""
     import json
     import subprocess
     from importlib.util import find_spec

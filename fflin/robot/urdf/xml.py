@@ -35,7 +35,7 @@ def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
 
 @dataclass(eq=False, repr=False, slots=True)
 class Element:
-    """One XML element; text between elements is not kept, for URDF has none."""
+    """XML element; text between elements is ignored, because URDF has no such text."""
 
     tag: str  # with its prefix, if any: prefixes need not be bound
     attributes: dict[str, str]
@@ -75,14 +75,14 @@ class Element:
         return found
 
     def iterate(self, skip: Collection[str] = ()) -> Iterator[Element]:
-        """Yield all elements below this one, in document order, none in what is skipped."""
+        """Yield all elements below this element in document order, except skipped subtrees."""
         for child in self.children:
             if child.tag not in skip:
                 yield child
                 yield from child.iterate(skip)
 
     def allow_only(self, *names: str, of: str) -> None:
-        """Refuse a misspelt attribute, a default taken in silence; note others it does not know."""
+        """Refuse misspelt attributes, and note other unknown attributes."""
         for name in self.attributes:
             if name in names or ":" in name:
                 continue
@@ -96,7 +96,7 @@ class Element:
             )
 
     def text(self, name: str, of: str) -> str:
-        """Return an attribute that must be there and hold something."""
+        """Return an attribute that must exist and not be empty."""
         value = self.attributes.get(name)
         if value is None or not value.strip():
             what = "has no" if value is None else "has an empty"
@@ -151,7 +151,7 @@ def enumerated(names: list[str]) -> str:
 
 
 def named(kind: str, names: list[str]) -> str:
-    """Show names after what they are names of: joint 'a', joints 'a', 'b'."""
+    """Show names after their kind: joint 'a', joints 'a', 'b'."""
     return f"{kind}{'s' if len(names) > 1 else ''} {enumerated(names)}"
 
 

@@ -4,7 +4,6 @@ import os
 import re
 import sys
 from collections import Counter
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import pytest
@@ -51,24 +50,6 @@ def run(case, folder):
     return Run(result.returncode, result.stdout.decode(), result.stderr.decode(), left)
 
 
-@pytest.fixture(scope="module")
-def runs(request, tmp_path_factory):
-    """Start the selected entries two at a time."""
-    chosen = [
-        item.callspec.params["case"]
-        for item in request.session.items
-        if item.module is request.module and hasattr(item, "callspec")
-    ]
-    folder = tmp_path_factory.mktemp("corpus")
-    with ThreadPoolExecutor(2) as pool:
-        futures: dict[str, Future[Run]] = {
-            case.name: pool.submit(run, case, folder / str(CASES.index(case))) for case in chosen
-        }
-        yield futures
-        for future in futures.values():
-            future.cancel()
-
-
 def test_corpus_is_large_and_its_names_differ():
     assert len(CASES) >= 150
     assert not [name for name, n in Counter(case.name for case in CASES).items() if n > 1]
@@ -77,10 +58,10 @@ def test_corpus_is_large_and_its_names_differ():
 
 @pytest.mark.process
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_corpus(case, runs):
+def test_corpus(case, tmp_path):
     if "xacro" in case.name:
         pytest.importorskip("xacrodoc")
-    result = runs[case.name].result()
+    result = run(case, tmp_path / str(CASES.index(case)))
     lines = hear_lines(result.err).splitlines()
     if case.expected == REFUSE:
         assert (result.code, result.out, result.left) == (2, "", [])
