@@ -204,7 +204,7 @@ class Dispatch:
 
     def __init__(self, job: Job, rows: Rows, spans: list[Span], workers: Executor) -> None:
         self._job = pickle.dumps(job)
-        self._rows, self._workers, self._ahead = rows, workers, _QUEUED * _count(workers)
+        self._rows, self._workers, self._ahead = rows, workers, _QUEUED * worker_count(workers)
         self._waiting = spans[::-1]
         self._running: dict[Future[ChunkResult], Span] = {}
         self._attempts: Counter[Span] = Counter()
@@ -308,7 +308,7 @@ def _unpickled(job: bytes) -> Job:
     return result
 
 
-def _count(executor: Executor) -> int:
+def worker_count(executor: Executor) -> int:
     """Return the number of workers of an executor, or a default if it is not known."""
     for name in ("_max_workers", "num_workers"):
         count = getattr(executor, name, None)
