@@ -170,8 +170,8 @@ class LinearModel(StateSpace):
         vars(self).update(shared or {}, **fields)
 
     def __getattr__(self, name: str) -> Any:
-        # `shared` may hold {field: function of the model} for fields that are computed at first access,
-        # because they take as long as the dynamics.
+        # `shared` may hold {field: function of the model} for fields that are computed at first
+        # access, because they take as long as the dynamics.
         make = vars(self).get("_computed", {}).get(name)
         if make is None:
             raise AttributeError(f"'LinearModel' object has no attribute '{name}'")
