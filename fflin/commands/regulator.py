@@ -115,7 +115,7 @@ def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
         options.add_former_name(group, "--dt", "sample")
     group.switch(
         "--reduce",
-        "regulate only the states that the inputs can control if momentum is conserved",
+        "for robots with conserved momentum: regulate only the controllable states",
     )
     group.yes_or_no(
         "--wheel-speeds",

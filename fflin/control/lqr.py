@@ -83,9 +83,9 @@ def lqr(
     N : array_like (nx, nu), optional
         Cross weight. Q - N R^-1 N' must be positive semidefinite.
     weights : {"urdf", "identity"}, optional
-        Rule for the weights, instead of Q and R: "urdf" (default) respects the limits of the
-        URDF, "identity" is 1 on every state and input. For a sampled model, the rule defines the
-        continuous-time cost, which `sampled_cost` converts.
+        Rule for the weights if Q and R are omitted. The rule "urdf" (default) respects the limits
+        of the URDF, "identity" is 1 on every state and input. For a sampled model, the rule
+        defines the continuous-time cost, which `sampled_cost` converts.
     wheel_speeds : bool, optional
         Whether to regulate the wheel speeds to their values at the point. By default, wheel
         speeds are regulated if inputs other than the wheels can change them. With True,

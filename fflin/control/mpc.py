@@ -85,7 +85,7 @@ def mpc(
         Weight on the error after N samples, or at the end of a trajectory. "steady" is the cost
         to go of the regulator from the end of the horizon on.
     weights : {"urdf", "identity"}, optional
-        Rule for the weights, instead of Q and R, as in `lqr`.
+        Rule for the weights if Q and R are omitted, as in `lqr`.
 
     Returns
     -------

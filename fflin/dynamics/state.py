@@ -264,7 +264,7 @@ class StateMap:
         return q[0], v[0]
 
     def points(self, x: Array) -> tuple[Chart, Array, Array]:
-        """Return the charts, configurations and velocities of many states (N, nx)."""
+        """Return the attitude charts, configurations and velocities of states (N, nx)."""
         g = self.groups
         if not np.isfinite(x).all():
             raise InputError("x has entries that are not finite; give finite numbers")

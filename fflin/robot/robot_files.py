@@ -177,7 +177,7 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
                         ``momentum`` [N m s]: `ReactionWheel`
     every type          optional: ``max`` and ``min`` [N m | N], the largest and
                         the least value. The default of ``min`` is -max, for a
-                        thruster 0. Base inputs take one number or three
+                        thruster 0. For base inputs: one number, or three
     ==================  =========================================================
 
     Parameters
