@@ -13,6 +13,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _PATIENCE = 1.0  # seconds before a bar is shown
+_WORTH = 10.0  # seconds of work, whose estimate is shown
 _INTERVAL = 0.1
 
 
@@ -25,9 +26,20 @@ class Progress:
         self._start = time.monotonic()
         self._next = self._start + (_PATIENCE if shown is None else 0.0)
         self._drawn = False
+        self.done, self.total = 0, 0
+
+    def expect(self, seconds: float, cores: int) -> None:
+        """Print the estimated time of long work that is about to begin."""
+        if seconds < _WORTH:
+            return
+        size, unit = (seconds / 3600.0, "h") if seconds > 7200.0 else (seconds / 60.0, "min")
+        size, unit = (seconds, "s") if seconds < 120.0 else (size, unit)
+        on = f"{cores} core{'s' * (cores != 1)}"
+        print(f"fflin: about {float(f'{size:.2g}'):g} {unit} on {on}", file=sys.stderr)
 
     def update(self, done: int, total: int, what: str = "") -> None:
         """Say how many steps of how many are done, and of `what`."""
+        self.done, self.total = done, total
         if not self._shown or (now := time.monotonic()) < self._next:
             return
         self._next = now + _INTERVAL
@@ -37,6 +49,8 @@ class Progress:
         self._drawn = True
         said = f"\r{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left "
         print(said, end="", file=sys.stderr, flush=True)
+
+    __call__ = update
 
     def close(self) -> None:
         """Take the bar away."""

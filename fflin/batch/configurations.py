@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +18,9 @@ from fflin.batch.rows import checked_configurations, follow_rows
 from fflin.dynamics.points import configuration
 from fflin.robot.joints import Joint
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 # Random rows are drawn in blocks of this size, each with a seed of its own, so that a row does not
 # depend on the chunk that it is read in.
@@ -135,7 +138,7 @@ Configurations: TypeAlias = Grid | RandomConfigurations | GivenConfigurations
 
 def grid(
     robot: Robot,
-    axes: Mapping[str, Any],
+    axes: Mapping[str, ArrayLike],
     *,
     joints: Mapping[str, float] | None = None,
     base: pin.SE3 | None = None,
@@ -248,7 +251,7 @@ def random_configurations(
     return RandomConfigurations(robot, count, seed, checked, start)
 
 
-def as_configurations(robot: Robot, q: Any) -> Configurations:
+def as_configurations(robot: Robot, q: ArrayLike | Configurations) -> Configurations:
     """Return the points that `sweep` is given as rows of this robot."""
     instance("robot", robot, Robot, "a fflin.Robot")
     if isinstance(q, GivenConfigurations):  # checked already
@@ -273,7 +276,7 @@ def content(configurations: Configurations) -> dict[str, Any]:
     return {"of": type(configurations).__name__, **values, **named}
 
 
-def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:
+def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tuple[float, float]:
     if given is not None:
         what = f"range of '{joint.name}'"
         try:

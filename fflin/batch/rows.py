@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from fflin.base.errors import FflinError, InputError
 from fflin.base.validation import NORM_TOLERANCE, Array, as_double, dimension, vector
 from fflin.robot.joints import ROUND_OFF, Joint
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 # Where a joint stands in q: (index, -1), or, where it is stored so, those of (cos, sin); and the
 # entry for a unit of its value.
@@ -66,7 +69,7 @@ def follow_rows(robot: Robot, q: Array) -> None:
         joint.place(q.T, at)
 
 
-def checked_configurations(robot: Robot, q: Any) -> Array:
+def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
     """Return a copy of configurations (N, nq), each as `Robot.checked_configuration` has it."""
     rows = _rows("q", q, robot.nq, "one configuration in Pinocchio's order per row")
     for start in range(0, len(rows), _BLOCK):
@@ -104,7 +107,7 @@ def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
     return rows
 
 
-def checked_inputs(names: tuple[str, ...], u: Any, count: int) -> Array:
+def checked_inputs(names: tuple[str, ...], u: ArrayLike, count: int) -> Array:
     """Return inputs (N, nu) of an array (N, nu), or (nu,) for all; read-only."""
     nu = len(names)
     if dimension("u", u) == 1:
@@ -126,7 +129,7 @@ def _not_finite(rows: Array) -> list[int]:
     return rows_left
 
 
-def _rows(name: str, value: Any, size: int, of_what: str, count: int | None = None) -> Array:
+def _rows(name: str, value: ArrayLike, size: int, of_what: str, count: int | None = None) -> Array:
     array = as_double(name, value)
     expected = f"({'N' if count is None else count}, {size})"
     if array.ndim != 2 or array.shape[1] != size or (count is not None and len(array) != count):

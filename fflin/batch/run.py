@@ -79,7 +79,9 @@ class Done(NamedTuple):
     reason: str
 
 
-def check_workers(executor: Any, workers: Any, threads: Any, chunk: Any, progress: Any) -> None:
+def check_workers(
+    executor: object, workers: object, threads: object, chunk: object, progress: object
+) -> None:
     """Raise `InputError` if an option for the execution of the chunks is wrong."""
     if executor is not None and workers is not None:
         raise InputError("executor and workers are both given; give only one of them")
@@ -202,7 +204,7 @@ class Dispatch:
 
     def __init__(self, job: Job, rows: Rows, spans: list[Span], workers: Executor) -> None:
         self._job = pickle.dumps(job)
-        self._rows, self._workers, self._ahead = rows, workers, _QUEUED * _count(workers)
+        self._rows, self._workers, self._ahead = rows, workers, _QUEUED * worker_count(workers)
         self._waiting = spans[::-1]
         self._running: dict[Future[ChunkResult], Span] = {}
         self._attempts: Counter[Span] = Counter()
@@ -306,7 +308,7 @@ def _unpickled(job: bytes) -> Job:
     return result
 
 
-def _count(executor: Executor) -> int:
+def worker_count(executor: Executor) -> int:
     """Return the number of workers of an executor, or a default if it is not known."""
     for name in ("_max_workers", "num_workers"):
         count = getattr(executor, name, None)

@@ -246,7 +246,13 @@ _OF_THE_ROBOT = (
 class SweepTask:
     """Points of a sweep, and the part of its result that is the same at all points."""
 
-    def __init__(self, job: ChunkJob, configurations: Configurations, v: Any, u: Any) -> None:
+    def __init__(
+        self,
+        job: ChunkJob,
+        configurations: Configurations,
+        v: ArrayLike | None,
+        u: ArrayLike | None,
+    ) -> None:
         self.job, self.robot = job, job.linearizer.robot
         self.configurations, self.count = configurations, len(configurations)
         names = job.linearizer.prepared.actuation.names

@@ -25,7 +25,7 @@ from fflin.batch.run import Progress, check_workers, failure, run_chunks
 from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
 from fflin.batch.workers import OwnWorkers
 from fflin.campaign.campaign import NOT_RUN, Campaign
-from fflin.campaign.runs import CampaignJob, chunk_size
+from fflin.campaign.runs import CampaignJob, chunk_size, expect
 from fflin.campaign.spreads import placed
 from fflin.campaign.statistics import KINDS
 from fflin.kernel.compiled import available_cores
@@ -218,6 +218,7 @@ def monte_carlo(
     with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
         how: Any = {"executor": others, "progress": progress}
         how["threads"] = threads if job.engine == "compiled" else 1
+        expect(progress, [(job, job.dispersions.rows(0, min(runs, LANES)), runs)], others, threads)
         done = runs if until is None else min(_STAGE, runs)
         while not (failed := run_chunks(job, job.dispersions.rows, store, upto=done, **how)):
             if done == runs:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from copy import copy
 from dataclasses import replace
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ import numpy as np
 from fflin.base.errors import FflinError
 from fflin.base.record import content_digest
 from fflin.base.validation import Array
-from fflin.batch.run import ChunkResult, Progress, Rows, run_chunks
+from fflin.batch.run import ChunkResult, Progress, Rows, run_chunks, worker_count
 from fflin.batch.store import MemoryStore
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.spreads import placed
@@ -36,6 +38,7 @@ from fflin.simulation.simulate import motion_of
 
 ARRAYS = Outcome._fields
 _LARGEST_CHUNK = 256
+_FEW_STEPS, _SOME_STEPS = 4, 64  # that are measured to estimate the time of runs
 
 
 class CampaignJob:
@@ -165,6 +168,25 @@ class CampaignJob:
         run = _recorded(replace(plan, events=(goes_on,)), plant, every=1)
         return rule.outcome(run.steps, np.array([float(stop_of(run.stopped))]))
 
+    def seconds(self, first: Draws, count: int) -> float:
+        """Return the estimated time [s] of runs on one core, from a few steps of the first runs."""
+        few, plan = _remade(self._arguments, self.engine), self.plan
+        compiled, steps = self.engine == "compiled", plan.times.steps
+        lanes = LANES if compiled else 1
+        drawn = first.part(0, lanes)
+
+        def measured(steps: int) -> float:
+            few.plan = replace(plan, times=plan.times._replace(steps=steps))
+            began = perf_counter()
+            few.run(drawn, 0)
+            return perf_counter() - began
+
+        short, long = (min(each, steps) for each in (_FEW_STEPS, _SOME_STEPS))
+        measured(1)  # compiles what is not compiled yet
+        begin = measured(short)
+        step = (measured(long) - begin) / (long - short) if long > short else 0.0
+        return (begin + max(step, 0.0) * (steps - short)) * math.ceil(count / lanes)
+
     def replay(self, drawn: Array) -> Motion:
         """Simulate a run (k,) again with the same arithmetic, and return its motion."""
         plan, plant = self.plan_of(drawn)
@@ -219,6 +241,31 @@ def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, Any]:
 
     collect("loop", parts)
     return found
+
+
+def expect(
+    progress: Progress | None,
+    work: Sequence[tuple[CampaignJob, Draws, int]],
+    executor: Executor | None,
+    threads: int | None,
+) -> None:
+    """Tell a progress bar the estimated time of jobs, each with its first runs and their number.
+
+    Only the bar of the command line has the method `expect`; a function is only called.
+    """
+    tell = getattr(progress, "expect", None)
+    if tell is None:
+        return
+    compiled = any(job.engine == "compiled" for job, *_ in work)
+    here = (threads or available_cores()) if compiled else 1
+    lanes = LANES if compiled else 1
+    cores = worker_count(executor) if executor else here
+    cores = min(cores, max(math.ceil(count / lanes) for *_, count in work))
+    try:
+        seconds = sum(job.seconds(first, count) for job, first, count in work)
+    except FflinError:
+        return  # of a run, which the work itself reports
+    tell(seconds / cores, cores)
 
 
 def _remade(arguments: tuple[Any, ...], engine: str) -> CampaignJob:

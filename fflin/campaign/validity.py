@@ -19,8 +19,11 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, number, share, whole
 from fflin.batch.run import Progress, check_workers
 from fflin.batch.workers import OwnWorkers
+from fflin.campaign.dispersions import Draws
+from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, Loop, checked_loop, settle, settling_runs
 from fflin.dynamics.names import Frame, refuse_orbit
+from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -259,11 +262,19 @@ def validity(
         for frame, each in loops.items()
         for predicts in sets
     }
-    for make in runs_of.values():  # a wrong argument is refused before anything is compiled
-        make().choose(engine)
+    jobs = {key: make() for key, make in runs_of.items()}
+    for job in jobs.values():  # a wrong argument is refused before anything is compiled
+        job.choose(engine)
+    work = []
+    for (frame, predicts), job in jobs.items():
+        at, streams = sets[predicts]
+        some = np.arange(min(LANES, len(at)))
+        first = _starts(loops[frame], largest, seed, at, streams, some)
+        work.append((job, Draws(first, some.astype(float)), len(at)))
     total, done, found = len(loops) * (len(_LEVELS) * _DIRECTIONS + samples), 0, list[Validity]()
     with OwnWorkers(workers) if workers else nullcontext(executor) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
+        expect(progress, work, others, threads)
         for frame, each in loops.items():
             arrays = {}
             for predicts, (at, streams) in sets.items():

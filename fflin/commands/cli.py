@@ -65,7 +65,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")
     argv = sys.argv[1:] if argv is None else argv
     try:
-        arguments = _parser(argv[0] if argv else "").parse_args(argv)
+        main_parser = _parser(argv[0] if argv else "")
+        arguments, unknown = main_parser.parse_known_args(argv)
+        if unknown:  # its command has the list of options
+            chosen = getattr(arguments, "command", main_parser)
+            chosen.error(f"unrecognized arguments: {' '.join(unknown)}")
         with files_of_command(*parser.files_of(arguments)):
             check_outputs(arguments)
             code = finish(arguments.run(arguments), arguments)

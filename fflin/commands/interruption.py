@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 from types import FrameType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from fflin.commands import INTERRUPTED
 
@@ -40,7 +40,7 @@ def _heard(_: int, frame: FrameType | None) -> None:
     _raise_in(importer)
 
 
-def _passed_over(unraisable: Any) -> None:
+def _passed_over(unraisable: sys.UnraisableHookArgs) -> None:
     if issubclass(unraisable.exc_type, KeyboardInterrupt):
         frame = sys._getframe(1)
         _raise_in(_importer(frame) or frame)

@@ -22,9 +22,14 @@ from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.tracking import add_trajectory, models_along, schedule_of
 
 if TYPE_CHECKING:
+    import pinocchio as pin
+
     from fflin.base.validation import Array
-    from fflin.control.policies import StateFeedback
+    from fflin.control.gain import Gain
+    from fflin.control.gain_schedule import GainSchedule
+    from fflin.control.policies import Allocation, Feedback, StateFeedback
     from fflin.linear.model import LinearModel
+    from fflin.linear.trajectory import Trajectory
     from fflin.robot.robot import Robot
 
 _WEIGHTS = ("weights", "q", "r", "bryson", "sample")
@@ -170,7 +175,7 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
 
 
 def start_of(
-    robot: Robot, arguments: argparse.Namespace, reference: Any = None
+    robot: Robot, arguments: argparse.Namespace, reference: pin.SE3 | None = None
 ) -> tuple[Array, Array | None]:
     """Return the initial q (nq,) and v (nv,) of the arguments or of the robot."""
     from fflin.base.names import rates_by_name
@@ -190,13 +195,15 @@ def start_of(
     return q, velocity_of(robot, arguments, state, "velocity")
 
 
-def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, LinearModel | None]:
+def about_point(
+    robot: Robot, arguments: argparse.Namespace
+) -> tuple[Feedback | Allocation, Any, LinearModel | None]:
     """Return the policy, its feedback, and the model that predicts every row."""
     from fflin.control.authority import thrusters_give_every_wrench
     from fflin.control.linear_controller import LinearController
     from fflin.control.policies import Allocation, StateFeedback
 
-    gain: Any = None
+    gain: Gain | None = None
     if arguments.mpc:
         names = ("allocate", "gain", "controller", "reduce")
         _refuse(arguments, names, "--mpc computes the inputs itself")
@@ -233,7 +240,7 @@ def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, 
     return feedback, feedback, None if arguments.reduce else lin
 
 
-def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Any:
+def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Feedback:
     """Return the predictive controller of the weights and limits."""
     from fflin.control.default_weights import rule_weights
     from fflin.control.mpc import mpc
@@ -285,7 +292,7 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
     return (Allocation(policy, design) if arguments.allocate else policy), start
 
 
-def _require_own(schedule: Any, motion: Any, arguments: argparse.Namespace) -> None:
+def _require_own(schedule: GainSchedule, motion: Trajectory, arguments: argparse.Namespace) -> None:
     """Refuse gains of another trajectory."""
     import numpy as np
 
@@ -325,7 +332,7 @@ def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> Linea
     return linearize(robot, q, v, gain.u0, frame=gain.frame, reference=reference)
 
 
-def require_held(robot: Robot, policy: Any, q: Array) -> None:
+def require_held(robot: Robot, policy: Feedback, q: Array) -> None:
     """Warn of initial errors without feedback; refuse a start with no other errors."""
     from fflin.control.policies import fed_back
     from fflin.dynamics.state import StateMap

@@ -111,8 +111,8 @@ def lock(text: str) -> tuple[str, float | None]:
 
 _REPEATABLE = " (repeatable)"
 # Types of Python that `Group.add` takes in place of a reader.
-_READERS: dict[Any, Callable[[str], Any]] = {float: number, int: count_of, Path: input_file}
-_METAVARS: dict[Any, str] = {
+_READERS: dict[object, Callable[[str], object]] = {float: number, int: count_of, Path: input_file}
+_METAVARS: dict[object, str] = {
     input_file: "FILE",
     input_name: "FILE.toml",
     assignment: "NAME=VALUE",
@@ -130,7 +130,7 @@ class Group(argparse._ArgumentGroup):
         self,
         name: str,
         help: str,
-        type: Callable[[str], Any] = str,
+        type: Callable[[str], object] = str,
         metavar: str | tuple[str, ...] | None = None,
         *,
         default: object = None,

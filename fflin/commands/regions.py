@@ -131,7 +131,7 @@ def _validity(arguments: argparse.Namespace) -> Report:
                 frames=arguments.frames,
                 limits="urdf" if cut else None,
                 executor=executor,
-                progress=bar.update,
+                progress=bar,
             )
     finally:
         bar.close()

@@ -39,9 +39,9 @@ class Report:
     """
 
     robot: str | None
-    result: Any
+    result: object
     text: str
-    files: Mapping[Path | None, Callable[[Path], Any] | None] = field(default_factory=dict)
+    files: Mapping[Path | None, Callable[[Path], object] | None] = field(default_factory=dict)
     code: int = DONE
     interrupted: str = ""
 
@@ -72,7 +72,7 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
     return report.code
 
 
-def figure_of(name: str, drawn: object) -> Callable[[Path], Any]:
+def figure_of(name: str, drawn: object) -> Callable[[Path], object]:
     """Return a function that draws with the public function of this name and saves the figure."""
 
     def save(path: Path) -> None:

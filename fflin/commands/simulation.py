@@ -107,7 +107,7 @@ def _simulate(arguments: argparse.Namespace) -> Report:
     try:
         motion = simulated(robot, arguments)
     except InputError as error:
-        hint = " (--sample)" if "time between samples" in str(error) else ""
+        hint = " (--sample)" if "needs sampled commands" in str(error) else ""
         raise InputError(f"{error}{hint}") from None
     return Report(
         robot.name,

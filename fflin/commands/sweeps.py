@@ -18,6 +18,7 @@ from fflin.commands.results import Report
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from fflin.base.process import Progress
     from fflin.base.validation import Array
     from fflin.batch.configurations import Configurations
     from fflin.robot.robot import Robot
@@ -262,21 +263,16 @@ def _given(path: Path) -> dict[str, Array]:
 
 
 @contextmanager
-def going_on(path: Path | None, what: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield the progress callback; after Ctrl-C report the progress and the saved part."""
+def going_on(path: Path | None, what: str) -> Iterator[Progress]:
+    """Yield the progress bar; after Ctrl-C report the progress and the saved part."""
     from fflin.base.process import Progress
     from fflin.batch.store import part_of
 
-    bar, reached = Progress(), [0, 0]
-
-    def update(done: int, total: int) -> None:
-        reached[:] = done, total
-        bar.update(done, total)
-
+    bar = Progress()
     try:
-        yield update
+        yield bar
     except KeyboardInterrupt:
-        said = "stopped" if not reached[1] else "stopped at {:,} of {:,} ".format(*reached) + what
+        said = f"stopped at {bar.done:,} of {bar.total:,} {what}" if bar.total else "stopped"
         if not path:
             said += "; nothing is saved without -o FILE"
         elif part_of(path).exists():

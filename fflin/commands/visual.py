@@ -94,7 +94,7 @@ def pictures(
     motion: Callable[[], Motion],
     arguments: argparse.Namespace,
     cloud: Campaign | None = None,
-) -> dict[Path | None, Callable[[Path], Any]]:
+) -> dict[Path | None, Callable[[Path], object]]:
     """Return the files of the options of `add_pictures`, with the functions that write them."""
     how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *_SHOWN)}
 

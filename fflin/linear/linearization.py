@@ -58,8 +58,8 @@ class Prepared:
     @cached_property
     def fields(self) -> dict[str, Any]:
         """Fields of a model at rest except B and q; expensive fields are computed on demand."""
-        at_rest = partial(_state_at_rest, self.map)
-        asked = {"x0": at_rest, "y0": at_rest, "_reference": partial(own_reference, self.robot)}
+        state = partial(_state_at, self)
+        asked = {"x0": state, "y0": state, "_reference": partial(own_reference, self.robot)}
         other = {} if self.own_reference else {"_reference": self.reference}
         return {**self.common, **self.rest, "_computed": asked, **other}
 
@@ -159,14 +159,16 @@ def prepare(
     )
 
 
-def _state_at_rest(state: StateMap, q: Array) -> Array:
-    x0: Array = np.zeros(state.nx)
-    x0[state.groups.q_m] = state.joint_positions(q)
+def _state_at(ready: Prepared, lin: LinearModel) -> Array:
+    state, own = ready.map, ready.own_reference
+    chart, r_b = (_STANDING, _STANDING.q_b) if own else (state.chart(lin.q), state.positions(lin.q))
+    x0 = state.compose(chart, r_b, state.joint_positions(lin.q), state.velocities(lin.v))
     return frozen(x0)
 
 
-def own_reference(robot: Robot, q: Array) -> Array:
-    """Return the base placement (7,) at a configuration, the default reference of a model."""
+def own_reference(robot: Robot, lin: LinearModel) -> Array:
+    """Return the base placement (7,) of a model, its default reference."""
+    q = lin.q
     root = robot.model.jointPlacements[ROOT]
     if root.isIdentity(0.0):
         return q[:7]
@@ -346,24 +348,19 @@ class Linearizer:
         nu, q_m = state.velocities(v), state.joint_positions(q)
         u_base = actuation.in_base_axes(chart, u)
         A, B = ready.rest["A"].copy(), np.zeros(self._shape_B)
-        x0 = state.compose(chart, r_b, q_m, nu)
         rates = self._source.rates(q, v, nu, q_m, u_base, A[lower], B[lower])
-        seen: dict[str, Array] = {"y0": x0}
+        seen: dict[str, Array] = {}
         if ready.sensing is not None:
-            point = (q, v, nu, u_base)
+            x0, point = state.compose(chart, r_b, q_m, nu), (q, v, nu, u_base)
             seen = output_equations(ready.sensing, actuation, self._data, chart, rates, x0, point)
             _require_finite(*seen.values())
         rate = assemble(state, actuation, chart, nu, u_base, rates, A, moving=ready.moving)
         _require_finite(A, B, rate)
         rate = drift(state, rate, rates.gravity) if ready.moving else rate
-        made = seen | {"A": A, "B": B, "x0": x0, "q": q, self._rate: rate}
-        if v is not self._still[0]:
-            made["v"] = v
-        if u is not self._still[1]:
-            made["u0"] = u
+        made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
         for array in made.values():
             array.setflags(write=False)
-        return LinearModel(self._fields, **made)
+        return LinearModel(self._fields | made)
 
     def along(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
         """Return A, B, C, D and y (N, ..) about rows of valid points, with u in base axes.
@@ -403,8 +400,7 @@ class Linearizer:
 def _require_finite(*arrays: Array) -> None:
     """Raise `InputError` if the squares of the entries of an array overflow."""
     for array in arrays:
-        entries = array.ravel()
-        if not entries.dot(entries) < LARGEST:  # nor NaN
+        if not np.vdot(array, array) < LARGEST:  # nor NaN
             raise InputError(
                 "the model is not finite, because q, v or u is too large; check their units"
             )

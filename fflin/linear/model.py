@@ -170,12 +170,12 @@ class LinearModel(StateSpace):
         vars(self).update(shared or {}, **fields)
 
     def __getattr__(self, name: str) -> Any:
-        # `shared` may hold {field: function of q} for fields that are computed at first access,
-        # because they take as long as the dynamics.
+        # `shared` may hold {field: function of the model} for fields that are computed at first
+        # access, because they take as long as the dynamics.
         make = vars(self).get("_computed", {}).get(name)
         if make is None:
             raise AttributeError(f"'LinearModel' object has no attribute '{name}'")
-        return vars(self).setdefault(name, make(self.q))
+        return vars(self).setdefault(name, make(self))
 
     def __repr__(self) -> str:
         nx, nu = self.B.shape

@@ -107,7 +107,7 @@ def _over_rotations(
     omega_in_reference, v_in_reference = state.axes
     # Derivatives of the accelerations alone are zero here without an orbit.
     theta, c = rates.by_turn, rates.c
-    for columns in actuation.held if u.any() else ():
+    for columns in actuation.held if np.count_nonzero(u) else ():
         theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
     if omega_in_reference:
         theta = theta + product(rates.by_nu[..., ANGULAR], W)
@@ -123,11 +123,12 @@ def _over_rotations(
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
     """Return the own rate (.., nx) of a reference that moves along, after (5.3)."""
+    weight = (gravity * gravity).sum(axis=-1, keepdims=True) if state.falls else np.zeros(1)
+    if not np.count_nonzero(weight):
+        return f0
     rate: Array = f0.copy()
-    weight = (gravity * gravity).sum(axis=-1, keepdims=True)
-    if weight.any():
-        turning = rate[..., state.groups.q_b]
-        turning -= (turning * gravity).sum(axis=-1, keepdims=True) / weight * gravity
+    turning = rate[..., state.groups.q_b]
+    turning -= (turning * gravity).sum(axis=-1, keepdims=True) / weight * gravity
     return rate
 
 

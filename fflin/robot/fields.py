@@ -48,7 +48,7 @@ def checked_fields(fields: Mapping[str, Any], scope: Scope) -> dict[str, Any]:
 
 
 def checked_inputs(
-    value: Any, find: Find, joints: Sequence[str], passive: Sequence[str]
+    value: object, find: Find, joints: Sequence[str], passive: Sequence[str]
 ) -> tuple[Input, ...]:
     """Return the inputs as a robot holds them."""
     if isinstance(value, str) or not isinstance(value, Sequence):
@@ -94,7 +94,7 @@ def _input_keys(inputs: Sequence[Input]) -> tuple[str, ...]:
     return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
 
 
-def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> dict[str, Range]:
+def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} of a magnitude, or of some by name."""
     keys, states, named = _input_keys(inputs), state_keys(joints), named_inputs(inputs)
     names = [*(name for _, own in named for name in own), *states]
@@ -117,7 +117,7 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> 
     }
 
 
-def _outputs(value: Any, _: Scope) -> tuple[Output, ...]:
+def _outputs(value: object, _: Scope) -> tuple[Output, ...]:
     if isinstance(value, str) or not isinstance(value, Sequence) or not value:
         raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
     for item in value:
@@ -126,13 +126,13 @@ def _outputs(value: Any, _: Scope) -> tuple[Output, ...]:
     return tuple(value)
 
 
-def _rest(value: Any, scope: Scope) -> dict[str, float]:
+def _rest(value: object, scope: Scope) -> dict[str, float]:
     if not isinstance(value, Mapping):
         raise InputError(f"rest is {value!r}, expected {{joint: rest position}}")
     return by_joint(numbers("rest", value, "joint", "rest of joint"), scope.own, scope.find)
 
 
-def _stiffness(value: Any, scope: Scope, what: str = "stiffness") -> dict[str, float]:
+def _stiffness(value: object, scope: Scope, what: str = "stiffness") -> dict[str, float]:
     """Return {joint: value} from a mapping, or from one value for all joints except wheels."""
     if not isinstance(value, Mapping):
         value = dict.fromkeys(scope.own, value)
@@ -143,7 +143,7 @@ def _stiffness(value: Any, scope: Scope, what: str = "stiffness") -> dict[str, f
     return by_joint(checked, scope.own, scope.find)
 
 
-def _damping(value: Any, scope: Scope) -> dict[str, float]:
+def _damping(value: object, scope: Scope) -> dict[str, float]:
     if not isinstance(value, str):
         return _stiffness(value, scope, "damping")
     if value != "urdf":
@@ -166,7 +166,7 @@ def range_of(name: str, value: Any) -> Range:
     return least, largest
 
 
-def _state(what: str, value: Any, scope: Scope) -> dict[str, Any]:
+def _state(what: str, value: object, scope: Scope) -> dict[str, Any]:
     """Return a point, start or target of a robot, with joints and rates by their full names."""
     state = _parts(what, value, _STATE)
     if "joints" in state:
@@ -198,7 +198,7 @@ def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, An
     return both
 
 
-def _weights(value: Any, scope: Scope) -> dict[str, Any]:
+def _weights(value: object, scope: Scope) -> dict[str, Any]:
     """Return the weights of a robot's regulator, by names of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)
     require_known("rule of weights", [str(weights.get("rule", RULES[0]))], RULES)
@@ -224,7 +224,7 @@ def _weights(value: Any, scope: Scope) -> dict[str, Any]:
 
 
 def checked_passive(
-    value: Any, find: Find, joints: Sequence[str], locked: Sequence[str]
+    value: object, find: Find, joints: Sequence[str], locked: Sequence[str]
 ) -> tuple[str, ...]:
     """Return the joints without a motor, in the order of the state."""
     keys = [value] if isinstance(value, str) else value
@@ -240,7 +240,7 @@ def checked_passive(
     return tuple(name for name in joints if name in found)
 
 
-def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
+def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         raise InputError(f"{what} is {value!r}, expected a table with the keys {', '.join(known)}")
     require_known(f"part of {what}", value, known)
@@ -250,7 +250,7 @@ def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
 class Field(NamedTuple):
     """Key of a robot file: the types of its values, and the check of a field."""
 
-    check: Callable[[Any, Scope], Any] = lambda value, _: value
+    check: Callable[[Any, Scope], object] = lambda value, _: value
     kind: Kind = NUMBER  # of a value, and of the entries of a list
     table: Kind | None = NUMBER  # of the entries of a table; None if it must not be a table
     parts: bool = False  # whether it is a table of named parts, some of which are tables

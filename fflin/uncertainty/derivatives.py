@@ -47,7 +47,7 @@ class ModelDerivatives:
 
     def __init__(self, lin: LinearModel, robot: Robot, source: LinearModel) -> None:
         self.lin, self.robot, self._source = lin, robot, source
-        own = lin.moving or bool(np.array_equal(lin.placement, own_reference(robot, lin.q)))
+        own = lin.moving or bool(np.array_equal(lin.placement, own_reference(robot, lin)))
         own = own and robot.orbit is None
         self._how: Any = {"frame": lin.frame, "moving": lin.moving}
         self._how["reference"] = None if own else lin.reference

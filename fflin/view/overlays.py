@@ -16,6 +16,8 @@ from fflin.view.page import packed
 
 if TYPE_CHECKING:
     from fflin.campaign.campaign import Campaign
+    from fflin.campaign.funnel import Funnel
+    from fflin.simulation.motion import Motion
 
 # With these a page grows by no more than 1.2 MB.
 _RUNS, _ROWS = 240, 150
@@ -26,7 +28,7 @@ _COLORS = {"base": "#a9c4e8", "tool": "#ffb877"}
 _COUNT, _THIN = 160, 1e-3
 
 
-def drawn_robot(robot: Robot, cloud: Any, motion: Any) -> Robot:
+def drawn_robot(robot: Robot, cloud: Campaign, motion: Motion) -> Robot:
     """Return the robot of a motion shown with a cloud, with the bodies that its run drew."""
     from fflin.campaign.campaign import Campaign
 
@@ -61,7 +63,7 @@ def cloud_of(robot: Robot, campaign: Campaign, tool: str | None) -> list[dict[st
 
 
 def tubes(
-    robot: Robot, funnel: Any, tool: str | None, size: float, colors: tuple[str, str]
+    robot: Robot, funnel: Funnel, tool: str | None, size: float, colors: tuple[str, str]
 ) -> list[dict[str, Any]]:
     """Return centres (N, 3) and half axes (N, 9) of the ellipsoids of tool and base."""
     from fflin.campaign.funnel import Funnel

@@ -27,7 +27,7 @@ class Server:
         self,
         page: str,
         scene: Callable[[], Iterable[bytes]],  # for a browser that has just come
-        asked: Callable[[Any], None],  # takes what a browser sends
+        asked: Callable[[object], None],  # takes what a browser sends
         port: int,  # 0 for one that is free
     ) -> None:
         self.scene, self.asked = scene, asked
@@ -92,7 +92,7 @@ class Server:
         self._call(self._stop.set)
         self._thread.join(5.0)
 
-    def _call(self, what: Callable[[], Any]) -> None:
+    def _call(self, what: Callable[[], object]) -> None:
         if self._running and self._thread.is_alive():
             with contextlib.suppress(RuntimeError):  # it has just been closed
                 self._loop.call_soon_threadsafe(what)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from warnings import warn
@@ -216,7 +216,7 @@ def _temporary(name: str) -> Path:
         return Path(file.name)
 
 
-def check_outputs(files: dict[str, Any]) -> dict[str, Path]:
+def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, Path]:
     """Return {ending: path} of the files that are named, or raise where one cannot be written."""
     outputs = {}
     for ending, file in files.items():
@@ -257,7 +257,7 @@ def _speed(speed: float | None, default: float) -> float:
     return speed
 
 
-def _check_motion(robot: Robot, motion: Motion, cloud: Any) -> Robot:
+def _check_motion(robot: Robot, motion: Motion, cloud: Campaign | None) -> Robot:
     """Return the robot that a motion is of."""
     from fflin.simulation.motion import require_motion
 

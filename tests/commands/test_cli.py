@@ -692,3 +692,11 @@ def test_equilibria_in_orbit_are_taken_as_panels_sag(tmp_path):
         name, *more = options
         number = [more.pop()] if more and more[-1] == 25 else []
         assert words in refused("modes", name, *more, "--relative-equilibrium", *number)
+
+
+def test_an_unknown_option_is_answered_with_the_help_of_its_command():
+    code, _, err = run("lqr", "cubesat", "--target-joint", "a=0.3")
+    assert code == 2
+    assert err == (
+        "fflin: error: unrecognized arguments: --target-joint a=0.3 (see fflin lqr --help)\n"
+    )

@@ -142,6 +142,25 @@ def test_an_allocation_meets_the_conditions_of_karush_kuhn_and_tucker(seed):
     assert (low | high).any()
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_an_allocation_that_can_realise_the_force_is_the_smallest(seed):
+    """Minimise ``|u|^2`` with ``A u = b``: where no bound acts, u is ``A^T l`` for one l."""
+    rng = np.random.default_rng(seed)
+    size, count = 6, 12
+    A = rng.normal(size=(size, count))
+    least, most = -rng.uniform(0.2, 1.0, size=count), rng.uniform(0.2, 1.0, size=count)
+    least[::2] = 0.0
+    b = A @ rng.uniform(least, most)
+    problem = least_squares(least, most, size)._replace(columns=np.append(A.T.ravel(), b))
+    solve(problem, size, 0)
+    u = np.array(problem.x)
+    free = (u > least + 1e-9) & (u < most - 1e-9)
+    assert size <= free.sum() < count
+    multiplier = np.linalg.lstsq(A[:, free].T, u[free], rcond=None)[0]
+    assert u == pytest.approx(np.clip(A.T @ multiplier, least, most), abs=1e-12)
+    assert A @ u == pytest.approx(b, abs=1e-10)
+
+
 def test_a_run_goes_on_within_its_speeds_and_its_chart():
     turn = pin.Quaternion(pin.exp3(np.array([0.0, 0.0, 2.0]))).coeffs()
     origin, bounds = np.append(np.zeros(3), turn), np.array([2.0, 3.0])

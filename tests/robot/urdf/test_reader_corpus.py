@@ -2,20 +2,19 @@
 
 import os
 import re
-import sys
 from collections import Counter
 from dataclasses import dataclass
 
 import pytest
 
+from tests.support.forked import forking
 from tests.support.messages import hear_lines
-from tests.support.patience import finished
 from tests.support.reader_corpus import ACCEPT, CASES, REFUSE, WARN
 
 pytestmark = pytest.mark.fuzz
 
 TIME_LIMIT = 20  # [s] of the processor
-MEMORY_LIMIT = 4 * 2**20  # [KiB]
+MEMORY_LIMIT = 4 * 2**30  # [B]
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Run:
     left: list[str]  # names of files that the command left behind
 
 
-def run(case, folder):
+def run(case, folder, command_of):
     folder.mkdir()
     path = folder / f"robot{case.suffix}"
     if callable(case.document):
@@ -39,15 +38,16 @@ def run(case, folder):
     else:
         command = ["check", str(path)]
     before = set(os.listdir(folder))
-    shell = ["sh", "-c", f'ulimit -v {MEMORY_LIMIT}; ulimit -t {TIME_LIMIT}; exec "$@"', "sh"]
-    result = finished(
-        [*shell, sys.executable, "-m", "fflin", *command],
-        capture_output=True,
-        env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "default"},
-        cwd=folder,
-    )
+    out, err = (folder.with_suffix(f".{name}") for name in ("out", "err"))
+    code = command_of(command, folder, out, err, (TIME_LIMIT, MEMORY_LIMIT))
     left = sorted(set(os.listdir(folder)) - before)
-    return Run(result.returncode, result.stdout.decode(), result.stderr.decode(), left)
+    return Run(code, out.read_text(), err.read_text(), left)
+
+
+@pytest.fixture(scope="module")
+def command_of():
+    with forking(PYTHONWARNINGS="default") as run:
+        yield run
 
 
 def test_corpus_is_large_and_its_names_differ():
@@ -58,10 +58,10 @@ def test_corpus_is_large_and_its_names_differ():
 
 @pytest.mark.process
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_corpus(case, tmp_path):
+def test_corpus(case, tmp_path, command_of):
     if "xacro" in case.name:
         pytest.importorskip("xacrodoc")
-    result = run(case, tmp_path / str(CASES.index(case)))
+    result = run(case, tmp_path / str(CASES.index(case)), command_of)
     lines = hear_lines(result.err).splitlines()
     if case.expected == REFUSE:
         assert (result.code, result.out, result.left) == (2, "", [])

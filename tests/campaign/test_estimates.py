@@ -1,0 +1,87 @@
+"""The estimated time of campaigns and of `validity`, with a clock that counts steps."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.base.process import Progress
+from fflin.campaign import runs as runs_module
+from fflin.campaign.runs import CampaignJob
+from tests.support.commands import run
+
+STEP = 1e-3  # seconds of a step of one run
+
+
+class Told(Progress):
+    """A bar that keeps what it is told."""
+
+    def expect(self, seconds, cores):
+        self.told = seconds, cores
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Let a run take a millisecond for each step and 20 ms at its start."""
+    now, done = [0.0], CampaignJob.run
+
+    def timed(job, rows, start, out=None):
+        now[0] += len(rows.drawn) * (20.0 + job.plan.times.steps) * STEP
+        return done(job, rows, start, out)
+
+    monkeypatch.setattr(CampaignJob, "run", timed)
+    monkeypatch.setattr(runs_module, "perf_counter", lambda: now[0])
+    return now
+
+
+def loop_of(robot):
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin)
+    return lin, gain, fflin.StateFeedback(lin, gain.K)
+
+
+def test_a_campaign_and_validity_say_what_they_will_take(clock):
+    robot = fflin.load("cubesat")
+    lin, gain, policy = loop_of(robot)
+    bar, options = Told(), {"duration": 10.0, "dt": 0.1, "engine": "python"}
+    campaign = fflin.monte_carlo(robot, policy, {"q_b": 0.1}, runs=3, progress=bar, **options)
+    assert bar.told == (pytest.approx(3 * 120 * STEP), 1)
+    work = [(campaign._job, campaign._job.dispersions.rows(0, 1), 3)]
+    runs_module.expect(bar, work, ThreadPoolExecutor(2), None)
+    assert bar.told == (pytest.approx(1.5 * 120 * STEP), 2)
+    runs_module.expect(bar, work, ThreadPoolExecutor(20), None)
+    assert bar.told == (pytest.approx(120 * STEP), 3)
+    silent = fflin.monte_carlo(robot, policy, {"q_b": 0.1}, runs=3, **options)
+    assert (silent.q == campaign.q).all()  # the estimate changes no run
+    before = clock[0]
+    fflin.validity(robot, lin, gain, samples=3, engine="python", progress=bar)
+    seconds, cores = bar.told
+    assert cores == 1 and seconds == pytest.approx(clock[0] - before, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "cores", "said"),
+    [
+        (9.0, 1, ""),
+        (41.4, 2, "fflin: about 41 s on 2 cores\n"),
+        (119.0, 1, "fflin: about 120 s on 1 core\n"),
+        (1260.0, 8, "fflin: about 21 min on 8 cores\n"),
+        (9000.0, 8, "fflin: about 2.5 h on 8 cores\n"),
+    ],
+)
+def test_an_estimate_is_a_line_on_stderr(capsys, seconds, cores, said):
+    Progress().expect(seconds, cores)
+    assert capsys.readouterr() == ("", said)
+
+
+@pytest.mark.parametrize(
+    "command", ["validity cubesat --samples 2", "montecarlo cubesat u.toml --runs 2 --duration 1"]
+)
+def test_commands_print_it_before_they_begin(command, tmp_path, monkeypatch):
+    (tmp_path / "u.toml").write_text("[dispersions]\nq_b = 0.1\n")
+    monkeypatch.setattr(CampaignJob, "seconds", lambda *_: np.float64(1000.0))
+    monkeypatch.setattr(runs_module, "available_cores", lambda: 1)
+    code, _, err = run(*command.split(), cwd=tmp_path)
+    assert code == 0
+    assert err.splitlines()[0] in ("fflin: about 17 min on 1 core", "fflin: about 33 min on 1 core")
