@@ -136,7 +136,7 @@ def lqr(
         Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
     elif weights is not None or Q is None or R is None:
         raise InputError(
-            "only one of Q and R is given; give both, or leave both out for default weights"
+            "give the weights either by both Q and R, or by weights='urdf' or 'identity' alone"
         )
     Q, R, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)

@@ -114,7 +114,7 @@ def tvlqr(
     given, by_rule = list[Any]((Q, R)), Q is None and R is None
     if not by_rule and (weights is not None or Q is None or R is None):
         raise InputError(
-            "only one of Q and R is given; give both, or leave both out for default weights"
+            "give the weights either by both Q and R, or by weights='urdf' or 'identity' alone"
         )
     end: Any = steady_end(traj) if steady or by_rule else None
     if by_rule:

@@ -269,7 +269,7 @@ def test_identity_and_given_weights_are_said(loops):
     with pytest.raises(fflin.UnknownNameError, match="'bryson'"):
         fflin.lqr(lin, weights="bryson")
     for arguments, options in (((1.0,), {}), ((None, 1.0), {}), ((1.0, 1.0), {"weights": "urdf"})):
-        with pytest.raises(fflin.InputError, match="default weights"):
+        with pytest.raises(fflin.InputError, match="both Q and R"):
             fflin.lqr(lin, *arguments, **options)
 
 

@@ -364,7 +364,7 @@ def test_a_plan_that_is_not_found_is_told_and_not_applied(servicer, monkeypatch)
     regulator = fflin.StateFeedback(policy.lin, policy.gain.K)
     cut = fflin.simulate(robot, regulator, **options)
     assert flown.u[0] == pytest.approx(cut.u[0], rel=1e-9, abs=1e-12)
-    assert "regulator" in flown.notes[-1]
+    assert "LQR command" in flown.notes[-1]
 
 
 @pytest.mark.exhaustive
@@ -383,7 +383,7 @@ def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp
         "the point exceeds the limits of tau_b.x": {"limits": {"tau_b": (0.1, 0.2)}},
         "Qf is 'nosuch'": {"Qf": "nosuch"},
         "limits is 'nosuch'": {"limits": "nosuch"},
-        "only one of Q and R": {"R": None},
+        "both Q and R": {"R": None},
     }
     for said, given in wrong.items():
         with pytest.raises(fflin.FflinError, match=said):

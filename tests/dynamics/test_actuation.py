@@ -274,7 +274,7 @@ def test_bad_fields_are_told():
         "'panel'": {"damping": {"panel": 1}},
         "'urdf'": {"damping": "yes"},
         "gravity": {"gravity": 9.81},
-        "mapping": {"rest": 1.0},
+        "rest position": {"rest": 1.0},
         "differentiable": {"friction": "urdf"},
         "'stifness'": {"stifness": 1},
     }

@@ -197,7 +197,7 @@ def test_a_law_from_a_file_needs_its_robot(tmp_path):
         ({"real": "half"}, "'double' or 'float'"),
         ({"law": 3}, "Gain, StateFeedback"),
         ({"robot": "cubesat"}, "a Robot"),
-        ({"law": "continuous"}, "samples"),
+        ({"law": "continuous"}, "sampled gains"),
         ({"law": "compensator"}, "continuous, expected a sampled"),
     ],
 )
@@ -216,9 +216,9 @@ def test_what_cannot_be_written_is_refused(change, match, tmp_path):
 
 def test_the_code_is_not_flown_with_another_robot(tmp_path):
     code = fflin.CLaw(fflin.write_c(law("hybrid")[1], tmp_path))
-    with pytest.raises(fflin.InputError, match="does not fit the given robot 'planar_detumble'"):
+    with pytest.raises(fflin.InputError, match="the given robot 'planar_detumble' lacks"):
         code.bind(fflin.load("planar_detumble"))
-    with pytest.raises(fflin.FileError, match="holds 0"):
+    with pytest.raises(fflin.FileError, match="contains 0"):
         fflin.CLaw(tmp_path / "nowhere")
     with pytest.raises(fflin.MissingPackageError, match="no C compiler"):
         fflin.CLaw(tmp_path, compiler="no_such_compiler")
@@ -296,7 +296,7 @@ def test_a_folder_holds_several_laws_and_none_is_lost(tmp_path):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
     fflin.write_c(fflin.OutputFeedback(lin, by), tmp_path, name="filter")
     fflin.write_c(fflin.lqr(lin, 2.0, 1.0), tmp_path)  # the same gain, tuned again
-    with pytest.raises(fflin.FileError, match="holds 2 pairs"):
+    with pytest.raises(fflin.FileError, match="contains 2 pairs"):
         fflin.CLaw(tmp_path)
     names = [fflin.CLaw(tmp_path, name=name).name for name in ("controller", "filter")]
     assert names == ["controller", "filter"]

@@ -359,7 +359,7 @@ def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
     refused(r"dt is 0.1 s for drake", to, robot, lin, "drake", dt=0.1)
     refused(r"dt is -1 s for mujoco", to, robot, lin, "mujoco", dt=-1.0)
     refused(r"sampled", to, robot, lin.discretize(0.1), "mujoco", dt=0.1)
-    refused(r"does not fit the given robot 'cubesat'", to, fflin.load("cubesat"), lin, "drake")
+    refused(r"the given robot 'cubesat' lacks", to, fflin.load("cubesat"), lin, "drake")
     arm = robot.replace(inputs=[fflin.JointTorque("*")])
     reduced = fflin.momentum_reduction(fflin.linearize(arm))
     refused(r"lin lacks some states", to, arm, reduced, "drake")

@@ -89,7 +89,7 @@ def test_what_is_no_motion_is_told_with_the_time_and_refused_where_asked():
         r"q has shape \(16, 19\), expected \(17, 19\)": (t, q[:-1], v, u),
         r"v has shape \(17, 11\), expected \(17, 12\)": (t, q, v[:, 1:], u),
         r"u has shape \(17, 11\), expected \(17, 12\)": (t, q, v, u[:, 1:]),
-        "u holds": (t, q, v, "none"),
+        "u contains": (t, q, v, "none"),
         r"at t = 0\.05 s: v\[0\] is nan": (
             t,
             q,

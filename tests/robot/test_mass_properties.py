@@ -161,7 +161,7 @@ def test_wheels_stay_in_what_carries_them():
     assert without.model.inertias[ROOT] == bare.model.inertias[ROOT]
     assert without.urdf_sha256 == heavy.urdf_sha256
     inertia = 1e-9 * np.eye(3)
-    with pytest.raises(fflin.InputError, match="carrier"):
+    with pytest.raises(fflin.InputError, match="link that carries it"):
         robot.with_mass_properties({"base": {"inertia": inertia}})
 
 

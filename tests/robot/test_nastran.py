@@ -126,7 +126,7 @@ def test_a_link_that_differs_from_the_file_is_told_and_may_be_replaced(files):
     others = sum(link.mass for name, link in robot.links.items() if name != "base")
     assert heavier.mass == pytest.approx(700.0 + others, rel=1e-9)
     twice = [read(op4, asm, frame="base", name=name, rigid=True) for name in ("one", "two")]
-    with pytest.raises(InputError, match="'two' is the second of its body"):
+    with pytest.raises(InputError, match="'two' is the second appendage"):
         robot.replace(appendages=twice)
 
 
