@@ -326,7 +326,7 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
     if motion.tracked and not motion.phases:
         said = f"tracking errors at the end: {_and([kind.last for kind in judged])}"
     elif failed := [kind.last for kind in moved if kind.late]:
-        said = f"not settled: the errors at the end are {_and(failed)}"
+        said = f"not settled: {_and(failed)} off target"
     elif moved:
         when = motion.t[max(kind.settled for kind in moved)]
         said = f"settled after {when:.3g}\u00a0s to within {100.0 * SETTLED:g}\u00a0%"
@@ -335,7 +335,7 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
     aside = {k.title: k.last for k in places if k.late and not k.steered}
     loose = not pushed(motion) and aside.pop("position", "")
     if aside:
-        said += f"; errors that are not controlled: {_and([*aside.values()])}"
+        said += f"; not controlled: {_and([*aside.values()])}"
     if loose:
         said += "; position is not controlled"
     return f"{said}; saturated inputs: {_full(motion)}"

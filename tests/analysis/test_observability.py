@@ -153,7 +153,7 @@ def test_gramians_that_do_not_exist(robots):
     for model in (lin, lin.discretize(0.1)):
         with pytest.raises(fflin.InputError, match="duration"):
             fflin.gramians(model)
-    with pytest.raises(fflin.InputError, match="horizon"):
+    with pytest.raises(fflin.InputError, match="duration is -1"):
         fflin.gramians(lin, -1.0)
     with pytest.raises(fflin.InputError, match="multiple"):
         fflin.gramians(lin.discretize(0.1), 0.25)

@@ -306,7 +306,7 @@ def test_feedback_along_a_trajectory_does_not_see_the_quaternions_sign():
     asked = policy(0.5, here, speed)
     assert np.abs(asked).max() > 1.0
     np.testing.assert_array_equal(policy(0.5, other, speed), asked)
-    with pytest.raises(fflin.InputError, match="LinearTrajectory"):
+    with pytest.raises(fflin.InputError, match="Trajectory"):
         fflin.TrajectoryFeedback(3, 4)
 
 

@@ -131,7 +131,7 @@ def test_samples_are_rigid_bodies_and_corners_that_are_none_are_counted():
     worst = of.worst(fflin.lqr(fflin.linearize(robot)), samples=20)
     assert bad and worst.tried == 20 + 4 - bad + 1
     assert worst.excluded == of.draws(20)[1] + bad
-    assert says(str(worst), f"{worst.excluded} draws")
+    assert says(str(worst), f"{worst.excluded} samples and corners")
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
