@@ -229,8 +229,8 @@ class Linearizer:
         "local", and f0 is zero. Trajectories require a moving reference, and so do relative
         equilibria such as a steady spin.
     engine : {"python", "compiled"}, optional
-        Engine for the accelerations of points with velocity, springs or forces: Python by
-        default, or the compiled kernel of sweeps. The Python engine and the compiled engine agree
+        Engine for the accelerations at operating points with velocity, springs or forces:
+        Python by default, or the compiled kernel of sweeps. The Python engine and the compiled engine agree
         to machine precision.
 
     Raises
