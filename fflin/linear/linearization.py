@@ -230,8 +230,8 @@ class Linearizer:
         equilibria such as a steady spin.
     engine : {"python", "compiled"}, optional
         Engine for the accelerations at operating points with velocity, springs or forces:
-        Python by default, or the compiled kernel of sweeps. The Python engine and the compiled engine agree
-        to machine precision.
+        Python by default, or the compiled kernel of sweeps. The Python engine and the compiled
+        engine agree to machine precision.
 
     Raises
     ------
