@@ -122,9 +122,10 @@ def controllability(lin: LinearModel) -> Controllability:
       test is applied: the rank of :math:`[A - p E, B]` is found from its singular values, with
       states scaled to units of energy.
 
-    A sampled model has the structure of its continuous model, with one exception: sampling makes
-    a vibration uncontrollable if its period divides the sample time. For a sampled model from a
-    file, only the sampled matrices are analysed.
+    A sampled model has the structure of its continuous model, with one exception: sampling may
+    map two poles to one. For example, a vibration is uncontrollable if the sample time is a
+    multiple of half its period. For a sampled model from a file, only the sampled matrices are
+    analysed.
 
     Every tolerance is a small multiple of the rounding error. `margin` compares the decisions with
     their tolerances, and `notes` lists decisions within rounding error.

@@ -149,9 +149,7 @@ def placement(name: str, value: Any) -> pin.SE3:
     if not np.isfinite(value.homogeneous).all():
         raise InputError(f"{name} has entries that are not finite")
     if not is_rotation(value.rotation):
-        raise InputError(
-            f"the matrix R of {name} is not a rotation; expected R^T R = I and det R = 1"
-        )
+        raise InputError(f"{name} is not a rotation matrix; expected R^T R = I and det R = 1")
     return pin.SE3(pin.Quaternion(value.rotation).normalized().matrix(), value.translation)
 
 

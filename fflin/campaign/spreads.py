@@ -65,7 +65,7 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     -------
     dict
         {name: spread}, the argument `dispersions` of `monte_carlo`. If a name or spread is
-        invalid, the error of `monte_carlo` names file and line.
+        invalid, `monte_carlo` raises an error with the file and the line.
 
     Raises
     ------

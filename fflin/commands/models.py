@@ -45,7 +45,7 @@ def add_commands(commands: parser.Commands) -> None:
         commands,
         "init",
         _init,
-        "write a first robot.toml for a URDF, with its inputs, limits and joints without a motor",
+        "write a first robot.toml for a URDF, with all inputs, limits and unactuated joints",
         example="fflin init my.urdf && fflin simulate my.toml",
     )
     urdf = "path of a URDF, or a robot name listed by `fflin robots`"

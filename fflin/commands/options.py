@@ -47,8 +47,8 @@ def add_robot(command: Command) -> None:
     command.add_argument("robot", metavar="ROBOT", type=input_name, help=what)
     command.group(ROBOT).add(
         "--lock",
-        "lock a joint at VALUE [rad|m]; by default at its neutral position. In all options, NAME "
-        "may be a pattern such as 'hinge_*'",
+        "lock a joint at VALUE [rad|m]; by default at its neutral position. In every option, "
+        "NAME can also be a pattern such as 'hinge_*'",
         lock,
         repeatable=True,
     )
@@ -158,9 +158,9 @@ def add_inputs_there(group: Group) -> None:
     )
     group.switch(
         "--equilibrium",
-        "apply the minimum-norm inputs that make the operating point an equilibrium under springs "
-        "and gravity, or a steady motion. Passive joints deflect their springs to balance the "
-        "load. If no inputs hold the point, the command reports an error",
+        "apply the minimum-norm inputs that make the operating point an equilibrium (or a steady "
+        "motion) under springs and gravity. Passive joints deflect their springs to balance the "
+        "load. If no inputs keep the robot at the operating point, the command reports an error",
     )
     group.add(
         "--relative-equilibrium",
@@ -179,8 +179,8 @@ def add_reference(group: Group) -> None:
     """Add the option for the reference of attitude and position."""
     group.add(
         "--reference",
-        "reference pose of attitude and position in the state: the base pose at the operating "
-        "point (base, default), or the world frame (world)",
+        "pose from which the attitude and position in the state are measured: the base pose at "
+        "the operating point (base, default), or the world frame (world)",
         choices=("base", "world"),
         default="base",
     )

@@ -61,7 +61,7 @@ def lqr(
     weights, each input has a phase margin of at least 60 deg and tolerates any gain factor above
     one half. With springs or gravity, each controllable mode decays as fast as without springs
     and gravity (10.8). ``gain.weights`` states the bandwidth, decay rate and damping of the loop,
-    and lists slower modes.
+    and lists the modes that decay more slowly.
 
     For a model with reaction wheels, only the controllable part is regulated, see (9.4) of
     docs/derivation.md; ``gain.regulated`` lists its states. Weights on the following states have
@@ -169,8 +169,8 @@ def acceleration_lqr(
     ----------
     lin : LinearModel
         Continuous model at rest, without gravity, orbit, springs or dampers. Every coordinate that
-        `lqr` regulates must be actuated. `sampled_cost` converts the weights Q and R of the
-        returned gain for a sampled regulator.
+        `lqr` regulates must be actuated. For a sampled regulator, give the weights Q and R of the
+        returned gain to `sampled_cost`.
     Qp, Qv, Ra : array_like (6 + n,) or float, or mapping
         Diagonal weights on the positions (q_b, r_b, q_m), the velocities and the accelerations.
         In a mapping {name: weight}, the names are positions for `Qp`, and velocities for `Qv` and

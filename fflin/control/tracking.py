@@ -51,7 +51,8 @@ class TrajectoryFeedback(Feedback):
         Result of `tvlqr`.
     held : bool
         Whether commands are held between samples; commands of a sampled schedule are always held.
-        With held commands, the command at the last knot already contains the holding inputs.
+        If commands are held, the command at the last knot includes the inputs that keep the
+        robot in the final state.
 
     Examples
     --------

@@ -112,7 +112,7 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
     elif (indices := dimension(what, value)) == 0:
         diagonal = np.full(size, number(what, value))
     elif indices == 1:
-        diagonal = vector(what, value, size, f"its diagonal, {names[0]} to {names[-1]}")
+        diagonal = vector(what, value, size, f"one weight for each of {names[0]} to {names[-1]}")
     else:
         return _checked_matrix(what, value, names, definite)
     lowest = int(diagonal.argmin())

@@ -178,7 +178,10 @@ class StateMap:
         return Chart.of(q[..., 3:7] @ turning.product_matrix(self.origin_quaternion).T)
 
     def rotation(self, q: Array) -> Array:
-        """Return the rotation matrix (3, 3) of refMb at a valid configuration, for any attitude."""
+        """Return the rotation matrix (3, 3) of refMb at a valid configuration.
+
+        The attitude may also be 180 deg from the reference, where the chart is singular.
+        """
         turned: Array = pin.XYZQUATToSE3(q[:7]).rotation
         return turned if self._aligned else self._rotation.dot(turned)
 

@@ -107,8 +107,8 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
     Raises
     ------
     InputError
-        If gain and model have different frames or sampling times, or belong to different robots:
-        each has states, or inputs, that the other lacks.
+        If gain and model have different frames or sampling times, or if they belong to different
+        robots (each has states or inputs that the other lacks).
 
     Examples
     --------

@@ -224,13 +224,14 @@ class Linearizer:
         default is the orbital frame.
     moving : bool
         Whether to return the error dynamics about a moving reference, which passes through the
-        point and obeys the dynamics of the robot. The error is q_b = vec(q*^-1 q), r_b = R*^T (p
-        - p*), the frame is "local", and f0 is zero. Trajectories, and relative equilibria such as
-          a steady spin, require a moving reference.
+        point and obeys the dynamics of the robot. The errors are
+        :math:`q_b = \mathrm{vec}(q^{*-1} q)` and :math:`r_b = R^{*T} (p - p^*)`, the frame is
+        "local", and f0 is zero. Trajectories require a moving reference, and so do relative
+        equilibria such as a steady spin.
     engine : {"python", "compiled"}, optional
-        Engine for the accelerations of points with velocity, springs or forces: Python by
-        default, or the compiled kernel of sweeps. The Python engine and the compiled engine agree
-        to machine precision.
+        Engine for the accelerations at operating points with velocity, springs or forces:
+        Python by default, or the compiled kernel of sweeps. The Python engine and the compiled
+        engine agree to machine precision.
 
     Raises
     ------

@@ -165,7 +165,7 @@ class Thruster(WrenchInput):
         Limits [N], at least 0: a thruster never pulls. Keyword only, like all parameters that
         follow.
     on_off : bool
-        Whether the thruster can only fire with `max` or be off. `simulate` then replaces the
+        True if the thruster has no thrust between zero and `max`. `simulate` then replaces the
         command of each sample by one pulse of `max`, whose length is a whole number of steps. The
         remaining impulse is added to the next sample, so that the mean impulse is correct.
     least_impulse : float, optional

@@ -160,8 +160,8 @@ def _kept(key: Any, gone: list[str], left: tuple[str, ...]) -> bool:
 def load_inputs(path: str | Path) -> tuple[Input, ...]:
     """Read the inputs of a robot from a TOML file.
 
-    The file is an array of tables ``[[input]]``, in the order of u. Each table has a ``type``
-    and the keys of this type, which are the parameters of the class:
+    The file is an array of tables ``[[input]]``, in the order of u. In each table,
+    ``type`` selects the class of the input. The other keys are the parameters of this class:
 
     ==================  =========================================================
     ``type``            keys

@@ -348,7 +348,7 @@ def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
     refused(r"w, x, y, z has length 1.1, expected 1", back, robot, "drake", q)
     q = lin.to("spart").q.copy()
     q[0] = -1.0
-    refused(r"the matrix R of R0 \(q\[:9\] by columns\) is not a rotation", back, robot, "spart", q)
+    refused(r"R0 \(q\[:9\] by columns\) is not a rotation matrix", back, robot, "spart", q)
     up = fflin.configuration(
         robot, {}, pin.SE3(pin.rpy.rpyToMatrix(0.3, np.pi / 2, 0.0), np.zeros(3))
     )

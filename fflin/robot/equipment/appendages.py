@@ -501,5 +501,7 @@ def _text(what: str, value: Any) -> str:
     if not isinstance(value, str) or not value.strip() or not value.isprintable():
         raise InputError(f"{what} of an appendage is {value!r}, expected a name")
     if what == "name" and set(value) & set("*?[]"):
-        raise InputError(f"name of an appendage is {value!r}, which is a pattern; give a name")
+        raise InputError(
+            f"name of an appendage is {value!r}, expected a name without *, ?, [ and ]"
+        )
     return value
