@@ -50,7 +50,9 @@ class Progress:
         said = f"\r{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left "
         print(said, end="", file=sys.stderr, flush=True)
 
-    __call__ = update
+    def __call__(self, done: int, total: int) -> None:
+        """Update the bar."""
+        self.update(done, total)
 
     def close(self) -> None:
         """Take the bar away."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import combinations, islice, product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array
@@ -19,6 +18,9 @@ from fflin.robot.equipment.wheels import carrier
 from fflin.robot.inputs import named_wheels
 from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 _FACETS = 20_000  # normals that are computed at once
 _MANY = 36  # thrusters, which have 400 000 facets

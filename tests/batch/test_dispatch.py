@@ -215,7 +215,7 @@ def test_there_are_no_more_workers_than_cores(robot):
         workers = OwnWorkers(10**6)
     workers.shutdown()
     assert workers._max_workers == cores
-    assert dispatching._count(workers) == cores
+    assert dispatching.worker_count(workers) == cores
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity")
@@ -367,7 +367,7 @@ def test_dask(robot):
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
-        assert dispatching._count(client.get_executor()) == 2
+        assert dispatching.worker_count(client.get_executor()) == 2
         configurations = fflin.random_configurations(robot, 400, seed=1)
         expected = fflin.sweep(robot, configurations)
         q, v, u = points(robot, 30)

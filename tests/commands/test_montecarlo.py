@@ -120,7 +120,9 @@ INTERRUPTED = """
 import os, signal, sys
 from fflin.base import process
 from fflin.__main__ import main
+counted = process.Progress.update
 def update(bar, done, total):
+    counted(bar, done, total)
     if done >= 32:
         os.kill(os.getpid(), signal.SIG_HOW)
 process.Progress.update = update

@@ -125,7 +125,9 @@ INTERRUPTED = """
 import os, signal, sys
 from fflin.base import process
 from fflin.__main__ import main
+counted = process.Progress.update
 def update(bar, done, total):
+    counted(bar, done, total)
     os.killpg(0, signal.SIGINT)
 process.Progress.update = update
 sys.exit(main())

@@ -134,7 +134,7 @@ def test_what_is_planned_is_flown(servicer, tmp_path):
     assert missed(robot, motion, run.q[-1], run.v[-1]) < 1e-5
     motion.save(tmp_path / "plan.csv")
     header, first, *_ = (tmp_path / "plan.csv").read_text().splitlines()
-    assert header.endswith("hold,frame") and first.endswith("previous,local")
+    assert header.endswith("hold,frame,sha256") and first.split(",")[-3:-1] == ["previous", "local"]
     read = fflin.Trajectory.load(tmp_path / "plan.csv", robot)
     assert (read.u == motion.u).all() and (read.hold, read.frame) == ("previous", "local")
 
