@@ -248,7 +248,8 @@ def short_help(command: argparse.ArgumentParser) -> str:
     del options["help"]
     common = [name.replace("-", "_") for name in command.get_default("common")] or list(options)
     formatter = argparse.HelpFormatter(command.prog, max_help_position=30)
-    operands = " ".join(str(each.metavar) for each in arguments)
+    required = [f"{each.option_strings[-1]} {each.metavar}" for each in every if each.required]
+    operands = " ".join([*(str(each.metavar) for each in arguments), *required])
     formatter.add_text(" ".join(f"usage: {command.prog} {operands} [options]".split()))
     formatter.add_text(command.description)
     for title, actions in (

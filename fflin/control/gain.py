@@ -268,7 +268,8 @@ def one_sided(gain: Gain) -> str:
     return (
         f"the design requires thrusters to pull ({listed(thrusters)}): negative thrust is cut at "
         "zero, so the poles and margins do not hold; design with torque and force on the base, "
-        "and allocate them to thrusters with fflin.Allocation (fflin simulate --allocate)"
+        "and allocate them to thrusters with fflin.Allocation. `fflin simulate` "
+        "allocates by default if the thrusters push in every direction"
     )
 
 

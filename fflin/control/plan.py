@@ -184,7 +184,7 @@ def plan(
     raise InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
         f"last trial {listed(by) if by else 'diverges'}; give a longer duration, wider limits, "
-        "more knots, or list states with a free end value in `free`"
+        "more knots, or name states with a free end value by `free` (--free-end)"
     )
 
 

@@ -152,13 +152,13 @@ class Check:
         if failures := self.failures:
             names = [f"{row.block} ({row.test})" for row in failures[:6]]
             names += ["..."] * (len(failures) > 6)
-            said = f"{len(failures)} of {len(self.rows)} errors FAILED: {', '.join(names)}"
+            said = f"{len(failures)} of {len(self.rows)} comparisons FAILED: {', '.join(names)}"
             verdict = f"A and B are not verified: {said}"
         else:
             largest = max(self.rows, key=lambda row: row.error)
             said = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
             verdict = f"A and B are verified: largest error {said}"
-        title = f"{self.title}, {len(self.rows)} errors"
+        title = f"{self.title}, {len(self.rows)} comparisons"
         blocks = [row for row in self.rows if row.test in _ROUTES]
         parts = [folded([verdict]), folded([title]), _block_table(blocks)]
         rest, exact = [["figure", "error", "allowed"]], list[str]()

@@ -139,7 +139,7 @@ def test_report_fits_80_columns():
     robot = fflin.load("tiago_dual")
     text = str(fflin.check(robot, fflin.linearize(robot)))
     assert max(map(len, text.splitlines())) <= 80
-    assert text.startswith("A and B are verified: largest error") and "123 errors" in text
+    assert text.startswith("A and B are verified: largest error") and "123 comparisons" in text
 
 
 def test_rounding_of_a_large_acceleration_is_no_failure():
