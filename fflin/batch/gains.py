@@ -151,8 +151,8 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     For fully actuated models at rest, many gains are computed together:
 
     1. With L the lower half of B, factorise :math:`L R^{-1} L^T = L_s L_s^T`. The factor defines
-    coordinates :math:`(p, \dot p)` in which the weight on :math:`\ddot p` is the identity. 2.
-    Solve an eigenproblem of half the Hamiltonian's size (see `lqr`) for the poles and modes of
+       coordinates :math:`(p, \dot p)` in which the weight on :math:`\ddot p` is the identity.
+    2. Solve an eigenproblem of half the Hamiltonian's size (see `lqr`) for the poles and modes of
        the closed loop. Inputs u and states x of the modes give :math:`K = -u\,x^{-1}`.
     3. Refine each solution by Newton's method, and compute the residual of its Riccati equation.
 
