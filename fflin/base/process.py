@@ -37,8 +37,8 @@ class Progress:
         on = f"{cores} core{'s' * (cores != 1)}"
         print(f"fflin: about {float(f'{size:.2g}'):g} {unit} on {on}", file=sys.stderr)
 
-    def update(self, done: int, total: int, what: str = "") -> None:
-        """Say how many steps of how many are done, and of `what`."""
+    def __call__(self, done: int, total: int, what: str = "") -> None:
+        """Update the bar: `done` of `total` steps of `what`."""
         self.done, self.total = done, total
         if not self._shown or (now := time.monotonic()) < self._next:
             return
@@ -49,10 +49,6 @@ class Progress:
         self._drawn = True
         said = f"\r{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left "
         print(said, end="", file=sys.stderr, flush=True)
-
-    def __call__(self, done: int, total: int) -> None:
-        """Update the bar."""
-        self.update(done, total)
 
     def close(self) -> None:
         """Take the bar away."""

@@ -200,13 +200,6 @@ def check_distinct(*targets: Path | None) -> None:
         seen.append(target)
 
 
-def reserve(path: Path) -> None:
-    """Reserve disk space for the full size of a file, or raise `OSError`."""
-    if hasattr(os, "posix_fallocate"):
-        with path.open("r+b") as file:
-            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
-
-
 def reason(error: Exception) -> str:
     """Return why a file could not be opened, in a line."""
     said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)

@@ -1,4 +1,4 @@
-"""Files with arrays of many rows: npz, and HDF5 whose arrays are read on demand.
+"""Arrays of many rows, in memory and in files: npz, and HDF5 whose arrays are read on demand.
 
 An HDF5 file has a dataset for each array and two datasets of checksums. ``chunk_sha256`` has the
 checksum of each chunk of rows, whose size is the attribute ``chunk``. ``sha256`` is the checksum of
@@ -8,18 +8,29 @@ those and of all other content.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+import os
+import shutil
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fflin.base.errors import MissingPackageError
+from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.base.record import CHECKSUM, DAMAGED, content_digest, verify_checksum
 from fflin.base.validation import Array
-from fflin.base.writing import check_ending, replacing
+from fflin.base.writing import (
+    as_path,
+    check_ending,
+    check_output_path,
+    install,
+    reason,
+    replacing,
+)
 
 FORMATS = (".npz", ".h5")
 
@@ -29,6 +40,9 @@ CHECKED = ("v108", "v108")
 
 CHUNK_CHECKSUMS = f"chunk_{CHECKSUM}"
 _CHUNK_BYTES = 2**22
+
+# Allowance for what an HDF5 file has besides its rows: names, constant arrays, checksums [bytes].
+_OVERHEAD = 2**16
 
 
 def check_format(path: Path) -> None:
@@ -160,3 +174,187 @@ def _mapped(path: Path, dataset: Any) -> Array:
         path, dtype=dataset.dtype, mode="r", offset=offset, shape=dataset.shape
     )
     return result
+
+
+class MemoryStore:
+    """Arrays of `count` rows in memory."""
+
+    part = None  # there is no file
+
+    def __init__(self, count: int, chunk: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        self.count, self.chunk = count, chunk
+        try:
+            self.arrays = {key: np.empty((count, *shape)) for key, shape in shapes.items()}
+        except (MemoryError, ValueError):
+            raise InputError(
+                f"{count:,} rows do not fit into memory; write them to a file with "
+                "out='NAME.h5', or choose fewer"
+            ) from None
+
+    def finished(self, start: int, stop: int) -> bool:
+        """Return whether a chunk is there already."""
+        return False
+
+    def read(self, stop: int) -> dict[str, Array]:
+        """Return the rows before one."""
+        return self.view(0, stop)
+
+    def view(self, start: int, stop: int) -> dict[str, Array]:
+        """Return the arrays that a chunk is written to."""
+        return {key: value[start:stop] for key, value in self.arrays.items()}
+
+    def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
+        """Keep a finished chunk."""
+        for key, rows in self.view(start, stop).items():
+            if not np.may_share_memory(rows, arrays[key]):
+                rows[:] = arrays[key]
+
+    def close(self) -> None:
+        """Do nothing: memory needs no closing."""
+
+    discard = close
+
+
+class FileStore:
+    """Arrays of `count` rows in an HDF5 file, NAME.part until it is complete."""
+
+    def __init__(
+        self,
+        path: Path,
+        request: str,
+        count: int,
+        chunk: int,
+        shapes: Mapping[str, tuple[int, ...]],
+        constants: Mapping[str, Array],
+        texts: Mapping[str, str],
+    ) -> None:
+        self.path, self.part, self.count = path, part_of(path), count
+        self._names, self._constants, self._texts = tuple(shapes), constants, texts
+        self.resumed = self.part.exists()
+        with self._reported():
+            if not self.resumed:
+                size = 8 * count * sum(map(math.prod, shapes.values()))
+                _reserve(self.part, size + _OVERHEAD)
+            self._file = hdf5().File(self.part, "r+" if self.resumed else "w", libver=CHECKED)
+        try:
+            with self._reported():
+                self._begin(request, chunk, shapes)
+        except BaseException:
+            (self.close if self.resumed else self.discard)()
+            raise
+
+    def _begin(self, request: str, chunk: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        attributes, create = self._file.attrs, self._file.require_dataset
+        if self.resumed and attributes.get("request") != request:
+            raise FileError(
+                f"{self.part} is the unfinished file of another call; remove it, or choose "
+                "another name"
+            )
+        self.chunk = int(attributes.get("chunk", chunk))
+        if not self.resumed:
+            properties = hdf5().h5p.create(hdf5().h5p.DATASET_CREATE)
+            properties.set_alloc_time(hdf5().h5d.ALLOC_TIME_EARLY)
+            properties.set_fill_time(hdf5().h5d.FILL_TIME_NEVER)
+            for key, shape in shapes.items():
+                whole = (self.count, *shape)
+                self._file.create_dataset(key, whole, np.float64, dcpl=properties)
+        for key, value in self._constants.items():
+            create(key, value.shape, value.dtype)[...] = value
+        create(CHUNK_CHECKSUMS, (-(-self.count // self.chunk), 32), np.uint8)
+        create(CHECKSUM, (32,), np.uint8)
+        attributes.update({**self._texts, "chunk": self.chunk, "request": request})
+        self._file.flush()
+        _reserve(self.part, self.part.stat().st_size)
+
+    @contextmanager
+    def _reported(self) -> Iterator[None]:
+        """Turn the errors of HDF5 into a `FileError`."""
+        try:
+            yield
+        except FileError:
+            raise
+        except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+            hint = "; if no other run uses it, remove it to start again" * self.resumed
+            raise FileError(
+                f"{self.part}: cannot be read or written: {reason(error)}{hint}"
+            ) from None
+
+    def finished(self, start: int, stop: int) -> bool:
+        """Return whether a chunk is in the file and matches its checksum."""
+        with self._reported():
+            kept = self._file[CHUNK_CHECKSUMS][start // self.chunk]
+            return bool(kept.any()) and kept.tobytes() == chunk_checksum(
+                {key: self._file[key][start:stop] for key in self._names}
+            )
+
+    def read(self, stop: int) -> dict[str, Array]:
+        """Return the rows before one."""
+        with self._reported():
+            return {key: self._file[key][:stop] for key in self._names}
+
+    def view(self, start: int, stop: int) -> None:
+        """Return no arrays: a chunk is made elsewhere and then written."""
+
+    def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
+        """Keep a finished chunk."""
+        with self._reported():
+            for key in self._names:
+                self._file[key][start:stop] = arrays[key]
+            self._file.flush()
+            checksum = chunk_checksum({key: arrays[key] for key in self._names})
+            self._file[CHUNK_CHECKSUMS][start // self.chunk] = np.frombuffer(checksum, np.uint8)
+            self._file.flush()
+
+    def complete(self) -> None:
+        """Add the checksum of the whole file, and give the file its name."""
+        with self._reported():
+            checksums = self._file[CHUNK_CHECKSUMS][:]
+            self._file[CHECKSUM][:] = file_checksum(
+                self._texts, self.chunk, checksums, self._constants
+            )
+            self._file.close()
+            install(self.part, self.path)
+
+    def discard(self) -> None:
+        """Leave nothing behind."""
+        self.close()
+        self.part.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Leave the unfinished file for another run."""
+        self._file.close()
+
+
+def _reserve(path: Path, size: int) -> None:
+    """Reserve disk space for a file, since HDF5 can crash the process where the disk is full."""
+    try:
+        with path.open("ab") as file:
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def require_room(path: Path, size: int) -> None:
+    """Raise `FileError` if a file of this size [bytes] does not fit on the disk."""
+    if size > (free := shutil.disk_usage(path.parent).free):
+        raise FileError(
+            f"{path} needs {size / 1e9:,.4g} GB, but only {free / 1e9:,.4g} GB are free; free "
+            "space, or choose fewer rows"
+        )
+
+
+def output_path(out: str | Path) -> Path:
+    """Return the path of a file that can be written, or raise `FileError`."""
+    path = as_path(out)
+    check_format(path)
+    check_output_path(path)
+    check_output_path(part_of(path))
+    return path
+
+
+def part_of(path: Path) -> Path:
+    """Return the path NAME.part of an unfinished result, next to the target of a link."""
+    real = Path(os.path.realpath(path)) if os.path.islink(path) else path
+    return real.with_name(real.name + ".part")

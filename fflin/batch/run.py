@@ -1,43 +1,41 @@
 """Run of a job over rows, chunk by chunk, into a store that may already contain chunks.
 
-Chunks run on threads of this process, or on the workers of an executor; a chunk is repeated if its
-worker dies. This module is independent of the meaning of the rows and of the job's results.
+Chunks run on threads of this process, or on the workers of an executor. This module is independent
+of the meaning of the rows and of the job's results.
 """
 
 from __future__ import annotations
 
+import os
 import pickle
+import signal
 import warnings
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
-    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
     wait,
 )
+from contextlib import contextmanager
 from functools import lru_cache
+from multiprocessing import get_context, parent_process
+from threading import Thread
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
 from fflin.base.validation import Array, whole
-from fflin.batch.store import FileStore, MemoryStore
-from fflin.batch.workers import NoWorkers, WorkerDied
-
-# A chunk whose worker dies is given to another, up to this many times.
-_ATTEMPTS = 3
+from fflin.batch.files import FileStore, MemoryStore
+from fflin.kernel.compiled import available_cores
 
 # Chunks that are submitted for each worker at a time, so that none is idle between two.
 _QUEUED = 2
-
-# How often the worker processes are checked while no chunk is finished [s].
-_POLL_PERIOD = 1.0
 
 # Assumed of an executor that does not tell how many workers it has.
 _UNKNOWN_WORKERS = 16
@@ -123,7 +121,7 @@ def run_chunks(
     for done in (
         _run_here(job, rows, store, left, threads)
         if executor is None
-        else Dispatch(job, rows, left, executor)
+        else _run_on_workers(job, rows, left, executor)
     ):
         if done.result is None:
             failed.append(done)
@@ -199,101 +197,76 @@ def _run_here(
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-class Dispatch:
-    """Waiting and running chunks, the number of attempts for each, and the workers."""
+def _run_on_workers(job: Job, rows: Rows, spans: list[Span], executor: Executor) -> Iterator[Done]:
+    pickled, ahead = pickle.dumps(job), _QUEUED * worker_count(executor)
+    waiting, running = deque(spans), dict[Future[ChunkResult], Span]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < ahead:
+                span = waiting.popleft()
+                try:
+                    future = executor.submit(work, pickled, rows(*span), span.start)
+                except Exception as error:  # broken, shut down, or of its own
+                    yield Done(span, None, _reason(error))
+                else:
+                    running[future] = span
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                span = running.pop(future)
+                try:
+                    done = Done(span, future.result(), "")
+                except Exception as error:  # each executor has its own
+                    done = Done(span, None, _reason(error))
+                yield done
+    finally:
+        for future in running:
+            future.cancel()
 
-    def __init__(self, job: Job, rows: Rows, spans: list[Span], workers: Executor) -> None:
-        self._job = pickle.dumps(job)
-        self._rows, self._workers, self._ahead = rows, workers, _QUEUED * worker_count(workers)
-        self._waiting = spans[::-1]
-        self._running: dict[Future[ChunkResult], Span] = {}
-        self._attempts: Counter[Span] = Counter()
-        self._broken: BaseException | None = None
 
-    def __iter__(self) -> Iterator[Done]:
-        try:
-            while self._waiting or self._running:
-                while self._waiting and len(self._running) < self._ahead and not self._broken:
-                    self._submit(self._waiting.pop())
-                if self._running:
-                    yield from self._finished()
-                if self._broken:
-                    yield from self._given_up(self._broken)
-        finally:
-            for future in self._running:
-                future.cancel()
+def _reason(error: Exception) -> str:
+    """Return why a chunk failed."""
+    if isinstance(error, FflinError):
+        return str(error)
+    hint = ""
+    if isinstance(error, BrokenExecutor):
+        hint = (
+            "; a worker was killed, for example because the memory was full, or could not start: "
+            'call fflin under `if __name__ == "__main__":`'
+        )
+    return f"the executor failed: {type(error).__name__}: {error}".rstrip(": ") + hint
 
-    def _submit(self, span: Span) -> None:
-        """Begin a chunk, or put it back where the executor is dead."""
-        rows = self._rows(*span)
-        try:
-            future = self._workers.submit(work, self._job, rows, span.start)
-        except Exception as error:  # broken, shut down, or of its own
-            self._waiting.append(span)
-            self._broken = error
-        else:
-            self._attempts[span] += 1
-            self._running[future] = span
 
-    def _finished(self) -> Iterator[Done]:
-        """Wait for a chunk and yield what is finished."""
-        for future in self._wait():
-            span = self._running.pop(future)
-            try:
-                chunk = future.result()
-            except FflinError as error:
-                yield Done(span, None, str(error))
-            except WorkerDied as error:
-                yield from self._lost(span, str(error))
-            except (BrokenExecutor, CancelledError) as error:
-                self._broken = self._broken or error
-                self._waiting.append(span)
-            except Exception as error:
-                # Executors have errors of their own, such as of a scheduler that lost a worker.
-                yield from self._lost(span, f"{type(error).__name__}: {error}")
-            else:
-                yield Done(span, chunk, "")
+@contextmanager
+def executor_of(executor: Executor | None, workers: int | None) -> Iterator[Executor | None]:
+    """Yield the given executor, or an executor of new processes that end with this context."""
+    if not workers:
+        yield executor
+        return
+    cores = available_cores()
+    if workers > cores:
+        said = f"{workers} workers requested, but only {cores} cores are available; using {cores}"
+        warnings.warn(said, FflinWarning, stacklevel=4)
+    # A fork would copy locks that other threads hold.
+    pool = ProcessPoolExecutor(min(workers, cores), get_context("spawn"), _prepare_worker)
+    try:
+        yield pool
+    finally:
+        processes = [*(pool._processes or {}).values()]
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:  # after Ctrl-C they are in the middle of a chunk
+            process.terminate()
 
-    def _wait(self) -> set[Future[ChunkResult]]:
-        pool = self._workers if isinstance(self._workers, ProcessPoolExecutor) else None
-        hung = False
-        while not (
-            done := wait(self._running, _POLL_PERIOD if pool else None, FIRST_COMPLETED).done
-        ):
-            assert pool is not None
-            processes = list((pool._processes or {}).values())
-            if hung:
-                # It waits for the rest of a result whose worker was killed as it sent it, as long
-                # as anybody could still write to the pipe that all workers and this process share.
-                # Where nobody can, it finds itself broken, and its futures with it.
-                for process in processes:
-                    process.kill()
-                channel: Any = pool._result_queue
-                channel._writer.close()
-            hung = any(process.exitcode not in (None, 0) for process in processes)
-        return done
 
-    def _lost(self, span: Span, reason: str) -> Iterator[Done]:
-        """Queue a chunk again whose worker died, or report its failure."""
-        if self._attempts[span] < _ATTEMPTS:
-            self._waiting.append(span)
-        else:
-            yield Done(span, None, reason)
+def _prepare_worker() -> None:
+    """Leave Ctrl-C to the calling process, and end this process when the caller ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    caller = parent_process()
+    assert caller is not None
 
-    def _given_up(self, error: BaseException) -> Iterator[Done]:
-        """Yield the chunks that an executor took with it when it died."""
-        reason = f"the executor failed: {type(error).__name__}: {error}".rstrip(": ")
-        if isinstance(error, NoWorkers):
-            reason = str(error)
-        running, self._running = self._running, {}
-        waiting, self._waiting = self._waiting, []
-        for future, span in running.items():
-            # Some were finished before it died.
-            good = future.done() and not future.cancelled() and future.exception() is None
-            chunk = future.result() if good else None
-            yield Done(span, chunk, "" if chunk is not None else reason)
-        for span in reversed(waiting):
-            yield Done(span, None, reason)
+    def end() -> None:
+        caller.join()
+        os._exit(1)
+
+    Thread(target=end, daemon=True).start()
 
 
 def work(job: bytes, rows: Any, start: int) -> ChunkResult:

@@ -7,9 +7,8 @@ import logging
 import math
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
-from contextlib import closing, nullcontext
+from contextlib import closing
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import __version__
-from fflin.base.errors import FileError
-from fflin.base.record import NoRoomError, content_digest
+from fflin.base.record import content_digest
 from fflin.base.validation import Array, frozen
 from fflin.batch.chunks import ChunkJob
 from fflin.batch.configurations import (
@@ -27,11 +25,10 @@ from fflin.batch.configurations import (
     as_configurations,
     content,
 )
+from fflin.batch.files import FileStore, MemoryStore, output_path
 from fflin.batch.linear_batch import AT_ROOT, LinearBatch, fields_of_model
 from fflin.batch.rows import Points, checked_inputs, checked_velocities, column
-from fflin.batch.run import Progress, check_workers, failure, run_chunks
-from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
-from fflin.batch.workers import OwnWorkers
+from fflin.batch.run import Progress, check_workers, executor_of, failure, run_chunks
 from fflin.kernel.compiled import available_cores
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
@@ -94,8 +91,8 @@ def sweep(
         Executor whose workers process the chunks: processes, dask (``Client.get_executor()``) or
         mpi4py.futures. The executor is not shut down.
     workers : int, optional
-        Number of worker processes to start, at most one per core. A process that dies is replaced.
-        With workers, call `sweep` under ``if __name__ == "__main__":``.
+        Number of worker processes to start, at most one per core. With workers, call `sweep` under
+        ``if __name__ == "__main__":``.
     threads : int, optional
         Number of threads of the compiled code; by default one for each available core.
     chunk : int, optional
@@ -105,8 +102,8 @@ def sweep(
         Function ``progress(done, total)``, called after every chunk with the numbers of finished
         points and of all points.
     out : str or Path, optional
-        File to write, .h5 or .npz. Chunks are first written to NAME.part. After a crash, the same
-        call resumes with the intact chunks in NAME.part.
+        File to write, .h5 or .npz. For .h5, chunks are first written to NAME.part. After a crash,
+        the same call resumes with the intact chunks in NAME.part.
 
     Returns
     -------
@@ -122,7 +119,7 @@ def sweep(
     UnknownNameError
         If the engine does not exist.
     SweepError
-        If a point cannot be linearised, or a worker dies repeatedly. The message names the chunk;
+        If a point cannot be linearised, or a worker dies. The message names the chunks;
         `SweepError.batch` or the file contains the results of the other chunks.
     FileError, MissingPackageError
         If the file cannot be written.
@@ -145,13 +142,12 @@ def sweep(
     points = as_configurations(robot, q)
     options: Any = {"frame": frame, "reference": reference, "moving": moving}
     job = ChunkJob(robot, at_rest=v is None and u is None, engine=engine, **options)
-    check_room(len(points), len(points) * _row_bytes(job), path)
     task = SweepTask(job, points, v, u)
     parallel = executor is not None or workers is not None
     threads = threads or available_cores()
     shares = (_SHARES, 1) if parallel else (4 * threads, threads)
     store = _store(task, path, chunk or _chunk_size(task, *shares))
-    with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
+    with closing(store), executor_of(executor, workers) as others:
         if others is None and not job.compiled:
             threads = 1
         failed = run_chunks(
@@ -192,7 +188,7 @@ def _chunk_size(task: SweepTask, shares: int, threads: int) -> int:
 
 def _store(task: SweepTask, path: Path | None, size: int) -> FileStore | MemoryStore:
     given, shapes = task.given(), {**task.job.shapes, "q": (task.robot.nq,)}
-    if path is None or (path.suffix == ".npz" and find_spec("h5py") is None):
+    if path is None or path.suffix == ".npz":
         held = {key: shape for key, shape in shapes.items() if key not in given}
         return MemoryStore(task.count, size, held)
     shapes |= {key: rows.shape[1:] for key, rows in given.items()}
@@ -205,35 +201,19 @@ def _store(task: SweepTask, path: Path | None, size: int) -> FileStore | MemoryS
 
 
 def _finish(task: SweepTask, store: FileStore | MemoryStore, path: Path | None) -> LinearBatch:
-    if isinstance(store, MemoryStore):
-        batch = _in_memory(task, store)
-        if path is not None:
-            batch.save(path)
-        return batch
-    store.complete()
-    if store.path.suffix != ".npz":
-        return _written(store.path, task)
-    try:
-        _written(store.part, task).save(store.path)
-        batch = _written(store.path, task)
-    except (MemoryError, NoRoomError):
-        raise FileError(
-            f"{store.path}: not enough memory to write .npz; the complete result is in "
-            f"{store.part}, an HDF5 file: rename it to end in .h5, and give out= an .h5 file next "
-            "time"
-        ) from None
-    store.part.unlink()
+    if isinstance(store, FileStore):
+        store.complete()
+        # This call has written the file, so that its checksums need no check.
+        return replace(LinearBatch.load(store.path, task.robot, verify=False), verified=True)
+    batch = _in_memory(task, store)
+    if path is not None:
+        batch.save(path)
     return batch
 
 
 def _in_memory(task: SweepTask, store: FileStore | MemoryStore) -> LinearBatch:
     assert isinstance(store, MemoryStore)
     return task.batch(task.given() | store.arrays)
-
-
-def _written(path: Path, task: SweepTask) -> LinearBatch:
-    """Read a file that this call has written, whose checksums need no check."""
-    return replace(LinearBatch.load(path, task.robot, verify=False), verified=True)
 
 
 # Attributes of a robot that, with its model and its mappings, tell it from others.

@@ -247,7 +247,7 @@ class Dispersions:
         try:
             for done in (*range(1, min(_PART, runs)), *range(_PART, runs, _PART), runs):
                 self._drawn(column, (done - 1) // _BLOCK, (done - 1) % _BLOCK + 1)
-                bar.update(done, runs, f"drawing '{column.name}', {done:,} of {runs:,} ")
+                bar(done, runs, f"drawing '{column.name}', {done:,} of {runs:,} ")
         finally:
             bar.close()
 

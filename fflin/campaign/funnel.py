@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -30,8 +29,7 @@ from fflin.base.validation import (
     whole,
 )
 from fflin.base.writing import as_path
-from fflin.batch.run import Progress, check_workers
-from fflin.batch.workers import OwnWorkers
+from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import KINDS
@@ -377,7 +375,7 @@ def funnel(
     for job in jobs:
         job.choose(engine)
     tried, outcomes = np.empty(len(jobs)), np.empty((len(jobs), samples))
-    with OwnWorkers(workers) if workers else nullcontext(executor) as others:
+    with executor_of(executor, workers) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))

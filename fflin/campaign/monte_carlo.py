@@ -7,9 +7,8 @@ import math
 import pickle
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import closing, nullcontext
+from contextlib import closing, suppress
 from dataclasses import fields, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,18 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import __version__
-from fflin.base.errors import FflinError, FileError, InputError, unknown
-from fflin.base.record import content_digest
+from fflin.base.errors import FileError, InputError, unknown
+from fflin.base.record import content_digest, reading
 from fflin.base.validation import share, truth, whole
-from fflin.batch.files import hdf5
-from fflin.batch.run import Progress, check_workers, failure, run_chunks
-from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
-from fflin.batch.workers import OwnWorkers
+from fflin.batch.files import (
+    FileStore,
+    MemoryStore,
+    output_path,
+    part_of,
+    read_rows,
+    require_room,
+)
+from fflin.batch.run import Progress, check_workers, executor_of, failure, run_chunks
 from fflin.campaign.campaign import NOT_RUN, Campaign
 from fflin.campaign.runs import CampaignJob, chunk_size, expect
 from fflin.campaign.spreads import placed
@@ -143,9 +147,9 @@ def monte_carlo(
         Number of evenly spaced times at which the errors and inputs of each run are recorded. The
         bands of `plot_campaign` require histories.
     out : str or Path, optional
-        File to write, .h5 or .npz. Unfinished results are kept in NAME.part. After a crash, the
-        same call resumes from the intact chunks in NAME.part. If a .h5 file already contains all
-        of these runs, the file is read, even if its goals differ.
+        File to write, .h5 or .npz. The unfinished results of a .h5 file are kept in NAME.part.
+        After a crash, the same call resumes from the intact chunks in NAME.part. If the file
+        already contains all of these runs, the file is read, even if its goals differ.
     overwrite : bool
         Whether to replace the file `out` if a different call wrote the file. By default, such a
         file is an error.
@@ -197,11 +201,15 @@ def monte_carlo(
     width, confidence = share("width", width), share("confidence", confidence)
     check_workers(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
-    _require_own(path, truth("overwrite", overwrite))
     options |= {"duration": duration, "histories": whole("histories", histories, 0)}
     job = CampaignJob(robot, policy, dispersions, seed, "", options)
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
-    check_room(runs, 8 * runs * sum(map(math.prod, shapes.values())), path, "runs")
+    threads = threads or available_cores()
+    size = _chunk(runs, chunk, workers or threads, until is not None)
+    in_memory = path is None or path.suffix == ".npz"
+    store: Any = MemoryStore(runs, size, shapes) if in_memory else None
+    if path and not in_memory and not part_of(path).exists():
+        require_room(path, 8 * runs * sum(map(math.prod, shapes.values())))
     if executor or workers:
         _require_sendable(job)
     job.choose(engine)
@@ -209,13 +217,14 @@ def monte_carlo(
     header["goals"] = _goals(goals, until, shapes, header)
     with placed(dispersions):
         job.dispersions.require_possible(runs)
-    threads = threads or available_cores()
-    size = _chunk(runs, chunk, workers or threads, until is not None)
-    request = _request(job, header, path, overwrite) if path else ""
-    if until is None and (earlier := _found(job, path, request, header)):
-        return earlier
-    store = _store(path, request, header, size, shapes)
-    with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
+    request = _request(job, header) if path else ""
+    earlier = _earlier(path, request) if path and not truth("overwrite", overwrite) else None
+    if earlier and until is None and len(earlier) == runs:
+        return replace(earlier, goals=tuple(header["goals"]), confidence=confidence, _job=job)
+    if path and not in_memory:
+        texts = {"header": json.dumps(header), "constant": "[]"}
+        store = FileStore(path, request, runs, size, shapes, {}, texts)
+    with closing(store), executor_of(executor, workers) as others:
         how: Any = {"executor": others, "progress": progress}
         how["threads"] = threads if job.engine == "compiled" else 1
         expect(progress, [(job, job.dispersions.rows(0, min(runs, LANES)), runs)], others, threads)
@@ -243,9 +252,6 @@ def monte_carlo(
             unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
             store.write(start, stop, unused)
         store.complete()
-        if store.path.suffix == ".npz":
-            Campaign.load(store.part)._save(store.path, request=request)
-            store.discard()
     return replace(Campaign.load(store.path), _job=job)
 
 
@@ -264,57 +270,17 @@ def _goals(given: Any, until: Any, shapes: Any, header: dict[str, Any]) -> list[
     return goals
 
 
-def _store(
-    path: Path | None, request: str, header: dict[str, Any], size: int, shapes: Any
-) -> FileStore | MemoryStore:
-    if path is None or (path.suffix == ".npz" and find_spec("h5py") is None):
-        return MemoryStore(header["asked"], size, shapes)
-    texts = {"header": json.dumps(header), "constant": "[]"}
-    return FileStore(path, request, header["asked"], size, shapes, {}, texts, what="campaign")
-
-
-def _require_own(path: Path | None, overwrite: bool, request: str = "") -> None:
-    """Refuse to replace the file of another call, whose request begins differently."""
-    if overwrite or path is None or not path.is_file():
-        return
-    earlier = _request_of(path)
-    if earlier and earlier.startswith(request):
-        return
-    try:
-        found = Campaign.load(path)
-        there = f"contains another campaign: {found!r}, seed {found.seed}"
-    except FflinError:
-        there = "exists already and is not a campaign"
-    raise FileError(
-        f"{path} {there}; name another file, or replace it with overwrite=True (--force)"
-    )
-
-
-def _request_of(path: Path) -> str:
-    """Return the hash of the call that made a file; "" if none did."""
-    try:
-        if path.suffix == ".h5":
-            with hdf5().File(path, "r") as file:
-                return str(file.attrs.get("request", ""))
-        with path.open("rb") as content, np.load(content, allow_pickle=False) as file:
-            return str(file["request"])
-    except Exception:  # each decoder has its own
-        return ""
-
-
-def _found(
-    job: CampaignJob, path: Path | None, request: str, header: dict[str, Any]
-) -> Campaign | None:
-    """Return the campaign of a file with all runs of this call; its goals may differ."""
-    if path is None or path.suffix != ".h5" or not path.is_file() or _request_of(path) != request:
+def _earlier(path: Path, request: str) -> Campaign | None:
+    """Return the campaign of a file that the same call made; another file is not replaced."""
+    if not path.is_file():
         return None
-    try:
-        found = Campaign.load(path)
-    except FileError:
-        return None  # the file is written again
-    goals = tuple(header["goals"])
-    whole = len(found) == header["asked"]
-    return replace(found, goals=goals, confidence=header["confidence"], _job=job) if whole else None
+    with suppress(FileError), reading(path, "Campaign"):
+        if read_rows(path, verify=False)[2].get("request") == request:
+            return Campaign.load(path)
+    raise FileError(
+        f"{path} exists, and this call did not make it; name another file, or replace it with "
+        "overwrite=True (--force)"
+    )
 
 
 def _require_sendable(job: CampaignJob) -> None:
@@ -363,16 +329,10 @@ def _header(job: CampaignJob) -> dict[str, Any]:
     }
 
 
-def _request(job: CampaignJob, header: dict[str, Any], path: Path, overwrite: bool) -> str:
-    """Return a hash of everything that the result depends on; another call's file is refused.
-
-    The header and the first draws are compared first, since the rest may take a run in Python.
-    """
+def _request(job: CampaignJob, header: dict[str, Any]) -> str:
+    """Return a hash of everything that the result depends on."""
     draws = job.dispersions.rows(0, min(header["asked"], _STAGE))
     kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
     call = repr((kept, __version__, pin.__version__))
-    request = content_digest({"call": call, "drawn": draws.drawn})
-    _require_own(path, overwrite, request)
-    request += job.digest(draws.part(0, 1))
-    _require_own(path, overwrite, request)
-    return request
+    first = job.digest(draws.part(0, 1))
+    return content_digest({"call": call, "drawn": draws.drawn, "first": first})

@@ -16,8 +16,8 @@ import numpy as np
 from fflin.base.errors import FflinError
 from fflin.base.record import content_digest
 from fflin.base.validation import Array
+from fflin.batch.files import MemoryStore
 from fflin.batch.run import ChunkResult, Progress, Rows, run_chunks, worker_count
-from fflin.batch.store import MemoryStore
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.spreads import placed
 from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, outcome_of

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from concurrent.futures import Executor
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -17,8 +16,7 @@ from fflin.base.errors import InputError
 from fflin.base.intervals import until_failure
 from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, number, share, whole
-from fflin.batch.run import Progress, check_workers
-from fflin.batch.workers import OwnWorkers
+from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, Loop, checked_loop, settle, settling_runs
@@ -272,7 +270,7 @@ def validity(
         first = _starts(loops[frame], largest, seed, at, streams, some)
         work.append((job, Draws(first, some.astype(float)), len(at)))
     total, done, found = len(loops) * (len(_LEVELS) * _DIRECTIONS + samples), 0, list[Validity]()
-    with OwnWorkers(workers) if workers else nullcontext(executor) as others:
+    with executor_of(executor, workers) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         expect(progress, work, others, threads)
         for frame, each in loops.items():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import nullcontext
 from pathlib import Path
 
 from fflin.base.errors import InputError
@@ -37,7 +36,7 @@ def _add_validity(commands: parser.Commands) -> None:
         "find how far the robot can be displaced before the linear model or its regulator fails",
         example="fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
         common="joint inputs weights q r bryson sample reduce attitude offset spread samples seed "
-        "jobs limits frames plot",
+        "jobs limits frame plot",
     )
     options.add_point(validity)
     add_weights(validity)
@@ -54,13 +53,6 @@ def _add_validity(commands: parser.Commands) -> None:
         "inputs",
         choices=("urdf", "none"),
         default="none",
-    )
-    runs.add(
-        "--frames",
-        "also test the regulator with base velocities and wrenches in these axes",
-        choices=("hybrid", "local", "world"),
-        nargs="+",
-        default=(),
     )
     options.add_figure(validity, "the results")
 
@@ -109,7 +101,6 @@ _FREE = "not limited; --limits urdf saturates the inputs"
 
 def _validity(arguments: argparse.Namespace) -> Report:
     from fflin.base.process import Progress
-    from fflin.batch.workers import OwnWorkers
     from fflin.campaign.validity import validity
 
     robot, lin = linear_model(arguments)
@@ -118,21 +109,19 @@ def _validity(arguments: argparse.Namespace) -> Report:
     judged = lin.discretize(arguments.sample) if arguments.sample else lin
     bar, cut = Progress(), arguments.limits == "urdf"
     try:
-        with OwnWorkers(arguments.jobs) if arguments.jobs > 1 else nullcontext() as executor:
-            found = validity(
-                robot,
-                judged,
-                gain,
-                attitude=arguments.attitude,
-                position=arguments.offset,
-                joint=arguments.spread,
-                samples=arguments.samples,
-                seed=arguments.seed,
-                frames=arguments.frames,
-                limits="urdf" if cut else None,
-                executor=executor,
-                progress=bar,
-            )
+        found = validity(
+            robot,
+            judged,
+            gain,
+            attitude=arguments.attitude,
+            position=arguments.offset,
+            joint=arguments.spread,
+            samples=arguments.samples,
+            seed=arguments.seed,
+            limits="urdf" if cut else None,
+            workers=arguments.jobs if arguments.jobs > 1 else None,
+            progress=bar,
+        )
     finally:
         bar.close()
     text = str(found)
@@ -155,7 +144,7 @@ def _funnel(arguments: argparse.Namespace) -> Report:
     kept["within"], bar = once("--within", arguments.within), Progress()
     try:
         goal = once("--goal", arguments.goal)
-        found = funnel(robot, policy, goal, progress=bar.update, **kept)
+        found = funnel(robot, policy, goal, progress=bar, **kept)
     finally:
         bar.close()
 

@@ -129,7 +129,7 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
 def _sweep(arguments: argparse.Namespace) -> Report:
     import pinocchio as pin
 
-    from fflin.batch.store import check_room, output_path, part_of, readable
+    from fflin.batch.files import output_path, part_of
     from fflin.batch.sweep import planned_bytes, sweep
     from fflin.dynamics.points import effort
 
@@ -151,12 +151,11 @@ def _sweep(arguments: argparse.Namespace) -> Report:
         nonlocal said
         output_path(path)  # again, when the inputs are known
         size = planned_bytes(robot, count, at_rest=at_rest, **settings)
-        said = f"{count:,} points of '{robot.name}', {readable(size)}"
+        said = f"{count:,} points of '{robot.name}', {size / 1e6:,.4g} MB"
         if size > _LARGE and not arguments.yes:
             raise InputError(
                 f"{said}: this is more than 10 GB; add --yes to permit it, or choose fewer points"
             )
-        check_room(count, size, path)
         part = part_of(path)
         said += f" to {path}" + f", resuming from {part}" * part.exists()
 
@@ -266,7 +265,7 @@ def _given(path: Path) -> dict[str, Array]:
 def going_on(path: Path | None, what: str) -> Iterator[Progress]:
     """Yield the progress bar; after Ctrl-C report the progress and the saved part."""
     from fflin.base.process import Progress
-    from fflin.batch.store import part_of
+    from fflin.batch.files import part_of
 
     bar = Progress()
     try:

@@ -149,7 +149,7 @@ class LaneLoop:
                 raw = space[: (-(-done // every) - -(-first // every)) * self.width]
                 if len(raw):
                     statistics.add(first, self.split(raw), raw)
-                bar.update(done, steps)
+                bar(done, steps)
                 v = self._state.spread(point.nu.T)
                 for lane in going.nonzero()[0]:
                     told[lane] = self._ending(done * times.dt, point.q[:, lane], v[lane])

@@ -77,7 +77,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
             if stopped := ending(t, q, v):
                 break
             if step % _LOOK == 0:
-                bar.update(step + 1, times.steps)
+                bar(step + 1, times.steps)
     except KeyboardInterrupt:
         if not count:
             raise

@@ -127,7 +127,7 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     for figures in (undamped, loops.figures(disk), loops.figures(whole)):
         value, delta = _largest(figures, tried, of.makes)
         found.append(Found(value, of.values(delta)))
-        bar.update(len(found), 4)
+        bar(len(found), 4)
     unstable = loops.undamped(tried) >= 0.0
     safe = min(_safe(loops), float(np.abs(tried[unstable]).max(axis=1).min(initial=np.inf)))
     bar.close()

@@ -1,4 +1,4 @@
-"""Sweeps on executors: in order, the robot unpickled once, workers that die."""
+"""Sweeps on executors: in order, the robot unpickled once, executors that fail."""
 
 import os
 import signal
@@ -13,10 +13,9 @@ import pytest
 import fflin
 from fflin.batch import chunks as batch_chunks
 from fflin.batch import run as dispatching
-from fflin.batch.workers import OwnWorkers, WorkerDied
 from fflin.kernel import compiled
 from tests.support.messages import any_wording
-from tests.support.patience import STALL, finished, finishing, wait_until
+from tests.support.patience import STALL, finished, finishing
 from tests.support.robots import singular_at
 from tests.support.sweeps import assert_same, points
 
@@ -107,66 +106,9 @@ def killing(monkeypatch, tmp_path):
     return set_up
 
 
-@pytest.mark.compiled
-def test_a_worker_that_is_killed_is_replaced(robot, killing):
-    q, _, _ = points(robot, 80)
-    killing(1)
-    batch = fflin.sweep(robot, q, workers=2, chunk=8)
-    assert np.abs(batch.B_lower - fflin.sweep(robot, q).B_lower).max() < 1e-13
-
-
-@pytest.mark.compiled
-def test_a_chunk_that_kills_every_worker_is_named_and_the_rest_is_there(robot, killing):
-    q, _, _ = points(robot, 80)
-    killing(99)
-    with pytest.raises(fflin.SweepError, match="24 to 31") as caught:
-        fflin.sweep(robot, q, workers=2, chunk=8)
-    assert [failure[:2] for failure in caught.value.failed] == [(24, 32)]
-    rest = np.r_[0:24, 32:80]
-    assert np.array_equal(caught.value.batch.q, q[rest])
-    expected = fflin.sweep(robot, q[rest]).B_lower
-    assert np.abs(caught.value.batch.B_lower - expected).max() < 1e-13
-
-
-def half_sent(large=10**6):
-    """Return a large result of which only half is sent before the worker is killed."""
-    from multiprocessing.connection import Connection
-
-    whole = Connection._send
-
-    def send(self, buffer, *arguments):
-        if len(buffer) < large:
-            return whole(self, buffer, *arguments)
-        whole(self, buffer[: len(buffer) // 2], *arguments)
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    Connection._send = send
-    return np.zeros(10**6)
-
-
-def result(future):
-    """Return what comes of a task, or raise what it raised."""
-    wait_until(future.done, "the result of a worker")
-    return future.result()
-
-
-def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
-    workers = OwnWorkers(2)
-    try:
-        lost = workers.submit(half_sent)
-        kept = [workers.submit(pow, 2, each) for each in range(9)]
-        with pytest.raises(WorkerDied):
-            result(lost)
-        assert [result(each) for each in kept] == [2**each for each in range(9)]
-    finally:
-        workers.shutdown()
-    with pytest.raises(RuntimeError):
-        workers.submit(pow, 2, 3)
-
-
 BEGIN = """
 import os, sys, time
-from fflin.batch.workers import OwnWorkers
+from fflin.batch.run import executor_of
 
 def busy(_):
     print("begun", flush=True)
@@ -174,11 +116,10 @@ def busy(_):
         pass
 
 if __name__ == "__main__":
-    workers = OwnWorkers(2)
-    workers.submit(pow, 2, 3).result()
-    {task}
-    sys.stdin.read()
-    {end}
+    with executor_of(None, 2) as workers:
+        workers.submit(pow, 2, 3).result()
+        {task}
+        sys.stdin.read()
 """
 
 
@@ -192,11 +133,11 @@ if __name__ == "__main__":
         ("workers.submit(pow, 2, 4); workers.submit(pow, 2, 4); print('new', flush=True)", "new"),
     ],
 )
-@pytest.mark.parametrize("end", ["kill", "workers.shutdown()"])
+@pytest.mark.parametrize("end", ["kill", "return"])
 def test_no_worker_outlives_its_caller(task, said, end, tmp_path):
     """It is killed, or ends the workers; these may be busy, asleep, idle or not yet there."""
     script = tmp_path / "script.py"
-    script.write_text(BEGIN.format(task=task, end="pass" if end == "kill" else end))
+    script.write_text(BEGIN.format(task=task))
     with subprocess.Popen(
         [sys.executable, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -211,11 +152,12 @@ def test_no_worker_outlives_its_caller(task, said, end, tmp_path):
 @pytest.mark.compiled
 def test_there_are_no_more_workers_than_cores(robot):
     cores = compiled.available_cores()
-    with any_wording(), pytest.warns(fflin.FflinWarning, match=f"1000000 .* {cores} "):
-        workers = OwnWorkers(10**6)
-    workers.shutdown()
-    assert workers._max_workers == cores
-    assert dispatching.worker_count(workers) == cores
+    with (
+        any_wording(),
+        pytest.warns(fflin.FflinWarning, match=f"1000000 .* {cores} "),
+        dispatching.executor_of(None, 10**6) as workers,
+    ):
+        assert dispatching.worker_count(workers) == cores
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity")
@@ -240,44 +182,6 @@ def test_cores_are_those_of_the_container(files, cores, tmp_path, monkeypatch):
     assert compiled.available_cores() == cores
 
 
-class HalfSendingJob(batch_chunks.ChunkJob):
-    """A job whose worker is killed in the middle of the result of the chunk that begins at 24."""
-
-    here = os.getpid()
-
-    def __reduce__(self):
-        return _half_sending, (self._again,)
-
-    def run(self, points, start, out=None):
-        if start == 24 and os.getpid() != self.here:
-            half_sent(1000)
-        return super().run(points, start, out)
-
-
-def _half_sending(again):
-    job = again()
-    job.here = None
-    return job
-
-
-@pytest.mark.process
-@pytest.mark.parametrize("method", ["spawn", "fork"])
-def test_a_pool_whose_worker_is_killed_in_the_middle_of_its_result_is_one_line(
-    method, robot, monkeypatch
-):
-    """Left alone it waits for the rest for ever, and so do those who use it."""
-    monkeypatch.setattr("fflin.batch.sweep.ChunkJob", HalfSendingJob)
-    monkeypatch.setattr(dispatching, "_POLL_PERIOD", 0.2)
-    q, _, _ = points(robot, 80)
-    with (
-        ProcessPoolExecutor(2, mp_context=get_context(method)) as doomed,
-        any_wording(),
-        pytest.raises(fflin.SweepError, match="BrokenProcessPool") as caught,
-    ):
-        fflin.sweep(robot, q, executor=doomed, chunk=8)
-    assert (24, 32) in [failure[:2] for failure in caught.value.failed]
-
-
 @pytest.mark.process
 def test_workers_that_cannot_start_are_one_line(tmp_path):
     script = tmp_path / "script.py"
@@ -297,7 +201,10 @@ def test_workers_that_cannot_start_are_one_line(tmp_path):
 
 @pytest.mark.compiled
 @pytest.mark.process
-def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, killing, tmp_path):
+@pytest.mark.parametrize("own", [False, True])
+def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(
+    own, robot, killing, tmp_path
+):
     pytest.importorskip("h5py")
     q, _, _ = points(robot, 80)
     killing(1)
@@ -305,9 +212,10 @@ def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, k
     with (
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as doomed,
         any_wording(),
-        pytest.raises(fflin.SweepError, match="BrokenProcessPool") as caught,
+        pytest.raises(fflin.SweepError, match=r"BrokenProcessPool.*killed") as caught,
     ):
-        fflin.sweep(robot, q, executor=doomed, chunk=8, out=path)
+        how = {"workers": 1} if own else {"executor": doomed}
+        fflin.sweep(robot, q, chunk=8, out=path, **how)
     assert (24, 32) in [failure[:2] for failure in caught.value.failed]
     told = []
     batch = fflin.sweep(
@@ -389,29 +297,3 @@ def test_dask(robot):
     assert killed
     assert np.array_equal(batch.q, expected.q)
     assert np.abs(batch.B_lower - expected.B_lower).max() < 1e-13
-
-
-LEFT_TAKEN = """
-import os, time
-from fflin.batch.workers import OwnWorkers
-
-if __name__ == "__main__":
-    workers = OwnWorkers(1)
-    workers.submit(pow, 2, 3).result()
-    future = workers.submit(time.sleep, 9999)
-    while not future.running():
-        time.sleep(0.01)
-    future._condition.acquire()
-    workers.shutdown()
-    print("ended", flush=True)
-    os._exit(0)
-"""
-
-
-@pytest.mark.process
-def test_shutdown_does_not_wait_for_a_future_whose_lock_is_left_taken(tmp_path):
-    """As Ctrl-C leaves it that comes between taking the lock and waiting."""
-    script = tmp_path / "script.py"
-    script.write_text(LEFT_TAKEN)
-    done = finished([sys.executable, script], capture_output=True, text=True)
-    assert done.stdout == "ended\n"

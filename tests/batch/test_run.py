@@ -1,16 +1,14 @@
 """Any rows through any job: drawn by a seed, on threads or workers, into a file that goes on."""
 
-from contextlib import closing, nullcontext
+from contextlib import closing
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 import fflin
-from fflin.batch.files import read_rows
-from fflin.batch.run import ChunkResult, failure, run_chunks
-from fflin.batch.store import FileStore, MemoryStore
-from fflin.batch.workers import OwnWorkers
+from fflin.batch.files import FileStore, MemoryStore, read_rows
+from fflin.batch.run import ChunkResult, executor_of, failure, run_chunks
 
 COUNT, CHUNK = 50, 8
 STORED = {"seed": (), "walk": (3,)}
@@ -62,7 +60,7 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
         pace = {"pace": np.array([1.5])}
         with (
             closing(FileStore(path, "request", COUNT, CHUNK, STORED, pace, texts)) as store,
-            OwnWorkers(workers) if workers else nullcontext() as executor,
+            executor_of(None, workers) as executor,
         ):
             failed = run_chunks(
                 job,

@@ -20,7 +20,7 @@ from scipy.stats import binomtest
 
 import fflin
 from fflin.base.intervals import clopper_pearson
-from fflin.batch.workers import OwnWorkers
+from fflin.batch.run import executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.settling import Loop, settling_runs
 from fflin.campaign.validity import _LEVELS, _crossing, _slope
@@ -346,9 +346,8 @@ def test_a_process_that_dies_is_one_line(robots, monkeypatch):
     lin, gain = held(robot)
     # A function of Python's own, for which a worker imports nothing.
     monkeypatch.setattr(Loop, "__reduce__", lambda _: (signal.raise_signal, (signal.SIGKILL,)))
-    workers = OwnWorkers(1)
-    for executor in (workers, ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
-        with executor, pytest.raises(fflin.FflinError, match="died"):
+    for pool in (executor_of(None, 1), ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
+        with pool as executor, pytest.raises(fflin.FflinError, match="died"):
             fflin.validity(robot, lin, gain, samples=2, executor=executor)
 
 
@@ -417,13 +416,6 @@ def test_frames_are_compared_in_the_same_linear_loop():
         fflin.validity(robot, turned, gain, frames=["local"], **options)
     with pytest.raises(fflin.InputError, match="'local'"):
         fflin.validity(robot, lin, gain, frames="local", **options)
-
-
-def test_command_compares_frames():
-    options = ("validity", "cubesat", "--samples", "2")
-    code, out, _ = run(*options, "--frames", "local", "hybrid")
-    assert code == 0 and out.count("2 of 2 runs settled: every run up to") == 2
-    assert "'hybrid', 'local', 'world'" in refused(*options, "--frames", "base")
 
 
 @pytest.mark.exhaustive
