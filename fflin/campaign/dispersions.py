@@ -14,7 +14,6 @@ import pinocchio as pin
 
 from fflin.base.errors import ChartError, InputError, UnknownNameError
 from fflin.base.names import by_name, input_keys
-from fflin.base.process import Progress
 from fflin.base.validation import Array, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
@@ -36,7 +35,6 @@ from fflin.simulation.times import Times
 from fflin.uncertainty.parameters import bodies_named
 
 _BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
-_PART = 16  # values of a slow distribution that are drawn together; a divisor of _BLOCK
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
 _AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
@@ -233,29 +231,16 @@ class Dispersions:
         kept = self._kept.get((column.name, block), np.empty(0))
         if len(kept) < count:
             try:
-                values = np.asarray(column.inverse(uniform[len(kept) : count]), dtype=float)
+                kept = np.asarray(column.inverse(uniform[:count]), dtype=float)
             except Exception as error:  # each distribution has its own
                 raise InputError(
                     f"the distribution of '{column.name}' cannot be drawn: {reason(error)}"
                 ) from None
-            kept = self._kept[column.name, block] = np.concatenate((kept, values))
+            self._kept[column.name, block] = kept
         return kept
-
-    def _draw_all(self, column: Column, runs: int) -> None:
-        """Draw a distribution for so many runs, with a bar on a terminal."""
-        bar = Progress()
-        try:
-            for done in (*range(1, min(_PART, runs)), *range(_PART, runs, _PART), runs):
-                self._drawn(column, (done - 1) // _BLOCK, (done - 1) % _BLOCK + 1)
-                bar(done, runs, f"drawing '{column.name}', {done:,} of {runs:,} ")
-        finally:
-            bar.close()
 
     def require_possible(self, runs: int) -> None:
         """Raise `InputError` if a draw gives an invalid robot or attitude."""
-        for column in self.columns:
-            if not is_closed_form(column.inverse):
-                self._draw_all(column, runs)
         for start in range(0, runs, _BLOCK):
             drawn = self.rows(start, min(start + _BLOCK, runs)).drawn
             for values, column in zip(drawn.T, self.columns, strict=True):

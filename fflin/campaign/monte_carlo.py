@@ -206,10 +206,7 @@ def monte_carlo(
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     threads = threads or available_cores()
     size = _chunk(runs, chunk, workers or threads, until is not None)
-    in_memory = path is None or path.suffix == ".npz"
-    store: Any = MemoryStore(runs, size, shapes) if in_memory else None
-    if path and not in_memory and not part_of(path).exists():
-        require_room(path, 8 * runs * sum(map(math.prod, shapes.values())))
+    store: Any = _memory(path, runs, size, shapes)
     if executor or workers:
         _require_sendable(job)
     job.choose(engine)
@@ -221,7 +218,7 @@ def monte_carlo(
     earlier = _earlier(path, request) if path and not truth("overwrite", overwrite) else None
     if earlier and until is None and len(earlier) == runs:
         return replace(earlier, goals=tuple(header["goals"]), confidence=confidence, _job=job)
-    if path and not in_memory:
+    if path and store is None:
         texts = {"header": json.dumps(header), "constant": "[]"}
         store = FileStore(path, request, runs, size, shapes, {}, texts)
     with closing(store), executor_of(executor, workers) as others:
@@ -247,11 +244,7 @@ def monte_carlo(
             if path is not None:
                 campaign._save(path, request=request)
             return campaign
-        for start in range(done, runs, store.chunk):
-            stop = min(start + store.chunk, runs)
-            unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
-            store.write(start, stop, unused)
-        store.complete()
+        _complete(store, done, shapes)
     return replace(Campaign.load(store.path), _job=job)
 
 
@@ -268,6 +261,24 @@ def _goals(given: Any, until: Any, shapes: Any, header: dict[str, Any]) -> list[
             raise InputError(f"{said}, expected a text such as 'attitude < 1 deg'")
         Campaign.of(MemoryStore(1, 1, shapes).arrays, header | {"goals": []}).met(goal)
     return goals
+
+
+def _memory(path: Path | None, runs: int, size: int, shapes: Any) -> MemoryStore | None:
+    """Return memory for the runs, or None for a .h5 file, which must fit on the disk."""
+    if path is None or path.suffix == ".npz":
+        return MemoryStore(runs, size, shapes)
+    if not part_of(path).exists():
+        require_room(path, 8 * runs * sum(map(math.prod, shapes.values())))
+    return None
+
+
+def _complete(store: FileStore, done: int, shapes: Any) -> None:
+    """Complete a file, whose runs from `done` on were not needed."""
+    for start in range(done, store.count, store.chunk):
+        stop = min(start + store.chunk, store.count)
+        unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
+        store.write(start, stop, unused)
+    store.complete()
 
 
 def _earlier(path: Path, request: str) -> Campaign | None:

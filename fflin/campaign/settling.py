@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -22,7 +22,7 @@ from fflin.base.validation import Array, as_double
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.control.policies import StateFeedback
-from fflin.dynamics.state import Frame, StateMap, states_of, unwound
+from fflin.dynamics.state import StateMap, states_of, unwound
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
@@ -126,16 +126,6 @@ class Loop:
         center[self.watched] = self.lin.x0
         e = unwound(self.state, x - center)[:, self.watched]
         return 1.0 - (x[:, :3] ** 2).sum(axis=1), e
-
-    def fed_back_in(self, frame: Frame) -> Loop:
-        """Return the same linear loop, fed back in other axes."""
-        state = StateMap(self.robot, reference=self.lin.reference, frame=frame)
-        if not np.allclose(state.to_state(self.lin.q, self.lin.v)[:3], 0.0, atol=1e-9):
-            raise InputError(
-                "the base of the operating point is rotated relative to the reference, so that "
-                "models in other frames differ; compare frames on a model made without reference="
-            )
-        return replace(self, lin=replace(self.lin, frame=state.frame))
 
 
 def settling_runs(

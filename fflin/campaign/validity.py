@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -20,7 +19,6 @@ from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, Loop, checked_loop, settle, settling_runs
-from fflin.dynamics.names import Frame, refuse_orbit
 from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -78,8 +76,6 @@ class Validity(FrozenArrays):
         "rad" or "m" if all joints have this unit, otherwise "rad|m".
     frame : str
         Frame in whose axes base velocities and inputs are fed back.
-    frames : dict
-        {frame: Validity} of the other frames that were requested.
 
     Examples
     --------
@@ -105,7 +101,6 @@ class Validity(FrozenArrays):
     joint_unit: str
     robot: str
     frame: str
-    frames: dict[str, Validity] = field(default_factory=dict)
 
     @property
     def settled(self) -> int:
@@ -136,16 +131,6 @@ class Validity(FrozenArrays):
             f"so {100.0 * low:.1f} to {100.0 * high:.1f} % settle there ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]
-        for each in (self, *self.frames.values()) if self.frames else ():
-            upto = shown(each.holds, self.joint_unit)
-            lines.append(
-                f"with feedback in frame {each.frame}, {each.settled} of {count} runs settled: "
-                + (
-                    f"every run up to {upto} settled"
-                    if each.inside
-                    else "the smallest displacement did not settle"
-                )
-            )
         return folded(lines)
 
 
@@ -167,7 +152,6 @@ def validity(
     samples: int = 100,
     seed: int = 0,
     confidence: float = 0.95,
-    frames: Iterable[Frame] = (),
     limits: Any = None,
     executor: Executor | None = None,
     workers: int | None = None,
@@ -205,9 +189,6 @@ def validity(
         or number of workers.
     confidence : float
         Confidence level of the intervals.
-    frames : sequence of {"hybrid", "local", "world"}
-        Other frames in whose axes the same linear loop is tested, with the same displacements.
-        The base of the operating point must not be rotated relative to the reference.
     limits : optional
         Limits at which the inputs saturate, as in `simulate`. By default no input saturates, except
         that thrusters never pull.
@@ -244,10 +225,6 @@ def validity(
     largest = _checked_displacement(loop.lin, attitude, position, joint)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)
-    if isinstance(frames, str) or not isinstance(frames, Iterable):
-        raise InputError(f"frames is {frames!r}, expected a sequence such as ('hybrid', 'local')")
-    refuse_orbit((frames := tuple(frames)) and robot, "loops in other `frames`")
-    loops = {loop.lin.frame: loop} | {each: loop.fed_back_in(each) for each in frames}
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
     # Level and random stream of each run that predicts, and of each random run.
@@ -255,37 +232,43 @@ def validity(
         True: (np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
         False: (levels, _DIRECTIONS + np.arange(samples)),
     }
-    runs_of = {
-        (frame, predicts): partial(settling_runs, each, predicts, limits, largest["joint"])
-        for frame, each in loops.items()
-        for predicts in sets
-    }
-    jobs = {key: make() for key, make in runs_of.items()}
-    for job in jobs.values():  # a wrong argument is refused before anything is compiled
-        job.choose(engine)
+    starts = {key: partial(_starts, loop, largest, seed, *each) for key, each in sets.items()}
+    runs_of = {key: partial(settling_runs, loop, key, limits, largest["joint"]) for key in sets}
     work = []
-    for (frame, predicts), job in jobs.items():
-        at, streams = sets[predicts]
+    for key, (at, _) in sets.items():
+        job = runs_of[key]()
+        job.choose(engine)  # a wrong argument is refused before anything is compiled
         some = np.arange(min(LANES, len(at)))
-        first = _starts(loops[frame], largest, seed, at, streams, some)
-        work.append((job, Draws(first, some.astype(float)), len(at)))
-    total, done, found = len(loops) * (len(_LEVELS) * _DIRECTIONS + samples), 0, list[Validity]()
+        work.append((job, Draws(starts[key](some), some.astype(float)), len(at)))
+    total, done, found = len(_LEVELS) * _DIRECTIONS + samples, 0, {}
     with executor_of(executor, workers) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         expect(progress, work, others, threads)
-        for frame, each in loops.items():
-            arrays = {}
-            for predicts, (at, streams) in sets.items():
-                starts = partial(_starts, each, largest, seed, at, streams)
-                counted = progress and partial(_report, progress, done, total)
-                runs, how["progress"] = np.arange(len(at)), counted
-                arrays[predicts] = settle(runs_of[frame, predicts], starts, runs, engine, **how)
-                done += len(at)
-            error = arrays[True]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
-            outcomes = tuple(OUTCOMES[int(code)] for code in arrays[False]["outcome"])
-            found.append(_judged(each, largest, levels, error, outcomes, confidence))
-    own, *more = found
-    return replace(own, frames={each.frame: each for each in more})
+        for key, (at, _) in sets.items():
+            how["progress"] = progress and partial(_report, progress, done, total)
+            found[key] = settle(runs_of[key], starts[key], np.arange(len(at)), engine, **how)
+            done += len(at)
+    error = found[True]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
+    outcomes = tuple(OUTCOMES[int(code)] for code in found[False]["outcome"])
+    failed = np.array([outcome != "settled" for outcome in outcomes])
+    inside, bound, rate = until_failure(failed, confidence)
+    return Validity(
+        levels=_LEVELS,
+        prediction_error=error,
+        slope=_slope(error),
+        trusted=_scaled(largest, _crossing(error)),
+        sampled=levels,
+        outcomes=outcomes,
+        holds=_scaled(largest, float(levels[inside - 1]) if inside else 0.0),
+        inside=inside,
+        inside_rate=bound,
+        rate=rate,
+        confidence=confidence,
+        largest=largest,
+        joint_unit=joint_unit(loop.lin),
+        robot=loop.lin.robot,
+        frame=loop.lin.frame,
+    )
 
 
 def _starts(
@@ -306,35 +289,6 @@ def _starts(
 
 def _report(progress: Progress, before: int, total: int, done: int, _: int) -> None:
     progress(before + done, total)
-
-
-def _judged(
-    loop: Loop,
-    largest: dict[str, float],
-    levels: Array,
-    error: Array,
-    outcomes: tuple[str, ...],
-    confidence: float,
-) -> Validity:
-    failed = np.array([outcome != "settled" for outcome in outcomes])
-    inside, bound, rate = until_failure(failed, confidence)
-    return Validity(
-        levels=_LEVELS,
-        prediction_error=error,
-        slope=_slope(error),
-        trusted=_scaled(largest, _crossing(error)),
-        sampled=levels,
-        outcomes=outcomes,
-        holds=_scaled(largest, float(levels[inside - 1]) if inside else 0.0),
-        inside=inside,
-        inside_rate=bound,
-        rate=rate,
-        confidence=confidence,
-        largest=largest,
-        joint_unit=joint_unit(loop.lin),
-        robot=loop.lin.robot,
-        frame=loop.lin.frame,
-    )
 
 
 def _slope(errors: Array) -> float:

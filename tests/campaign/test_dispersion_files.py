@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 import fflin
-from fflin.base.process import Progress
 from fflin.campaign.runs import CampaignJob
 
 
@@ -139,26 +138,15 @@ def test_a_distribution_draws_each_value_once_whatever_is_asked_for(robots):
     ]
     once, uniform, plain = dispersions
     before = [each.columns[0].inverse.__self__.count for each in (once, plain)]
-    assert once.rows(3, 20).drawn.shape == (17, 1)
     for each in (once, plain):
         each.require_possible(2100)
+    assert once.rows(3, 20).drawn.shape == (17, 1)
     parts = [once.rows(*span).drawn for span in ((0, 1000), (1000, 1030), (1030, 2100))]
     counts = [each.columns[0].inverse.__self__.count for each in (once, plain)]
     assert counts == [each + 2100 for each in before]
     u = plain.rows(0, 2100).drawn
     np.testing.assert_allclose(np.concatenate(parts), stats.logistic(scale=0.1).ppf(u), rtol=1e-14)
     np.testing.assert_allclose(uniform.rows(5, 2100).drawn, -0.1 + 0.2 * u[5:], rtol=1e-14)
-
-
-def test_slow_draws_are_told_as_they_go(robots, monkeypatch):
-    told = []
-    monkeypatch.setattr(Progress, "update", lambda _, *given: told.append(given))
-    given = {"r_b.x": 0.1, "r_b.y": stats.logistic(scale=0.1)}
-    job = CampaignJob(robots["planar_detumble"], None, given, 0, "python", {"duration": 1.0})
-    job.dispersions.require_possible(1500)
-    done = [each[0] for each in told]
-    assert done == sorted(set(done)) and done[-1] == 1500 and done[0] == 1
-    assert told[-1][1:] == (1500, "drawing 'r_b.y', 1,500 of 1,500 ")
 
 
 @pytest.mark.parametrize(

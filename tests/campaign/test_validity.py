@@ -332,10 +332,10 @@ def test_progress_is_told_up_to_every_run(robots):
     for executor in (None, ThreadPoolExecutor(2)):
         told = []
         more = {"executor": executor, "progress": lambda *each, told=told: told.append(each)}
-        fflin.validity(robot, lin, gain, samples=40, frames=["local"], **more)
+        fflin.validity(robot, lin, gain, samples=40, **more)
         done = [each for each, _ in told]
         assert done == sorted(set(done)) and len(done) > 8
-        assert {total for _, total in told} == {done[-1]} == {2 * (28 + 40)}
+        assert {total for _, total in told} == {done[-1]} == {28 + 40}
     with pytest.raises(fflin.InputError, match="progress"):
         fflin.validity(robot, lin, gain, progress=3)
 
@@ -388,34 +388,6 @@ def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
     assert process.returncode == 130
     # The bar is taken away before the line.
     assert said.endswith(b"\r\x1b[2Kfflin: stopped\r\n")
-
-
-@pytest.mark.compiled
-@pytest.mark.exhaustive
-def test_frames_are_compared_in_the_same_linear_loop():
-    """What is fed back in base axes is that of `Loop` in that frame, run by run."""
-    robot = fflin.load("ur5")
-    lin = fflin.linearize(robot, fflin.configuration(robot, {"elbow_joint": 1.2}))
-    gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
-    options = {"attitude": 60.0, "position": 0.0, "joint": 0.0, "samples": 6, "seed": 2}
-    found = fflin.validity(robot, lin, gain, frames=("local", "world"), **options)
-    assert list(found.frames) == ["local", "world"] and found.frame == "hybrid"
-    for frame, other in found.frames.items():
-        there = fflin.linearize(robot, lin.q, frame=frame)
-        alone = fflin.validity(robot, there, gain, **options)
-        assert other.outcomes == alone.outcomes and other.frame == frame
-        assert other.prediction_error == pytest.approx(alone.prediction_error, rel=1e-4)
-    # A gain that is as uneven as the inertia bears no turn of the axes that it is given in.
-    assert found.settled == 6 > found.frames["world"].settled
-    assert says(str(found), "world", f"{found.frames['world'].settled} of 6")
-
-    base = pin.SE3(pin.exp3(np.array([0.3, 0.0, 0.0])), np.zeros(3))
-    q = fflin.configuration(robot, {}, base)
-    turned = fflin.linearize(robot, q, reference=pin.SE3.Identity())
-    with pytest.raises(fflin.InputError, match="reference"):
-        fflin.validity(robot, turned, gain, frames=["local"], **options)
-    with pytest.raises(fflin.InputError, match="'local'"):
-        fflin.validity(robot, lin, gain, frames="local", **options)
 
 
 @pytest.mark.exhaustive

@@ -96,7 +96,7 @@ def test_noise_has_a_report_and_another_campaign_is_replaced_by_force(folder, mo
     assert (code, error) == (0, "")
     before = (folder / "c.npz").read_bytes()
     code, _, error = run(*command, "--seed", "1")
-    assert code == 2 and "another campaign" in error and "--force" in error
+    assert code == 2 and "did not make it" in error and "--force" in error
     assert (folder / "c.npz").read_bytes() == before
     code, _, error = run(*command, "--seed", "1", "--force")
     assert (code, error) == (0, "")
@@ -120,12 +120,12 @@ INTERRUPTED = """
 import os, signal, sys
 from fflin.base import process
 from fflin.__main__ import main
-counted = process.Progress.update
+counted = process.Progress.__call__
 def update(bar, done, total):
     counted(bar, done, total)
     if done >= 32:
         os.kill(os.getpid(), signal.SIG_HOW)
-process.Progress.update = update
+process.Progress.__call__ = update
 if __name__ == "__main__":
     sys.exit(main())
 """

@@ -125,11 +125,11 @@ INTERRUPTED = """
 import os, signal, sys
 from fflin.base import process
 from fflin.__main__ import main
-counted = process.Progress.update
+counted = process.Progress.__call__
 def update(bar, done, total):
     counted(bar, done, total)
     os.killpg(0, signal.SIGINT)
-process.Progress.update = update
+process.Progress.__call__ = update
 sys.exit(main())
 """
 
