@@ -340,7 +340,7 @@ def require_room(path: Path, size: int) -> None:
     """Raise `FileError` if a file of this size [bytes] does not fit on the disk."""
     if size > (free := shutil.disk_usage(path.parent).free):
         raise FileError(
-            f"{path} needs {size / 1e9:,.4g} GB, but only {free / 1e9:,.4g} GB are free; free "
+            f"{path} needs {size / 1e9:,.1f} GB, but only {free / 1e9:,.1f} GB are free; free "
             "space, or choose fewer rows"
         )
 

@@ -151,7 +151,8 @@ def _sweep(arguments: argparse.Namespace) -> Report:
         nonlocal said
         output_path(path)  # again, when the inputs are known
         size = planned_bytes(robot, count, at_rest=at_rest, **settings)
-        said = f"{count:,} points of '{robot.name}', {size / 1e6:,.4g} MB"
+        scale, unit = (1e9, "GB") if size >= 1e9 else (1e3, "kB")
+        said = f"{count:,} points of '{robot.name}', {size / scale:,.1f} {unit}"
         if size > _LARGE and not arguments.yes:
             raise InputError(
                 f"{said}: this is more than 10 GB; add --yes to permit it, or choose fewer points"
