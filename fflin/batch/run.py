@@ -6,25 +6,19 @@ of the meaning of the rows and of the job's results.
 
 from __future__ import annotations
 
-import os
 import pickle
-import signal
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
-    BrokenExecutor,
     Executor,
     Future,
-    ProcessPoolExecutor,
     ThreadPoolExecutor,
     wait,
 )
 from contextlib import contextmanager
 from functools import lru_cache
-from multiprocessing import get_context, parent_process
-from threading import Thread
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -32,7 +26,7 @@ import numpy as np
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
 from fflin.base.validation import Array, whole
 from fflin.batch.files import FileStore, MemoryStore
-from fflin.kernel.compiled import available_cores
+from fflin.batch.workers import NoWorkers, OwnWorkers, WorkerDied
 
 # Chunks that are submitted for each worker at a time, so that none is idle between two.
 _QUEUED = 2
@@ -216,6 +210,9 @@ def _run_on_workers(job: Job, rows: Rows, spans: list[Span], executor: Executor)
                     done = Done(span, future.result(), "")
                 except Exception as error:  # each executor has its own
                     done = Done(span, None, _reason(error))
+                    if isinstance(error, NoWorkers):
+                        yield from (Done(each, None, done.reason) for each in waiting)
+                        waiting.clear()
                 yield done
     finally:
         for future in running:
@@ -226,13 +223,9 @@ def _reason(error: Exception) -> str:
     """Return why a chunk failed."""
     if isinstance(error, FflinError):
         return str(error)
-    hint = ""
-    if isinstance(error, BrokenExecutor):
-        hint = (
-            "; a worker was killed, for example because the memory was full, or could not start: "
-            'call fflin under `if __name__ == "__main__":`'
-        )
-    return f"the executor failed: {type(error).__name__}: {error}".rstrip(": ") + hint
+    if isinstance(error, WorkerDied | NoWorkers):
+        return str(error)
+    return f"the executor failed: {type(error).__name__}: {error}".rstrip(": ")
 
 
 @contextmanager
@@ -241,32 +234,8 @@ def executor_of(executor: Executor | None, workers: int | None) -> Iterator[Exec
     if not workers:
         yield executor
         return
-    cores = available_cores()
-    if workers > cores:
-        said = f"{workers} workers requested, but only {cores} cores are available; using {cores}"
-        warnings.warn(said, FflinWarning, stacklevel=4)
-    # A fork would copy locks that other threads hold.
-    pool = ProcessPoolExecutor(min(workers, cores), get_context("spawn"), _prepare_worker)
-    try:
+    with OwnWorkers(workers) as pool:
         yield pool
-    finally:
-        processes = [*(pool._processes or {}).values()]
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:  # after Ctrl-C they are in the middle of a chunk
-            process.terminate()
-
-
-def _prepare_worker() -> None:
-    """Leave Ctrl-C to the calling process, and end this process when the caller ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    caller = parent_process()
-    assert caller is not None
-
-    def end() -> None:
-        caller.join()
-        os._exit(1)
-
-    Thread(target=end, daemon=True).start()
 
 
 def work(job: bytes, rows: Any, start: int) -> ChunkResult:

@@ -8,6 +8,7 @@ import pytest
 
 import fflin
 from fflin.base.process import import_path_without
+from fflin.batch.workers import OwnWorkers
 from tests.support.commands import run, run_in_process
 
 pytestmark = pytest.mark.process
@@ -54,6 +55,12 @@ def test_an_expansion_runs_no_code_beside_it(beside, poison, tmp_path, monkeypat
     if beside:  # the document's folder is another than the working folder
         monkeypatch.chdir("/")
     assert fflin.load(tmp_path / "r.urdf.xacro").model.inertias[1].mass == 2.0
+
+
+def test_a_worker_starts_without_the_working_folder(poison):
+    poison(*ALL)
+    with OwnWorkers(1) as workers:
+        assert workers.submit(os.getpid).result() != os.getpid()
 
 
 def test_a_command_imports_nothing_from_the_working_folder(poison, tmp_path):

