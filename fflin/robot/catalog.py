@@ -8,6 +8,7 @@ from typing import NamedTuple
 from urllib.parse import unquote
 
 from fflin.base.errors import FileError, InputError, UrdfError, require_known, unknown
+from fflin.base.writing import missing, shown
 
 # example-robot-data's talos_legs is talos cut off at the torso, done in its loader's code.
 _PRUNED = {"talos_legs": ("torso_1_joint",)}
@@ -83,9 +84,8 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
         name = path.stem.encode(errors="backslashreplace").decode()
         return RobotFile(name, path, "file", (path.resolve().parent,))
     if isinstance(robot, Path) or path.suffix or len(Path(robot).parts) != 1:
-        raise FileError(
-            f"no file at '{path}'; give the path of a URDF or a name that `fflin robots` lists"
-        )
+        hint = "; give the path of a URDF or a name that `fflin robots` lists"
+        raise FileError(f"no file at '{shown(path)}'{missing(path, hint)}")
     if text == "cassie":
         raise UrdfError(
             "'cassie' exists only as SDF, which the packaged Pinocchio cannot read; load another "

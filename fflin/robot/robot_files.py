@@ -273,7 +273,7 @@ def read_appendages(document: TomlFile) -> list[Appendage]:
         alone = set(signature(special).parameters) - set(signature(make).parameters)
         for index, table in enumerate(_tables(document, key)):
             build: Any = special if alone & set(table) else make
-            of, place = f"{key} {index + 1}: ", (key, index)
+            of, place = _entry(key, index, table), (key, index)
             hidden = {"inertia"} if build is special else {"inertia", "rigid"}
             required = {
                 name: parameter.default is parameter.empty
@@ -310,7 +310,7 @@ def _built(
 
     `required` says of each key whether it must be given; `known` are the keys that a message lists.
     """
-    of = f"{place[0]} {place[1] + 1}: "
+    of = _entry(*place, values)
     for name in values:
         if name not in required:
             raise document.error(unknown(what, name, dict.fromkeys(known)), *place, name)
@@ -324,8 +324,14 @@ def _built(
             raise type(error)(f"{of}{error}") from None
 
 
+def _entry(key: str, index: int, table: Mapping[str, Any]) -> str:
+    """Return the beginning of a message about a table: its number, and its name if it has one."""
+    name = table.get("name")
+    return f"{key} {index + 1} ('{name}'): " if isinstance(name, str) else f"{key} {index + 1}: "
+
+
 def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
-    kind, of, place = table.get("type"), f"input {index + 1}: ", ("input", index)
+    kind, of, place = table.get("type"), _entry("input", index, table), ("input", index)
     if kind is None:
         near = [key for key in table if key.lower() == "type"]
         hint = f", but there is a key '{near[0]}'" if near else ""
