@@ -135,7 +135,7 @@ def _load(
     found: RobotFile, locks: Sequence[Lock | None], package_dirs: tuple[Path, ...]
 ) -> tuple[Robot, tuple[Advice, ...]]:
     """Return the robot of a URDF, and the warnings that its fields may still remove."""
-    description = read_urdf(found.path, found.prune)
+    description = read_urdf(found.path)
     loaded = _robot(description.model, found.name, locks, description.mimics)
     folders = (*package_dirs, *found.package_dirs)
     # Meshes are read when the robot is drawn, and no output may take their place before.
