@@ -4,10 +4,11 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 from fflin.base.errors import FileError, InputError, require_known, unknown
+from fflin.base.writing import as_path
 
 # Robots of example-robot-data that its loader's code makes from the URDF of another robot.
 _MADE_BY_CODE = ("talos_legs",)
@@ -102,6 +103,14 @@ def find_inputs(inputs: str | Path) -> Path:
     if path.name == str(inputs) and not path.suffix and not os.path.lexists(path):
         raise unknown("file or bundled set of inputs", str(inputs), sorted(bundled))
     return path
+
+
+def folders(given: Any, within: str | Path = "") -> tuple[Path, ...]:
+    """Return one folder or a list of folders, relative to a folder."""
+    listed = [given] if isinstance(given, str | os.PathLike) else given
+    if not isinstance(listed, Sequence):
+        raise InputError(f"package_dirs is {given!r}, expected a list of folders")
+    return tuple(within / as_path(folder) for folder in listed)
 
 
 def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
