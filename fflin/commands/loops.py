@@ -93,7 +93,7 @@ def add_loop(command: parser.Command) -> None:
         "T",
     )
     options.add_step(run)
-    methods = "integration method: cf4 (default), rkmk4 or semi_implicit_euler"
+    methods = "integration method: cf4 (default) or semi_implicit_euler"
     run.add("--method", methods, metavar="METHOD", default="cf4")
     options.add_system(command)
     options.add_frame(run)

@@ -96,7 +96,7 @@ def simulate(
         callback, a disturbance or a custom Python policy is not repeated, because such a function
         may have an internal state. For continuous policies without delay, the step is adjusted to
         divide the duration.
-    method : {"cf4", "rkmk4", "semi_implicit_euler"}
+    method : {"cf4", "semi_implicit_euler"}
     project : bool
         Whether the projection after each step restores momentum and centre of mass.
     sample : float, optional
