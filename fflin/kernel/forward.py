@@ -6,7 +6,7 @@ either. Momentum and centre of mass follow from the external impulse,
 
 .. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
 
-(11.2) of docs/derivation.md, as `simulation.conservation` has it; momentum is linear, then angular
+(11.2) of docs/derivation.md, as `simulation.plant` has it; momentum is linear, then angular
 about where the base's origin was at the start, and places are seen from there.
 """
 

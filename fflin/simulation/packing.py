@@ -19,9 +19,8 @@ from fflin.kernel.arguments import empty
 from fflin.kernel.tree import Tree, batch_tree, layout_of, loads_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.limits import limits_of
-from fflin.simulation.conservation import MomentumReference, conserved_by
 from fflin.simulation.plan import Plan
-from fflin.simulation.plant import Plant, triads
+from fflin.simulation.plant import MomentumReference, Plant, conserved_by, triads
 from fflin.simulation.run import stop_conditions
 
 SLOTS = 128  # samples whose noise is there at a time, and steps of a campaign
