@@ -195,5 +195,5 @@ def _export(arguments: argparse.Namespace) -> Report:
     )
     name, real = arguments.name, arguments.real
     test = f"cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm && ./{name}_test"
-    text = f"{law!r} in C99, with numbers of type {real}\nto test it in {folder}: {test}"
-    return Report(law.robot, {"name": name, "real": real, "folder": str(folder)}, text)
+    said = f"{law!r} in C99, with numbers of type {real}\nto test it in {folder}: {test}"
+    return Report(law.robot, {"name": name, "real": real, "folder": str(folder)}, said)
