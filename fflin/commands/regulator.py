@@ -173,8 +173,10 @@ def _lqr(arguments: argparse.Namespace) -> Report:
     gain = gain_of(regulated_part(lin, arguments), arguments)
     if pulling := one_sided(gain):  # a simulation reports how much of it is cut
         warnings.warn(pulling, FflinWarning, stacklevel=2)
+    # The warnings are on the standard error output.
+    text = "\n\n".join(x for x in str(gain).split("\n\n") if not x.startswith("warning: "))
     files = {arguments.output_file: gain.save, arguments.plot: figure_of("plot_loops", gain)}
-    return Report(gain.robot, gain, str(gain), files)
+    return Report(gain.robot, gain, text, files)
 
 
 def _export(arguments: argparse.Namespace) -> Report:

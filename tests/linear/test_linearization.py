@@ -235,9 +235,7 @@ def test_input_alone_is_not_dropped():
 
 def test_linearizer_is_shared_copied_and_pickled():
     robot = fflin.load("dual_arm")
-    linearizer = fflin.Linearizer(
-        robot, frame="world", reference=pin.SE3.Identity()
-    )
+    linearizer = fflin.Linearizer(robot, frame="world", reference=pin.SE3.Identity())
     rng = np.random.default_rng(15)
     points = [random_point(robot, rng) for _ in range(40)]
     expected = [linearizer(*point) for point in points]
