@@ -14,7 +14,7 @@ from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.results import Report, figure_of
 from fflin.commands.tracking import add_trajectory
 
-_ERRORS = "attitude [deg], position [m], joints, turning (omega_b), moving (v_b) or rates"
+_ERRORS = "attitude [deg], position [m], joints, omega_b, v_b or joint rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
 
 # Options of other commands, which `along` refuses.

@@ -169,8 +169,10 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
 def _lqr(arguments: argparse.Namespace) -> Report:
     _, lin = linear_model(arguments)
     gain = gain_of(regulated_part(lin, arguments), arguments)
+    # The warnings are on the standard error output.
+    text = "\n\n".join(x for x in str(gain).split("\n\n") if not x.startswith("warning: "))
     files = {arguments.output_file: gain.save, arguments.plot: figure_of("plot_loops", gain)}
-    return Report(gain.robot, gain, str(gain), files)
+    return Report(gain.robot, gain, text, files)
 
 
 def _export(arguments: argparse.Namespace) -> Report:
