@@ -36,10 +36,19 @@ KINDS = {
     "attitude": "deg",
     "position": "m",
     "joints": "rad|m",
-    "turning": "rad/s",
-    "moving": "m/s",
-    "rates": "rad/s|m/s",
+    "omega_b": "rad/s",
+    "v_b": "m/s",
+    "joint rates": "rad/s|m/s",
 }
+# Former names of kinds, which conditions and goals may still use.
+_FORMER = {"turning": "omega_b", "moving": "v_b", "rates": "joint rates"}
+
+
+def kind_named(name: str) -> str:
+    """Return a name of a kind of error, such as ``worst turning``, with its present words."""
+    of, _, kind = name.rpartition(" ")
+    kind = _FORMER.get(kind, kind) if of in ("", "worst", "settle") else kind
+    return f"{of} {kind}".strip()
 
 
 class Outcome(NamedTuple):

@@ -24,9 +24,9 @@ from fflin.control.tracking import (
     tracking_of,
 )
 from fflin.dynamics import points
-from fflin.dynamics.inertia import rotor_names
+from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import Integrator, integrator
-from fflin.dynamics.names import ORBITAL, refuse_orbit
+from fflin.dynamics.rnea import rotor_names
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range

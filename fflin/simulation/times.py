@@ -11,8 +11,8 @@ from fflin.base.validation import Array, number, whole
 from fflin.control.linear_controller import LinearController, closed_loop
 from fflin.control.policies import StateFeedback, decider, fed_back
 from fflin.control.tracking import TrajectoryFeedback, largest_rate, tracking_of
+from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.state import StateMap
-from fflin.linear.sampling import held_exponential
 from fflin.robot.robot import Robot
 
 # Of a run whose duration is not given [s], and between looks at the linear loop.

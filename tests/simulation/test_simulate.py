@@ -263,6 +263,9 @@ def test_allocation_gives_the_wrench_with_thrusts_that_push():
     motion = fflin.simulate(robot, policy, x0=x0, duration=60.0, dt=0.05, sample=0.1)
     assert (motion.u >= 0.0).all()
     assert np.abs(motion.x[-1]).max() < 2e-3
+    (note,) = motion.notes
+    assert note == "allocation: the commanded tau_b, F_b are realised by thrust"
+    assert note in str(motion)
     # Attitude and position are those relative to the model's reference, wherever it starts.
     turned = fflin.configuration(robot, {}, pin.SE3(pin.rpy.rpyToMatrix(0.2, 0, 0), np.zeros(3)))
     motion = fflin.simulate(robot, policy, q0=turned, duration=60.0, dt=0.05, sample=0.1)
