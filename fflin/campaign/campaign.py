@@ -23,7 +23,7 @@ from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
 from fflin.campaign.spreads import SEED
 from fflin.campaign.statistics import KINDS, kind_named
-from fflin.linear.trajectory_files import labels, write_table
+from fflin.linear.files import labels, write_table
 
 if TYPE_CHECKING:
     from fflin.campaign.runs import CampaignJob

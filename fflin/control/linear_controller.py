@@ -17,11 +17,11 @@ from fflin.control.kalman import Compensator
 from fflin.control.policies import Clock, Feedback, Policy, decider, feedback_of
 from fflin.control.systems import fitted, system_of
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import held_exponential
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import Array, dimension, instance, number, positive, shaped, vector
+from fflin.dynamics.integrators import held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import held_cost
 
 Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 
