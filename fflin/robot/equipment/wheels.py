@@ -46,12 +46,13 @@ def mounted_wheels(
         if is_impossible(rest.mass, moments):
             of = "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
             about = float(axis @ bodies[joint].inertia @ axis)
+            lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
             raise InputError(
                 f"wheel '{name}' of {wheel.inertia:g} kg m^2 has a larger inertia than the link "
                 "that carries it: "
                 f"{of} has {about:.3g} kg m^2 about its axis, so that {moments[0]:.3g} kg m^2 "
                 "would be left without the wheel; the URDF's inertia must include the wheels, so "
-                "correct the URDF or the wheel"
+                f"correct the URDF or the wheel{lock}"
             )
         bodies[joint] = rest
         placement = pin.SE3(turned_to(axis), np.zeros(3))
