@@ -25,6 +25,7 @@ from fflin.robot.mass_properties import (
     LinkMass,
     Piece,
     given_bodies,
+    idle_coordinates,
     pieces_of,
     random_bodies,
 )
@@ -363,6 +364,11 @@ class Robot(Coordinates):
         """Names of the model's frames that inputs and outputs use."""
         of_inputs = [name for item in self.inputs for name in item.frames]
         return (*of_inputs, *(name for item in self.outputs for name in item.frames))
+
+    @cached_property
+    def idle_coordinates(self) -> tuple[str, ...]:
+        """Coordinates that can move together without moving mass; usually none."""
+        return idle_coordinates(self)
 
     @cached_property
     def wheels(self) -> dict[str, float]:
