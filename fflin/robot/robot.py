@@ -16,8 +16,7 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import with_appendages, with_inputs
-from fflin.robot.equipment.mounting import difference
-from fflin.robot.equipment.wheels import stored_momentum
+from fflin.robot.equipment.mounting import difference, stored_momentum
 from fflin.robot.fields import Range, Scope, checked_fields, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
