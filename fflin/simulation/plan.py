@@ -104,12 +104,6 @@ class Plan:
         """Time of the last stage, relative to the step; below 1 if inputs jump at knots."""
         return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
 
-    @property
-    def repeatable(self) -> bool:
-        """Whether the plan calls no user functions, which may have an internal state."""
-        bound_anew = self.policy is None or hasattr(self.policy, "bind")
-        return bound_anew and not self.events and self.callback is None
-
     def channel(self) -> Channel | None:
         """Return the channel of the law's commands to the inputs, without pending commands."""
         if self.law is None:

@@ -231,6 +231,10 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
         ("linearize", "ets_vi", "-o", output): "'ets_vi'",
         ("linearize", bad, "-o", output): "bad.urdf:1",
         ("linearize", tmp_path / "no.urdf", "-o", output): "no file",
+        ("check", tmp_path / "bad.tml"): f"in the folder {tmp_path}; did you mean 'bad.toml'",
+        ("check", tmp_path / "none" / "bad.toml"): "its folder does not exist",
+        ("check", "cubesat", "--inputs", tmp_path / "bud.toml"): "did you mean 'bad.toml'",
+        ("montecarlo", "cubesat", "--runs", 2): '[dispersions] and "base.mass" = 0.05',
         ("linearize", tmp_path, "-o", output): "folder",
         ("linearize", "ets_vii", "--joint", "joint_9=1", "-o", output): "'joint_9'",
         ("linearize", "ets_vii", "--joint", "joint_1=x", "-o", output): "'x'",
@@ -293,7 +297,8 @@ def test_robots_own_file_is_never_the_output(tmp_path):
     assert robot.read_bytes() == before
     sibling = tmp_path / "arm.A.csv"
     sibling.write_bytes(before)
-    assert "input file" in refused("linearize", sibling, "-o", tmp_path / "arm.csv")
+    code, _, error = run("linearize", sibling, "-o", tmp_path / "arm.csv")
+    assert code == 2 and "input file" in error
     assert sibling.read_bytes() == before
 
 
