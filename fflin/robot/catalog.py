@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 from fflin.base.errors import FileError, InputError, require_known, unknown
-from fflin.base.writing import as_path
+from fflin.base.writing import as_path, missing, shown
 
 # Robots of example-robot-data that its loader's code makes from the URDF of another robot.
 _MADE_BY_CODE = ("talos_legs",)
@@ -83,9 +83,8 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
         name = path.stem.encode(errors="backslashreplace").decode()
         return RobotFile(name, path, "file", (path.resolve().parent,))
     if isinstance(robot, Path) or path.suffix or len(Path(robot).parts) != 1:
-        raise FileError(
-            f"no file at '{path}'; give the path of a URDF or a name that `fflin robots` lists"
-        )
+        hint = "; give the path of a URDF or a name that `fflin robots` lists"
+        raise FileError(f"no file at '{shown(path)}'{missing(path, hint)}")
     require_known("robot", [text], list_robots())
     return _example_robot_data()[text]
 

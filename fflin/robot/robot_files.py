@@ -211,6 +211,8 @@ def _tables(document: TomlFile, key: str) -> list[dict[str, Any]]:
 def _built(document: TomlFile, place: tuple[str, int], build: Any, values: dict[str, Any]) -> Any:
     """Build the object of a table, with file and line in front of errors."""
     of, parameters = f"{place[0]} {place[1] + 1}: ", dict(signature(build).parameters)
+    if isinstance(name := values.get("name"), str):
+        of = of.replace(":", f" ('{name}'):")
     if build is FlexibleAppendage:  # which has more parameters from files of Nastran
         del parameters["inertia"], parameters["rigid"]
     for name in values:

@@ -11,7 +11,8 @@ from fflin.base.validation import Array, instance
 from fflin.control.channel import Channel
 from fflin.control.linear_controller import Compensation, LinearController
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
-from fflin.dynamics.state import StateMap, moved_by, moving_errors
+from fflin.dynamics.coordinates import moved_by, moving_errors
+from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.simulation.plant import Plant
 
