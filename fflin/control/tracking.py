@@ -20,8 +20,9 @@ from fflin.control.linear_controller import LinearController, Loop, Sample
 from fflin.control.policies import Allocation, Feedback, Policy, decider
 from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import Frame, StateMap, moved_by, moving_error
+from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.fit import require_same, require_turns, sensed
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
