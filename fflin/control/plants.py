@@ -25,6 +25,8 @@ def notes_of(policy: object, robot: Robot) -> tuple[str, ...]:
     inputs = [own.get(x.name, x) if isinstance(x, ReactionWheel) else x for x in asked]
     plant = robot if design is None else robot.replace(inputs=inputs)
     lin = getattr(policy, "lin", None)
+    if getattr(lin, "_robot", None) is robot:
+        return ()
     if along is not None:
         lin = linearize(along.robot, *along.point(float(along.t[0])), frame="local")
     if not isinstance(lin, LinearModel):

@@ -258,10 +258,10 @@ def _candidate(robot: Robot, index: int) -> tuple[str, str]:
     key = "axis" if kind == "reaction_wheel" else "direction"
     at, along = _vector(placement.translation), _vector(placement.rotation @ axis)
     position = "" if key == "axis" else "# position = [0, 0, 0]  # [m], in that frame\n"
-    said = f"# Link {_text(frame.name)} at {at} [m], {key} {along}, both in base axes"
-    said += f"; lock joint {_text(own)} to use this wheel:" if own else ":"
+    said = f"# Link {_text(frame.name)} at {at} [m], {key} {along}, both in base axes:"
+    lock = f"# To use this wheel, lock joint {_text(own)} above.\n" if own else ""
     text = (
-        f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n"
+        f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n{lock}"
         f'# [[input]]\n# type = "{kind}"\n# name = {_text(name)}\n# frame = {_text(frame.name)}\n'
         f"{position}# {key} = {_vector(axis)}\n{limits}"
     )

@@ -84,7 +84,7 @@ def test_all_that_init_suggests_can_be_taken(tmp_path):
     assert says(text, '"RCS_1"', "[-1, 0, 0]", "[1, 0, 0]")
     taken = re.sub(r"(?m)^# (?=\[|[a-z_]+ = |\"[\w. ]+\" = )", "", text)
     # The wheel takes the place of its joint, which no other line may then speak of.
-    assert says(text, 'lock joint "spin" to use this wheel')
+    assert says(text, 'To use this wheel, lock joint "spin" above.')
     (tmp_path / "free.toml").write_text(taken.replace('lock = ["spin"]', ""))
     with pytest.raises(fflin.InputError, match="lock 'spin' if it is the wheel's"):
         fflin.load(tmp_path / "free.toml")
