@@ -13,10 +13,9 @@ from fflin.analysis.reduction import regulated_part, selection
 from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array, Values, dimension, instance
-from fflin.control.default_weights import rule_weights
 from fflin.control.gain import Gain, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve
-from fflin.control.weights import Weight, cost_weights, weight
+from fflin.control.weights import Weight, cost_weights, rule_weights, weight
 from fflin.linear.model import LinearModel
 
 _SHOWN_RESIDUALS = 6
