@@ -22,7 +22,7 @@ BANDWIDTH, _HELD = 0.2, 0.3
 # offset of the base in radii of gyration, and a joint's [rad], [m], or this fraction of its range.
 ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
-# What grows is held by a loop of at least this fraction of its rate of _growth, and of the second
+# What grows is held by a loop of at least this fraction of its rate of growth, and of the second
 # fraction where the efforts have less. A slower one lets light joints swing by radians.
 _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
@@ -36,7 +36,7 @@ _IDLE = 1e-12
 # Iterations for the bandwidth of a robot with dampers, whose effect depends on the bandwidth.
 _PASSES = 4
 
-# A loop with springs or gravity is _slowed at most this many times. The fastest loop is taken that
+# A loop with springs or gravity is slowed at most this many times. The fastest loop is taken that
 # leaves the efforts at least this fraction of the best.
 _TRIALS, _IN_VAIN = 8, 0.9
 
@@ -305,7 +305,7 @@ def _efforts_left(lin: LinearModel) -> dict[str, float]:
 
 
 def _growth(lin: LinearModel) -> Limit:
-    """Return the largest rate of _growth [1/s] of the model, and which mode has it."""
+    """Return the largest rate of growth [1/s] of the model, and which mode has it."""
     poles, modes = np.linalg.eig(lin.A)
     rates = rates_of(poles, lin.dt).real
     fastest, k = float(rates.max()), int(rates.argmax())
@@ -335,7 +335,7 @@ def _slowed(
 ) -> tuple[Limit, str]:
     """Slow a loop with springs or gravity until it respects the limits; report what it achieves.
 
-    The loop is _slowed down to `least` and no further. Displacements `size` (m,) require efforts at
+    The loop is slowed down to `least` and no further. Displacements `size` (m,) require efforts at
     the start, and displacements `driven` also on the way back. The latter omit joints without a
     motor, which springs or gravity move.
     """
@@ -385,7 +385,7 @@ def _achieved(lin: LinearModel, trial: _Trial) -> str:
     said += f"damping ratio at least {(decay / fast).min():.2g}"
     slow = decay < _AS_SLOW * math.sqrt(0.5) * trial.limit.bandwidth
     if names := _moving_most(lin, trial.modes[:, slow]):
-        said += f"; _slowed by springs, gravity or motion: {listed(names)}"
+        said += f"; decaying more slowly: {listed(names)}"
     return said
 
 
