@@ -265,12 +265,13 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
     base = [f"{turn:g} deg"] * ("q_b" in groups)
     if "r_b" in groups:
         base.append(f"{size[groups.index('r_b')]:.2g} m")
-    joints = sorted(zip(lin.state_units, size, groups, strict=False))
-    largest = {unit: d for unit, d, group in joints if group == "q_m" and unit != "kg^0.5 m"}
+    sizes = [x for x in zip(lin.state_units, size, groups, strict=False) if x[2] == "q_m"]
+    units = dict.fromkeys(unit for unit, *_ in sizes if unit != "kg^0.5 m")
+    largest = {unit: max(d for of, d, _ in sizes if of == unit) for unit in units}
     from_where = [f"{' and '.join(base)} of the base"] if base else []
     if largest:
-        sizes = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
-        from_where.append(f"{sizes} of the joints")
+        each = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
+        from_where.append(f"{each} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
     slow = f"; bandwidth limited by {limit.what}" if limit.what else ""
     if beyond := [name for name, room in _efforts_left(lin).items() if room <= 0.0]:

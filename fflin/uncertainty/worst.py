@@ -15,7 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, shaped
-from fflin.control.margins import ACCURACY, gain_crossings, largest_gain
+from fflin.control.gain import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.singular_value import largest_bound
 
