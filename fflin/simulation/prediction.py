@@ -9,8 +9,8 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance
 from fflin.control.channel import Channel
-from fflin.control.linear_controller import Compensation, LinearController
-from fflin.control.policies import Allocation
+from fflin.control.linear_controller import LinearController
+from fflin.control.policies import Allocation, Compensation
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap, moved_by, moving_errors
 from fflin.linear.model import LinearModel
