@@ -283,7 +283,7 @@ def _unregulated(gain: Gain) -> str:
     reasons = {
         "base position and velocity": "no input pushes the base",
         "wheel angles": "ignorable",
-        "wheel speeds": "determined by the other states, or not required by wheel_speeds=",
+        "wheel speeds": "determined by the other states; any others by wheel_speeds=True",
     }
     groups = [("r_b.", "v_b."), ("q_m.",), ("qdot_m.",)]
     parts = [

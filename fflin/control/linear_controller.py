@@ -228,12 +228,16 @@ def growing(policy: object) -> tuple[str, ...]:
     said, by = list[str](), decider(policy)
     if not isinstance(by, LinearController):
         return ()
-    for what in ("linear loop", "controller by itself"):
-        poles = np.linalg.eigvals(by.loop if what == "linear loop" else by.system.A)
+    hint = "; if it was designed for negative feedback, set sign=-1 (--negative-feedback)"
+    for what, matrix, advice in (
+        ("linear loop", by.loop, hint),
+        ("controller by itself", by.system.A, ""),
+    ):
+        poles = np.linalg.eigvals(matrix)
         growth = np.abs(poles) - 1.0 if by.dt else poles.real
         if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
             pole, unit = complex(poles[growth.argmax()]), "" if by.dt else " 1/s"
-            said.append(f"the {what} is unstable, with a pole at {pole:.4g}{unit}")
+            said.append(f"the {what} is unstable, with a pole at {pole:.4g}{unit}{advice}")
     return tuple(said)
 
 
