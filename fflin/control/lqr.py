@@ -160,7 +160,8 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
     .. math:: k_p = \sqrt{q_p/r_a},\quad k_d = \sqrt{q_v/r_a + 2 s k_p},\quad
               u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
 
-    and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. Wheel speeds are not regulated. The weight on u is
+    and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. Wheel speeds are not
+    regulated. The weight on u is
     :math:`L^T R_a L`. The gain is computed without the product :math:`L^T R_a L`, so that an
     ill-conditioned inertia does not reduce the accuracy of the gain.
 

@@ -139,7 +139,7 @@ def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Inter
     of_knots = [Coefficients(*x) for x in zip(*ends, strict=True)]
     passages = zip(through[:count], through[count : 2 * count], through[2 * count :], strict=True)
     return [
-        _Interval(*knots[k : k + 2].tolist(), *three, *of_knots[k : k + 2])
+        _Interval(float(knots[k]), float(knots[k + 1]), *three, of_knots[k], of_knots[k + 1])
         for k, three in enumerate(passages)
     ]
 
