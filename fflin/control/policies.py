@@ -277,7 +277,7 @@ class Loop(Compensation):
         dt: float,
         noise: Callable[[float], ArrayLike] | None,
         size: int,
-        at: Callable[[float], Sample],
+        at: Callable[[float], Any],
         there: Callable[[float], tuple[Measuring, Array]],
     ) -> None:
         super().__init__(size, at, dt)
