@@ -93,7 +93,7 @@ def _pulses(
         name, item = thrusters[at[int(short.argmax())]]
         raise InputError(
             f"thruster '{name}' is pulsed, with a least impulse of {item.least_impulse or 0.0:g} "
-            f"N s, and samples of {time:g} s; give a longer sample=, or a policy for a sampled model"
+            f"N s, and samples of {time:g} s; give a longer sample= or a sampled policy"
         )
     return Pulses(
         at=np.array(at),

