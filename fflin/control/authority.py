@@ -125,7 +125,7 @@ def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]
     """
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust", ())
-    found = {"thrusters": len(thrusters), "every_way": False, "bounded": False}
+    found = dict[str, Any](thrusters=len(thrusters), every_way=False, bounded=False)
     found |= {"least_force": None, "least_torque": None}
     if not len(thrusters):
         return found
