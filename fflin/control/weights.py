@@ -82,8 +82,8 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     found = {index for name in largest for index in matching("state or input", name, keys)}
     if len({index < len(lin.state_names) for index in found}) > 1:
         raise InputError(
-            f"{listed(largest)} are states and inputs; call bryson once for the states and once "
-            "for the inputs"
+            f"largest has states and inputs ({', '.join(map(repr, largest))}); call bryson once "
+            "for the states and once for the inputs"
         )
     of_inputs = min(found) >= len(lin.state_names)
     names = input_keys(lin) if of_inputs else lin.state_names
@@ -349,7 +349,9 @@ def _weights_of(
     """Return what is given by index among the states and then the inputs, and the names."""
     states, inputs = lin.state_names, input_keys(lin)
     found, named = dict[int, _Given](), list[str]()
-    for part, known in (("q", states), ("r", inputs), ("bryson", (*states, *inputs))):
+    every = (*states, *inputs)
+    kinds = ("q", "state", states), ("r", "input", inputs), ("bryson", "state or input", every)
+    for part, kind, known in kinds:
         values = given.get(part, {})
         if of_robot:  # a reduced model has not all that a robot's weights name
             values = {key: x for key, x in values.items() if stands_for_any(key, known)}
@@ -358,10 +360,10 @@ def _weights_of(
             what = "largest value of '{}' (--bryson)"
             values = {key: inverse_square(what.format(key), x) for key, x in values.items()}
         first = len(states) if part == "r" else 0
-        at = {first + i: x for i, x in by_name("state or input", values, known).items()}
+        at = {first + i: x for i, x in by_name(kind, values, known).items()}
         if both := found.keys() & at.keys():
             raise InputError(
-                f"'{(*states, *inputs)[min(both)]}' has both a weight and a largest value "
+                f"'{every[min(both)]}' has both a weight and a largest value "
                 "(bryson); give only one of them"
             )
         found |= {i: _Given(x, part == "bryson") for i, x in at.items()}
