@@ -114,8 +114,9 @@ def wheel_report(properties: Mapping[str, Any]) -> str:
         f"{np.linalg.norm(total):.4g} in all; they span "
         f"{('no', 'only one', 'only two', 'three')[properties['axes']]} axes"
     )
-    reach = f", with at least {least:.4g} N m s in every direction at their largest speeds"
-    return folded([text + reach if least is not None else text])
+    if least is not None:
+        text += f", with at least {least:.4g} N m s in every direction at their largest speeds"
+    return folded([text])
 
 
 def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]:

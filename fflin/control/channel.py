@@ -92,8 +92,9 @@ def _pulses(
     if (short := least > most * time).any() or not time:
         name, item = thrusters[at[int(short.argmax())]]
         raise InputError(
-            f"thruster '{name}' is pulsed, with a least impulse of {item.least_impulse or 0.0:g} "
-            f"N s, and samples of {time:g} s; give a longer sample= or a sampled policy"
+            f"thruster '{name}' is pulsed and its samples last {time:g} s, expected samples that "
+            f"fit its least impulse of {item.least_impulse or 0.0:g} N s; give a longer sample=, "
+            "or a sampled policy"
         )
     return Pulses(
         at=np.array(at),

@@ -42,7 +42,7 @@ def test_it_shows_and_saves_the_gain_that_the_library_gives(capsys, tmp_path):
     )
     assert says(saved.weights, "q_b, tau_b.x, tau_m, q_m.joint_1")
     assert saved.K == pytest.approx(expected.K, rel=1e-9, abs=1e-9 * np.abs(expected.K).max())
-    for words in ("every entry", "A - B K", "disk margin", "q_b, q_m"):
+    for words in ("every entry", "A - B K", "disk margin", "q_b, tau_b.x"):
         assert words in out
 
 
