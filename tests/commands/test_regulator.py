@@ -90,7 +90,7 @@ def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
         "'taum'": ("--bryson", "taum=5"),
         "'q_b' (--bryson)": ("--bryson", "q_b=0"),
         "1e-200": ("--bryson", "q_b=1e-200"),
-        "'q_b'": ("--bryson", "q_b=1", "--q", "q_b=1"),
+        "'q_b.x'": ("--bryson", "q_b=1", "--q", "q_b=1"),
         "eigenvalue -1": ("--q", "q_b=-1"),
         "eigenvalue 0": ("--r", "F_b.y=0"),
         "-1 s": ("--sample", "-1"),

@@ -116,7 +116,7 @@ def test_wheels_add_up_in_base_axes():
     found = wheel_properties(robot, q, v)
     np.testing.assert_allclose(found["total"], expected, atol=1e-12)
     assert found["axes"] == 2 and found["least"] is None
-    assert "only two axes" in wheel_report(found)
+    assert "only two" in wheel_report(found)
     three = [fflin.ReactionWheel(x, inertia=1e-5, max_speed=300.0) for x in np.eye(3).tolist()]
     report = wheel_report(
         wheel_properties(fflin.load("cubesat", inputs=three), *2 * [np.zeros(13)])
