@@ -41,7 +41,7 @@ _PUBLIC = {
         "linear.linearization": ["linearize", "Linearizer"],
         "linear.model": ["LinearModel", "Certificate"],
         "dynamics.state": ["StateMap"],
-        "linear.nonlinear": ["outputs"],
+        "linear.fit": ["outputs"],
         "linear.equilibrium": ["equilibrium", "Equilibrium"],
         "linear.trajectory": ["Trajectory"],
         "linear.linear_trajectory": ["linearize_trajectory", "LinearTrajectory"],

@@ -45,7 +45,7 @@ from fflin.linear.linearization import Linearizer as Linearizer
 from fflin.linear.model import LinearModel as LinearModel
 from fflin.linear.model import Certificate as Certificate
 from fflin.dynamics.state import StateMap as StateMap
-from fflin.linear.nonlinear import outputs as outputs
+from fflin.linear.fit import outputs as outputs
 from fflin.linear.equilibrium import equilibrium as equilibrium
 from fflin.linear.equilibrium import Equilibrium as Equilibrium
 from fflin.linear.trajectory import Trajectory as Trajectory

@@ -6,8 +6,8 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, FrozenArrays, instance, positive
+from fflin.dynamics.integrators import held_cost
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import held_cost
 
 # A pole that decays less, relative to the fastest, may be one at zero that rounding moved.
 _DECAY = 1e-7

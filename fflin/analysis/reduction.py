@@ -17,7 +17,7 @@ from fflin.analysis.ranks import Margin, Noisy, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError, listed
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, frozen
-from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.files import given
 from fflin.linear.model import LinearModel, same_certificate

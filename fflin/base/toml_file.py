@@ -1,12 +1,11 @@
-"""TOML files: their values, the kinds of values, and the line number of each key."""
+"""TOML files: their values, and the line number of each key."""
 
 import re
-import reprlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from fflin.base.errors import FflinError, InputError
 from fflin.base.names import stands_for_any
@@ -45,27 +44,6 @@ def is_number(value: Any) -> bool:
     """Whether a value of TOML is a finite number."""
     # The limit keeps lengths finite, and integers that no float can hold out.
     return type(value) in (int, float) and abs(value) < 1e100
-
-
-def is_vector(value: Any) -> bool:
-    """Whether a value of TOML is a list of three finite numbers."""
-    return isinstance(value, list) and len(value) == 3 and all(map(is_number, value))
-
-
-class Kind(NamedTuple):
-    """Kind of value in a TOML file: the test of a value, and what a message expects."""
-
-    fits: Callable[[Any], bool]
-    expected: str
-
-
-NAME = Kind(lambda value: isinstance(value, str) and value != "", "a text in quotes")
-NUMBER = Kind(is_number, "a finite number")
-VECTOR = Kind(is_vector, "three finite numbers [x, y, z]")
-NUMBERS = Kind(
-    lambda value: is_number(value) or is_vector(value), "one finite number, or three for [x, y, z]"
-)
-TRUTH = Kind(lambda value: isinstance(value, bool), "true or false")
 
 
 class TomlFile:
@@ -114,12 +92,6 @@ class TomlFile:
         """Build an error that names the file and the line of a key, of the problem's own type."""
         kind = type(problem) if isinstance(problem, FflinError) else InputError
         return kind(f"{self.path}:{self.line(*place)}: {problem}")
-
-    def require(self, kind: Kind, value: Any, *place: str | int, of: str = "") -> None:
-        """Raise `InputError` if a value is not of a kind; `of` names its table in the message."""
-        if not kind.fits(value):
-            name = of or ".".join(map(str, place))
-            raise self.error(f"{name} is {reprlib.repr(value)}, expected {kind.expected}", *place)
 
     @contextmanager
     def located(self, *table: str | int) -> Iterator[None]:

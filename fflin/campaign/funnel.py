@@ -34,7 +34,7 @@ from fflin.batch.run import Progress, check_workers
 from fflin.batch.workers import OwnWorkers
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
-from fflin.campaign.statistics import KINDS
+from fflin.campaign.statistics import KINDS, kind_named
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
 from fflin.dynamics.points import point_of
@@ -300,9 +300,9 @@ def funnel(
     schedule : GainSchedule or TrajectoryFeedback
         Schedule designed by `tvlqr`, continuous or sampled.
     goal : mapping or float
-        {"attitude" [deg], "position" [m], "joints" [rad|m], "turning" [rad/s], "moving" [m/s],
-        "rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`. A number
-        is the largest final value of ``e' P e``.
+        {"attitude" [deg], "position" [m], "joints" [rad|m], "omega_b" [rad/s], "v_b" [m/s],
+        "joint rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`.
+        A number is the largest final value of ``e' P e``.
     within : mapping, optional
         Largest errors allowed at any time of a run, as a mapping with the same keys as `goal`.
     knots : int or sequence of float
@@ -475,7 +475,8 @@ def _judged(
 
 def _bounds(name: str, given: Any, kinds: Iterable[str]) -> dict[str, float]:
     """Return the checked bounds {kind: largest error}."""
-    for key in by_name(name, given, "kind"):
+    given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
+    for key in given:
         if key not in kinds:
             raise unknown(f"kind of error in {name}", str(key), list(kinds))
     if name == "goal" and not given:

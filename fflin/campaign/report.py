@@ -47,11 +47,18 @@ def goal_met(campaign: Any, goal: str) -> str:
 
 
 def influences(campaign: Any) -> dict[str, dict[str, float]]:
-    """Return the significant rank correlations of the worst errors with the drawn values."""
-    worst, doubt = [f"worst {kind}" for kind in campaign.judged], 3.0 / math.sqrt(len(campaign))
+    """Return the significant rank correlations of the drawn values with the figures of interest.
+
+    These are the figures in the goals, then the worst errors and the settling time, at most five.
+    """
+    about, doubt = (
+        [campaign.about, *(x.name for x in campaign.bounds)],
+        3.0 / math.sqrt(len(campaign)),
+    )
+    worst = [f"worst {kind}" for kind in campaign.judged]
     return {
         name: {k: x for k, x in campaign.sensitivity(name).items() if abs(x) > doubt}
-        for name in list(dict.fromkeys([campaign.about, *worst]))[:2]
+        for name in list(dict.fromkeys([*about, *worst, "settle"]))[:5]
     }
 
 

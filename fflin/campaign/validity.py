@@ -22,7 +22,7 @@ from fflin.batch.workers import OwnWorkers
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, Loop, checked_loop, settle, settling_runs
-from fflin.dynamics.names import Frame, refuse_orbit
+from fflin.dynamics.coordinates import Frame, refuse_orbit
 from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot

@@ -51,12 +51,9 @@ def add_commands(commands: parser.Commands) -> None:
     urdf = "path of a URDF, or a robot name listed by `fflin robots`"
     init.add_argument("robot", metavar="URDF", type=parser.input_name, help=urdf)
     what = "the robot file (by default the URDF's name with .toml, in the current folder)"
-    options.add_output_file(
-        init.group(parser.OUTPUT),
-        what,
-        parser.OutputFile((".toml",)),
-        force="replace an existing file",
-    )
+    output = init.group(parser.OUTPUT)
+    options.add_output_file(output, what, parser.OutputFile((".toml",)))
+    output.switch("--force", "replace an existing file")
     _add_linearize(commands)
     _add_check(commands)
 
@@ -82,9 +79,7 @@ def _add_linearize(commands: parser.Commands) -> None:
     )
     add_trajectory(linearize)
     what = "A, B, C, D (with .csv one file per matrix: NAME.A.csv, ...)"
-    options.add_output_file(
-        made, what, parser.TABLE, "LinearModel", "LinearTrajectory", "ToolModel"
-    )
+    options.add_output_file(made, what, parser.TABLE)
     options.add_figure(linearize, "the magnitudes of the entries of A and B")
 
 

@@ -34,8 +34,8 @@ def add_commands(commands: parser.Commands) -> None:
         "dispersions",
         metavar="DISPERSIONS",
         type=parser.input_file,
-        help="TOML file with a table [dispersions] that defines the random parameters; see "
-        "fflin.load_dispersions",
+        help='TOML file with a line [dispersions], and a line such as "base.mass" = 0.05 '
+        "(standard deviation) for each random parameter; see fflin.load_dispersions",
     )
     runs = montecarlo.group("runs")
     runs.add("--runs", "number of runs", int, required=True)
@@ -66,7 +66,8 @@ def add_commands(commands: parser.Commands) -> None:
     options.add_figure(montecarlo, "quantile bands over time, histograms and the worst runs")
     what = "the runs (after an interruption, the same command resumes from FILE.part)"
     force = "replace the file of -o even if the file contains another campaign"
-    options.add_output_file(shown, what, parser.ROWS, force=force)
+    options.add_output_file(shown, what, parser.ROWS)
+    shown.switch("--force", force)
     add_pictures(montecarlo, "that plays the worst run, with the paths of other runs as thin lines")
 
 

@@ -14,7 +14,7 @@ from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.results import Report, figure_of
 from fflin.commands.tracking import add_trajectory
 
-_ERRORS = "attitude [deg], position [m], joints, turning (omega_b), moving (v_b) or rates"
+_ERRORS = "attitude [deg], position [m], joints, omega_b, v_b or joint rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
 
 # Options of other commands, which `along` refuses.
@@ -71,8 +71,7 @@ def _add_funnel(commands: parser.Commands) -> None:
         "funnel",
         _funnel,
         "find the initial errors from which the regulator along a trajectory reaches a goal",
-        example="fflin funnel arm.toml --trajectory plan.csv --schedule gains.npz "
-        "--goal attitude=1",
+        example="fflin funnel arm.toml --schedule gains.npz --goal attitude=1",
         common="trajectory schedule goal within weights q r knots samples seed threads "
         "dt limits limit frame inputs output-file plot html",
     )
@@ -100,7 +99,7 @@ def _add_funnel(commands: parser.Commands) -> None:
     options.add_step(runs)
     shown.add("--html", "write a page that plays the motion with the funnel as a tube", parser.PAGE)
     options.add_figure(funnel, "the funnel")
-    options.add_output_file(shown, "the funnel", parser.RECORD, "Funnel")
+    options.add_output_file(shown, "the funnel", parser.RECORD)
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 
@@ -146,7 +145,7 @@ def _funnel(arguments: argparse.Namespace) -> Report:
     from fflin.campaign.funnel import funnel
 
     if arguments.trajectory is None and arguments.schedule is None:
-        raise InputError("neither --trajectory nor --schedule is given; give one of them, or both")
+        raise InputError("neither --trajectory nor --schedule is given; give one of them")
     robot = load_robot(arguments)
     options.settle_step(arguments)
     policy, _ = along(robot, arguments)

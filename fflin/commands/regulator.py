@@ -7,7 +7,7 @@ import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fflin.base.errors import EquilibriumError, FflinWarning, FileError, StabilizabilityError
+from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityError
 from fflin.commands import options, parser
 from fflin.commands.points import linear_model, once
 from fflin.commands.results import Report, figure_of
@@ -35,7 +35,7 @@ def _add_lqr(commands: parser.Commands) -> None:
     )
     options.add_point(lqr)
     add_weights(lqr)
-    options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD, "Gain")
+    options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD)
     options.add_figure(lqr, "the poles, and the loop gain of each input with its margins,")
 
 
@@ -137,7 +137,7 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     """Return the regulator of the weights; warn if its margins are small."""
-    from fflin.control.gain import fragility
+    from fflin.control.gain import fragility, one_sided
     from fflin.control.lqr import lqr, require_fixed_point
     from fflin.control.weights import rule_weights
 
@@ -161,24 +161,22 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     except StabilizabilityError as error:
         hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
         raise StabilizabilityError(f"{error}{hint}") from None
-    if fragile := fragility(gain):
-        warnings.warn(fragile, FflinWarning, stacklevel=2)
+    for text in filter(None, (fragility(gain), one_sided(gain))):
+        warnings.warn(text, FflinWarning, stacklevel=2)
     return gain
 
 
 def _lqr(arguments: argparse.Namespace) -> Report:
-    from fflin.control.gain import one_sided
-
     _, lin = linear_model(arguments)
     gain = gain_of(regulated_part(lin, arguments), arguments)
-    if pulling := one_sided(gain):  # a simulation reports how much of it is cut
-        warnings.warn(pulling, FflinWarning, stacklevel=2)
+    # The warnings are on the standard error output.
+    text = "\n\n".join(x for x in str(gain).split("\n\n") if not x.startswith("warning: "))
     files = {arguments.output_file: gain.save, arguments.plot: figure_of("plot_loops", gain)}
-    return Report(gain.robot, gain, str(gain), files)
+    return Report(gain.robot, gain, text, files)
 
 
 def _export(arguments: argparse.Namespace) -> Report:
-    from fflin.commands.cli import kind_of
+    from fflin.base.record import read_record, reading, text
     from fflin.control.gain import Gain
     from fflin.control.gain_schedule import GainSchedule
     from fflin.control.kalman import Compensator
@@ -186,13 +184,9 @@ def _export(arguments: argparse.Namespace) -> Report:
     from fflin.robot.loading import load
 
     kinds = {kind.__name__: kind for kind in (Gain, GainSchedule, Compensator)}
-    kind = kind_of(arguments.file)
-    if kind not in kinds and arguments.file.is_file():
-        raise FileError(
-            f"{arguments.file} contains {kind or 'no result of fflin'}, expected a Gain, a "
-            "GainSchedule or a Compensator"
-        )
-    law = kinds.get(kind, Gain).load(arguments.file)
+    with reading(arguments.file, "Gain, GainSchedule or Compensator"):
+        kind = kinds[text(read_record(arguments.file)[0]["kind"])]
+    law = kind.load(arguments.file)
     folder = write_c(
         law,
         arguments.output_folder,
@@ -203,5 +197,5 @@ def _export(arguments: argparse.Namespace) -> Report:
     )
     name, real = arguments.name, arguments.real
     test = f"cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm && ./{name}_test"
-    text = f"{law!r} in C99, with numbers of type {real}\nto test it in {folder}: {test}"
-    return Report(law.robot, {"name": name, "real": real, "folder": str(folder)}, text)
+    said = f"{law!r} in C99, with numbers of type {real}\nto test it in {folder}: {test}"
+    return Report(law.robot, {"name": name, "real": real, "folder": str(folder)}, said)

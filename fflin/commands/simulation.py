@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import warnings
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from fflin.base.errors import FflinWarning, InputError
+from fflin.base.errors import InputError
 from fflin.base.names import chosen, input_keys
 from fflin.commands import DONE, FELL_SHORT, options, parser
 from fflin.commands.loops import add_loop, loop_of, target_of
@@ -16,7 +15,6 @@ from fflin.commands.results import Report
 from fflin.commands.visual import add_pictures, check_pictures, pictures
 
 if TYPE_CHECKING:
-    from fflin.control.policies import StateFeedback
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
 
@@ -51,9 +49,7 @@ def _add_plan(commands: parser.Commands) -> None:
     weight = "weight on an input, a group or a pattern. The default is 1/limit^2"
     group.add("--r", weight, parser.assignment, "NAME=W", repeatable=True)
     options.add_limits(group)
-    options.add_output_file(
-        plan.group(parser.OUTPUT), "the trajectory", parser.TABLE, "Trajectory", "Motion"
-    )
+    options.add_output_file(plan.group(parser.OUTPUT), "the trajectory", parser.TABLE)
     # Options of other commands, which the start and the target read.
     plan.set_defaults(relative_equilibrium=None)
 
@@ -90,7 +86,7 @@ def _add_simulate(commands: parser.Commands) -> None:
         metavar="NAME",
         repeatable=True,
     )
-    options.add_output_file(shown, "the motion", parser.TABLE, "Motion")
+    options.add_output_file(shown, "the motion", parser.TABLE)
     add_pictures(simulate)
 
 
@@ -129,33 +125,8 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
 
     loop = loop_of(robot, arguments)
     # The continuous model predicts every row, a sampled model only its samples.
-    foresees: dict[str, Any] = {"linear": loop.lin} if loop.feedback else {}
     shown = {"every": arguments.every, "engine": arguments.engine}
-    motion = simulate(robot, loop.policy, **shown, **loop.options, **foresees)
-    if loop.feedback:
-        _warn_of_cut_thrust(robot, motion, loop.feedback)
-    return motion
-
-
-def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> None:
-    from fflin.dynamics.actuation import Actuation
-    from fflin.dynamics.state import StateMap
-
-    groups = Actuation(StateMap(robot)).groups
-    if "thrust" not in groups:
-        return
-    lin, names = policy.lin, motion.state_names
-    deviation = motion.x[:, [names.index(name) for name in lin.state_names]] - lin.x0
-    asked = (lin.u0 - deviation @ policy.K.T)[:, groups["thrust"]]
-    # Rounding error in the command of an idle thruster does not count.
-    pulled = (asked < -1e-9 * abs(asked).max(initial=0.0)).any(axis=1).mean()
-    if pulled > 0.0:
-        warnings.warn(
-            f"thrusters cannot pull: negative thrust was commanded in {100.0 * pulled:.1f} % of "
-            "the run and set to zero; --allocate produces the wrench with positive thrusts",
-            FflinWarning,
-            stacklevel=2,
-        )
+    return simulate(robot, loop.policy, **shown, **loop.options, **loop.prediction)
 
 
 def _plan(arguments: argparse.Namespace) -> Report:

@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.commands import options, parser
-from fflin.commands.points import configuration_of, load_robot, once, velocity_of
+from fflin.commands.points import configuration_of, load_robot, once, refuse, velocity_of
 from fflin.commands.results import Report
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    import pinocchio as pin
+
     from fflin.base.process import Progress
     from fflin.base.validation import Array
     from fflin.batch.configurations import Configurations
     from fflin.robot.robot import Robot
-
-# Larger results [B] need --yes.
-_LARGE = 10e9
 
 _DASK_TIMEOUT = 10  # seconds
 
@@ -39,7 +37,7 @@ def add_commands(commands: parser.Commands) -> None:
         example="fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 "
         "-o grid.h5",
         common="grid random configurations seed range joint velocity inputs output frame engine "
-        "workers yes output-file",
+        "workers output-file",
     )
     points = sweep.group(
         "points",
@@ -95,9 +93,8 @@ def add_commands(commands: parser.Commands) -> None:
     work.add("--workers", workers, int)
     dask = "distribute the work over the workers of a dask scheduler"
     work.add("--dask", dask, metavar="ADDRESS")
-    work.switch("--yes", "permit results of more than 10 GB")
     what = "the models (after an interruption, the same command resumes from FILE.part)"
-    options.add_output_file(sweep.group(parser.OUTPUT), what, parser.ROWS, "LinearBatch")
+    options.add_output_file(sweep.group(parser.OUTPUT), what, parser.ROWS, required=True)
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
@@ -111,11 +108,7 @@ def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
 
 def _axis(text: str) -> tuple[str, tuple[float, float, int]]:
     name, parts = _parts(text, "JOINT=LO:HI:N", "joint_1=-1:1:21")
-    low, high, count = (
-        parser.number(parts[0]),
-        parser.number(parts[1]),
-        parser.count_of(parts[2]),
-    )
+    low, high, count = *map(parser.number, parts[:2]), parser.count_of(parts[2])
     if not (low < high or (count == 1 and low == high)):
         raise argparse.ArgumentTypeError(f"'{text}' is empty; LO must be less than HI")
     return name, (low, high, count)
@@ -129,40 +122,22 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
 def _sweep(arguments: argparse.Namespace) -> Report:
     import pinocchio as pin
 
-    from fflin.batch.store import check_room, output_path, part_of, readable
+    from fflin.batch.store import check_room, part_of, readable
     from fflin.batch.sweep import planned_bytes, sweep
-    from fflin.dynamics.points import effort
 
     path = arguments.output_file
-    if path is None:
-        raise InputError("-o is missing; give a file .h5 or .npz for the models")
     robot = load_robot(arguments)
-    # A file of configurations has its own velocities.
-    at_rest: dict[str, Any] = {}
-    v = velocity_of(
-        robot, arguments, at_rest if arguments.configurations else robot.point, "velocity"
-    )
-    u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
     settings: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
-    said = ""
-
-    def announce(count: int, *, at_rest: bool) -> None:
-        nonlocal said
-        output_path(path)  # again, when the inputs are known
-        size = planned_bytes(robot, count, at_rest=at_rest, **settings)
-        said = f"{count:,} points of '{robot.name}', {readable(size)}"
-        if size > _LARGE and not arguments.yes:
-            raise InputError(
-                f"{said}: this is more than 10 GB; add --yes to permit it, or choose fewer points"
-            )
-        check_room(count, size, path)
-        part = part_of(path)
-        said += f" to {path}" + f", resuming from {part}" * part.exists()
-
-    q, v, u = _points(robot, arguments, v, u, announce)
+    q, v, u = _points(robot, arguments)
+    size = planned_bytes(robot, len(q), at_rest=v is None and u is None, **settings)
+    check_room(len(q), size, path)
+    part = part_of(path)
+    resuming = f", resuming from {part}" * part.exists()
     with executor_of(arguments) as executor:
-        print(f"fflin: {said}", file=sys.stderr)  # all options are valid
+        # All options are valid.
+        said = f"fflin: {len(q):,} points of '{robot.name}', {readable(size)} to {path}{resuming}"
+        print(said, file=sys.stderr)
         with going_on(path, "points") as progress:
             work = {name: getattr(arguments, name) for name in ("engine", "workers")}
             work |= {"executor": executor, "progress": progress}
@@ -175,74 +150,51 @@ def _sweep(arguments: argparse.Namespace) -> Report:
 
 
 def _points(
-    robot: Robot,
-    arguments: argparse.Namespace,
-    v: Array | None,
-    u: Array | None,
-    announce: Callable[..., None],
+    robot: Robot, arguments: argparse.Namespace
 ) -> tuple[Array | Configurations, Array | None, Array | None]:
     """Return q, v and u of the points."""
     import numpy as np
 
     from fflin.batch.configurations import as_configurations, grid, random_configurations
+    from fflin.dynamics.points import effort
     from fflin.robot.joints import by_joint
 
-    kinds = [bool(arguments.grid), arguments.random is not None, bool(arguments.configurations)]
-    if sum(kinds) != 1:
+    file = arguments.configurations
+    if [bool(arguments.grid), arguments.random is not None, file is not None].count(True) != 1:
         raise InputError(
             "the points of the sweep are not defined; give exactly one of --grid, --random and "
             "--configurations"
         )
     if arguments.range and arguments.random is None:
         raise InputError("--range needs --random; --grid has its own ranges")
-    if arguments.configurations:
-        if arguments.joint:
-            raise InputError(
-                "--joint and --configurations both set joint positions; give only one of them"
-            )
-        if arguments.rpy or arguments.position:
-            raise InputError(
-                "--rpy or --position is given with --configurations, which also sets the base "
-                "pose; give only one of them"
-            )
-        given = _given(arguments.configurations)
-        for name, value in (("v", v), ("u", u)):
-            if name in given and value is not None:
-                raise InputError(
-                    f"{arguments.configurations} contains {name}, and an option gives it too; "
-                    "leave the option out"
-                )
-        v, u = given.get("v", v), given.get("u", u)
-        announce(len(given["q"]), at_rest=v is None and u is None)
-        return as_configurations(robot, given["q"]), v, u
+    if file:
+        refuse(arguments, ("joint", "rpy", "position"), "--configurations contains q")
+        given = _given(file)
+        for name, option in (("v", "velocity"), ("u", "effort")):
+            if name in given:
+                refuse(arguments, (option,), f"{file} contains {name}")
+    # A file of configurations has its own velocities.
+    v = velocity_of(robot, arguments, {} if file else robot.point, "velocity")
+    u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
+    if file:
+        return as_configurations(robot, given["q"]), given.get("v", v), given.get("u", u)
     fixed = once("--joint", arguments.joint)
     base = _base(robot, configuration_of(robot, arguments, robot.point))
-    at_rest = v is None and u is None
     if arguments.random is not None:
         ranges = once("--range", arguments.range)
-        twice = sorted(set(ranges) & set(fixed))
-        if twice:
-            raise InputError(
-                f"joint '{twice[0]}' is in --joint and in --range; give only one of them"
-            )
         ranges |= {name: (value, value) for name, value in fixed.items()}
-        drawn = random_configurations(
-            robot, arguments.random, seed=arguments.seed, ranges=ranges, base=base
-        )
-        announce(arguments.random, at_rest=at_rest)
-        return drawn, v, u
+        drawn = {"seed": arguments.seed, "ranges": ranges, "base": base}
+        return random_configurations(robot, arguments.random, **drawn), v, u
     axes = once("--grid", arguments.grid)
     for name in axes:
         robot.joint(name)
-    # The points are counted before the grid is created.
-    announce(math.prod(count for _, _, count in axes.values()), at_rest=at_rest)
     values = {name: np.linspace(*axis) for name, axis in axes.items()}
     joints = {**robot.point.get("joints", {}), **by_joint(fixed, robot.joint_names, robot.joint)}
     others = {name: x for name, x in joints.items() if name not in axes or name in fixed}
     return grid(robot, values, joints=others, base=base), v, u
 
 
-def _base(robot: Robot, q: Array) -> Any:
+def _base(robot: Robot, q: Array) -> pin.SE3:
     import pinocchio as pin
 
     return robot.model.jointPlacements[1] * pin.XYZQUATToSE3(q[:7])

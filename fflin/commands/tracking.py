@@ -43,7 +43,7 @@ def add_commands(commands: parser.Commands) -> None:
         parser.assignment,
         repeatable=True,
     )
-    options.add_output_file(tvlqr.group(parser.OUTPUT), "the gains", parser.RECORD, "GainSchedule")
+    options.add_output_file(tvlqr.group(parser.OUTPUT), "the gains", parser.RECORD)
 
 
 def add_trajectory(command: parser.Command, *, required: bool = False) -> None:

@@ -19,11 +19,11 @@ from fflin.base.validation import Array, as_double, instance, number
 from fflin.base.writing import as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Policy, Sample, decider, feedback_of
+from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import held_exponential
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 

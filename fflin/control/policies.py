@@ -9,6 +9,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
+from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, frozen, instance, shaped, vector
 from fflin.control.channel import Law
 from fflin.dynamics.aba import Aba
@@ -169,7 +170,7 @@ class Allocation:
 
 
 class AllocatedPolicy:
-    """Policy of an `Allocation` for one robot; `advance` is that of the inner policy, or None."""
+    """Policy of an `Allocation` for one robot, with `advance` and `notes` of the inner policy."""
 
     def __init__(self, allocation: Allocation, robot: Robot) -> None:
         frame, reference = axes_of(allocation)
@@ -182,11 +183,23 @@ class AllocatedPolicy:
         inner = bound(allocation.policy, allocation.design)
         self._command = Law(inner, names, (-free, free), np.inf)
         self.advance = self._command.advance
+        self._inner = inner
         self._data, self._design_data = robot.create_data(), allocation.design.create_data()
         limits, open_ = limits_of(robot), (-np.inf, np.inf)
         self._least, self._most = np.array(
             [limits.get(name, open_) for name in self._robot.names]
         ).T
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks on a motion: which inputs are commanded, and which inputs act instead."""
+        asked, given = (
+            list(dict.fromkeys(group_of(key) for key in input_keys(each)))
+            for each in (self._design, self._robot)
+        )
+        said = f"allocation: the commanded {', '.join(asked)} are realised by {', '.join(given)}"
+        same = self._design.names == self._robot.names
+        return (*[said] * (not same), *getattr(self._inner, "notes", ()))
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose force is nearest to the force of the inner command."""

@@ -20,12 +20,12 @@ from fflin.control.kalman import disturbance, kalman
 from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
-from fflin.dynamics.inertia import rotor_names
+from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
+from fflin.dynamics.rnea import rotor_names
 from fflin.linear.equilibrium import equilibrium
 from fflin.linear.linear_trajectory import LinearTrajectory, Steps, along, transitions
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import HEAVY, LIGHT, held_cost
 from fflin.linear.trajectory import Trajectory
 
 

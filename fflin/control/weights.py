@@ -19,9 +19,9 @@ from fflin.base.errors import InputError, listed, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import Array, dimension, instance, number, positive, shaped, vector
 from fflin.control.default_weights import AT_A_POINT, Pace, default_weights
+from fflin.dynamics.integrators import held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import held_cost
 
 Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 

@@ -11,9 +11,8 @@ import pinocchio as pin
 from fflin.base import rotation as turning
 from fflin.base.errors import ChartError, InputError
 from fflin.base.validation import Array, instance, placement, vector
-from fflin.dynamics import names
-from fflin.dynamics.chart import SMALLEST_Q0, Chart
-from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR, Frame
+from fflin.dynamics import coordinates as names
+from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, Chart, Frame
 from fflin.dynamics.orbital import field_of
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot

@@ -31,8 +31,10 @@ from numpy.typing import NDArray
 
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.inertia import LARGEST_SHARE, Inertia, bounds_of
-from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
+from fflin.dynamics.rnea import (
+    Inertia,
+    bounds_of,
+)
 from fflin.dynamics.state import StateMap
 from fflin.kernel import inertia, rnea
 from fflin.kernel import vectors as vec
@@ -52,7 +54,6 @@ from fflin.kernel.rnea import (
     joint_axis,
 )
 from fflin.kernel.tree import INERTIA, LANES, PLACE, Tree, layout_of, loads_of, work_space
-from fflin.kernel.vectors import get6, minus6, put6, times6
 
 
 @inlined
@@ -215,18 +216,18 @@ def _solve(work, robot):
     none = (zero, zero, zero), (zero, zero, zero)
     # The first six columns, of the base's turn and shift, are zeros.
     for row in range(size):
-        put6(work, robot.slopes + row * width, none)
+        vec.put6(work, robot.slopes + row * width, none)
     for column in range(width % 6 or 6, width, 6):
         slopes = layout.lower + column
         for k in range(size):
-            put6(work, layout.held + k * 6, get6(work, slopes + k * width))
+            vec.put6(work, layout.held + k * 6, vec.get6(work, slopes + k * width))
         for row in range(size):
             total = none
             for k in range(size):
                 entry = load(work, tree.square + (row * size + k))
-                held = get6(work, layout.held + k * 6)
-                total = minus6(total, times6(held, entry))
-            put6(work, robot.slopes + column + row * width, total)
+                held = vec.get6(work, layout.held + k * 6)
+                total = vec.minus6(total, vec.times6(held, entry))
+            vec.put6(work, robot.slopes + column + row * width, total)
 
 
 @compiled
@@ -352,27 +353,6 @@ class RowAccelerations:
             moves,
         )
         return judged
-
-
-class CompiledAccelerations:
-    """`Accelerations` of one point by the compiled kernel, where that can vouch for it."""
-
-    def __init__(self, rows: RowAccelerations, otherwise: Accelerations) -> None:
-        self._rows, self._otherwise = rows, otherwise
-
-    def rates(
-        self, q: Array, v: Array, nu: Array, q_m: Array, u: Array, slopes: Array, by_u: Array
-    ) -> AccelerationDerivatives:
-        """Return the rates as `Accelerations.rates` does."""
-        eight_q, eight_nu, eight_q_m, eight_u = (
-            np.repeat(each[None], LANES, axis=0) for each in (q, nu, q_m, u)
-        )
-        all_slopes, all_by_u = (np.empty((LANES, *each.shape)) for each in (slopes, by_u))
-        c, judged = self._rows.write(eight_q, eight_nu, eight_q_m, eight_u, all_slopes, all_by_u)
-        if not (self._rows.sound(q[None], judged[:1]).all() and judged[0, 1] < LARGEST_SHARE):
-            return self._otherwise.rates(q, v, nu, q_m, u, slopes, by_u)
-        slopes[:], by_u[:] = all_slopes[0], all_by_u[0]
-        return AccelerationDerivatives(c[0], slopes, by_u, self._rows.state.gravity(q))
 
 
 def _writable(rows: Array) -> Array:

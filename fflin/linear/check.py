@@ -10,28 +10,26 @@ from fflin.base.errors import InputError
 from fflin.base.tables import folded, grid, width
 from fflin.base.validation import Array, instance, share
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.names import Groups
+from fflin.dynamics.coordinates import Groups
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
-from fflin.linear.certificate import (
+from fflin.linear.fit import require_same, sensed
+from fflin.linear.model import LinearModel
+from fflin.linear.verification import (
+    ErrorDynamics,
+    Nonlinear,
     aba_route,
     compare,
+    difference_steps,
+    flow_error,
     inertia_matrix,
     inertia_residual,
     inverse_inertia,
+    jacobian,
     mobilities,
     scaled_condition,
     speeds,
-)
-from fflin.linear.fit import require_same, sensed
-from fflin.linear.model import LinearModel
-from fflin.linear.nonlinear import (
-    ErrorDynamics,
-    Nonlinear,
-    difference_steps,
-    flow_error,
-    jacobian,
 )
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot

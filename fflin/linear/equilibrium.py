@@ -11,7 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import EquilibriumError, listed
 from fflin.base.validation import Array, FrozenArrays
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.names import ORBITAL, forces_of
+from fflin.dynamics.coordinates import ORBITAL, forces_of
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.linearization import Linearizer

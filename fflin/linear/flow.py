@@ -12,8 +12,8 @@ import pinocchio as pin
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.inertia import rotor_names
 from fflin.dynamics.integrators import CommutatorFree4
+from fflin.dynamics.rnea import rotor_names
 from fflin.dynamics.state import StateMap
 
 # Steps are halved until the end of an interval is this accurate, relative to the largest rates.

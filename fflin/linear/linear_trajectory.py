@@ -16,10 +16,10 @@ from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
 from fflin.linear.flow import interval_of
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import GAUSS, HEAVY, LIGHT, held_exponential
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 

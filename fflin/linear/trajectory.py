@@ -17,7 +17,7 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, as_double, frozen, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.names import refuse_orbit
+from fflin.dynamics.coordinates import refuse_orbit
 from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
@@ -250,7 +250,7 @@ class Trajectory(Design):
 
     def save(self, path: str | Path) -> None:
         """Write the trajectory to a .npz, .mat, .json or .csv file, atomically; see `load`."""
-        from fflin.linear.trajectory_files import write_csv
+        from fflin.linear.files import write_csv
 
         target = as_path(path)
         if type(self) is Trajectory and target.suffix == ".csv":
@@ -293,7 +293,7 @@ class Trajectory(Design):
         InputError
             If the entries of the file are not a valid trajectory of this robot.
         """
-        from fflin.linear.trajectory_files import read
+        from fflin.linear.files import read
 
         source = as_path(path)
         values = read(source, robot, hold, frame)
@@ -345,7 +345,7 @@ def along(motion: Any, robot: Robot | None) -> Trajectory:
             "the motion was read from a file, which does not contain its robot; give the robot"
         )
     entries = {name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")}
-    from fflin.linear.trajectory_files import arguments
+    from fflin.linear.files import arguments
 
     values = arguments(entries, robot, "previous", motion.frame, motion.verified)
     held = Trajectory(robot, **values)

@@ -261,17 +261,18 @@ class Coordinates:
 
     def create_data(self) -> pin.Data:
         """Return a new pin.Data for this robot, or raise `ModelError` if it exceeds 1 GiB."""
-        self.require_room()
+        require_room(self.model, self.name)
         return self.model.createData()
 
-    def require_room(self) -> None:
-        """Raise `ModelError` if a pin.Data of this robot would exceed 1 GiB."""
-        size = _DATA_BYTES_PER_NV3 * self.nv**3
-        if size > _DATA_LIMIT:
-            raise ModelError(
-                f"'{self.name}' has {self.n} joints, for which Pinocchio's Data takes about "
-                f"{size / 2**30:.1f} GiB, more than the limit of 1 GiB; lock unimportant joints"
-            )
+
+def require_room(model: pin.Model, name: str) -> None:
+    """Raise `ModelError` if a pin.Data of a model would exceed 1 GiB."""
+    size = _DATA_BYTES_PER_NV3 * int(model.nv) ** 3
+    if size > _DATA_LIMIT:
+        raise ModelError(
+            f"'{name}' has {model.njoints - 2} joints, for which Pinocchio's Data takes about "
+            f"{size / 2**30:.1f} GiB, more than the limit of 1 GiB; lock unimportant joints"
+        )
 
 
 def change_in(model: pin.Model, made: pin.Model) -> str:

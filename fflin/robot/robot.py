@@ -222,8 +222,7 @@ class Robot(Coordinates):
             If a field, a joint, a frame of an input or output, or a name in `limits` does not
             exist.
         ModelError
-            If dry friction is given, which is not differentiable at rest, or the robot's model
-            was changed after the robot was made.
+            If the robot's model was changed after the robot was made.
         """
         self.require_unchanged()
         robot = self
@@ -415,7 +414,7 @@ class Robot(Coordinates):
                 "wheel an inertia, or its momentum"
             )
         if any(locked.rpartition("=")[0] == name for locked in self.locked):
-            raise InputError(f"joint '{name}' is locked; lock it at another value instead")
+            raise InputError(f"joint '{name}' is locked; unlock it, or leave it out here")
         raise unknown("joint", name, self.joint_names)
 
     @cached_property
@@ -431,7 +430,7 @@ class Robot(Coordinates):
     def _without_motors(self, passive: Any) -> Robot:
         """Return the robot without the torques of joints that have no motor."""
         bare = self._bare
-        joints = checked_passive(passive, bare.joint, bare.joint_names, self.locked)
+        joints = checked_passive(passive, bare.joint, bare.joint_names)
         inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
         if not inputs:
             raise InputError(

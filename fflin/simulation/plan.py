@@ -23,9 +23,9 @@ from fflin.control.tracking import (
     tracking_of,
 )
 from fflin.dynamics import points
-from fflin.dynamics.inertia import rotor_names
+from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import Integrator, integrator
-from fflin.dynamics.names import ORBITAL, refuse_orbit
+from fflin.dynamics.rnea import rotor_names
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
@@ -102,12 +102,6 @@ class Plan:
     def last_node(self) -> float:
         """Time of the last stage, relative to the step; below 1 if inputs jump at knots."""
         return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
-
-    @property
-    def repeatable(self) -> bool:
-        """Whether the plan calls no user functions, which may have an internal state."""
-        bound_anew = self.policy is None or hasattr(self.policy, "bind")
-        return bound_anew and not self.events and self.callback is None
 
     def channel(self) -> Channel | None:
         """Return the channel of the law's commands to the inputs, without pending commands."""

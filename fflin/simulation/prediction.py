@@ -10,7 +10,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance
 from fflin.control.channel import Channel
 from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Allocation, Compensation
+from fflin.control.policies import Compensation
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap, moved_by, moving_errors
 from fflin.linear.model import LinearModel
@@ -20,7 +20,6 @@ from fflin.simulation.plant import Plant
 LinearLaw: TypeAlias = Callable[[Array], Array]
 
 _SHARES = (0.0, 0.5, 0.5, 1.0)  # of a step, at which its stages are
-_WHY_NOT = {Allocation: "an Allocation is not linear, as its thrusters cannot pull"}
 
 
 class Predictor(NamedTuple):
@@ -35,31 +34,24 @@ class Predictor(NamedTuple):
 
 def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryFeedback | None:
     """Return the predictor of a run: the policy's own model, or the given model."""
-    if isinstance(linear, np.bool_):
-        linear = bool(linear)
-    if linear is False:
+    if isinstance(linear, bool | np.bool_) and not linear:
         return None
-    if isinstance(policy, TrajectoryFeedback):
-        if linear is None or linear is True:
-            return policy
-        raise InputError(
-            "linear= is a model about one point, but a TrajectoryFeedback is linear along a "
-            "trajectory; leave linear= out"
-        )
+    given = not (linear is None or isinstance(linear, bool | np.bool_))
+    along = isinstance(policy, TrajectoryFeedback)
+    if along and not given:
+        return policy
     own: Any = getattr(policy, "lin", None)
-    if not (linear is None or linear is True):
+    if given and not along:
         own = _checked(plant, policy, linear)
     law = _law(policy, own) if isinstance(own, LinearModel) else None
     if law is not None and own.state_names == plant.state.names:
-        along = isinstance(policy, LinearController) and not policy.dt
-        return Predictor(policy.around(own)[0] if along else own, law)
+        extended = isinstance(policy, LinearController) and not policy.dt
+        return Predictor(policy.around(own)[0] if extended else own, law)
     if linear is None:
         return None
-    why = _WHY_NOT.get(type(policy), f"a {type(policy).__name__} is not known to be linear")
-    if law is not None:
-        why = "this policy's model is reduced, so that linear= must be the full model"
     raise InputError(
-        f"linear= is given, but {why}; leave linear= out, or use a StateFeedback, an "
+        f"linear= is given, but this model cannot predict a motion under {type(policy).__name__}; "
+        "leave linear= out, or give the full model of a StateFeedback, an "
         "OutputFeedback, a LinearController or no policy"
     )
 
@@ -121,49 +113,32 @@ def predict(plan: Any, x: Array, steps: int, target: Array) -> Array:
 
 def _states(predictor: Predictor, plan: Any, x: Array, steps: int) -> Array:
     dt, _, every, sample, delay, *_ = plan.times
-    lin, limits = predictor.lin, plan.limits
+    lin, limits = predictor.lin.generator, plan.limits
+    if lin is None:  # what happens between its samples is not known
+        return x[:0]
     x0, u0 = lin.x0, lin.u0
-    finer = len(limits.wheels.at) + len(limits.pulses.at) > 0  # than a sample
-    if finer:
-        lin = lin.generator or lin
     of = [lin.state_names.index(f"qdot_m.{name}") for name in limits.wheel_names]
     channel = Channel(
         predictor.law(), plan.initial, limits, sample, delay, speeds=lambda e: (x0 + e)[of]
     )
-    rows = []
+    rows: list[Array] = []
     e: Array = np.concatenate((x, np.zeros(len(x0) - len(x)))) - x0
-    if lin.dt:
-        # Between the samples of a sampled model there is nothing to say.
-        whole = round(lin.dt / dt)
-        if finer or sample != whole or any(count % whole for count in (delay, every, steps)):
-            return np.zeros((0, len(x)))
-        for step in range(0, steps, whole):
-            u = channel.begin(step, e)
-            if step % every == 0:
-                rows.append(e)
-            e = lin.A @ e + lin.B @ (u - u0) + lin.f0
-        return np.array([*rows, e]) + x0
-
-    held = lin.discretize(dt) if sample else lin
 
     def slope(_: int, e: Array) -> Array:
         rate: Array = lin.A @ e + lin.B @ (channel.ask(e) - u0) + lin.f0
         return rate
 
-    shift: Array = np.zeros(0)
-    transition: Array = np.zeros((0, 0))
-    if not sample and not channel.cuts:  # then a step is a matrix and a shift
-        shift = _after(dt, np.zeros(len(e)), slope)
-        columns = [_after(dt, unit, slope) - shift for unit in np.eye(len(e))]
-        transition = np.column_stack(columns)
+    stepped = not sample and channel.cuts
+    held = lin.discretize(dt) if sample else lin
+    A, B, f0 = held.A, held.B, held.f0
+    if not (sample or stepped):  # then a step is a matrix and a shift
+        f0 = _after(dt, np.zeros(len(e)), slope)
+        A = np.column_stack([_after(dt, unit, slope) - f0 for unit in np.eye(len(e))])
     for step in range(steps):
         u = channel.begin(step, e) if sample else u0
         if step % every == 0:
             rows.append(e)
-        if sample:
-            e = held.A @ e + held.B @ (u - u0) + held.f0
-        else:
-            e = transition.dot(e) + shift if len(shift) else _after(dt, e, slope)
+        e = _after(dt, e, slope) if stepped else A.dot(e) + B.dot(u - u0) + f0
     return (np.array([*rows, e]) + x0)[:, : len(x)]
 
 

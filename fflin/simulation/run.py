@@ -12,9 +12,8 @@ from fflin.base.validation import Array
 from fflin.control.channel import Channel
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.kernel.loop import StopConditions, goes_on
-from fflin.simulation.conservation import Conserved, MomentumReference
 from fflin.simulation.plan import Plan
-from fflin.simulation.plant import Plant
+from fflin.simulation.plant import Conserved, MomentumReference, Plant
 from fflin.simulation.times import LARGEST_TURN
 
 # Take one step from (t, q, v) under u as it begins; return q and v at its end.

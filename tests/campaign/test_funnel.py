@@ -102,8 +102,10 @@ def test_a_narrower_goal_is_a_narrower_funnel(still, schedule):
     ratio = np.sqrt(wide.rho / narrow.rho)
     assert ((ratio > 2.5) & (ratio < 6.5)).all()  # 4 in a linear loop, but for chance
     kept = fflin.funnel(
-        still[0], schedule, {"attitude": 1.0, "position": 0.02}, within={"turning": 1e-4}, knots=2
+        still[0], schedule, {"attitude": 1.0, "position": 0.02}, within={"omega_b": 1e-4}, knots=2
     )
+    with pytest.raises(fflin.UnknownNameError, match="did you mean omega_b"):
+        fflin.funnel(still[0], schedule, {"attitude": 1.0}, within={"omega": 1e-4}, knots=2)
     assert (kept.rho < wide.rho).all() and OUTCOME["beyond"] in kept.outcomes
     # No motion of its own keeps an arm to a goal that it never comes near.
     weak = fflin.funnel(still[0], schedule, {"attitude": 1.0}, knots=1, limits=1e-12, samples=8)

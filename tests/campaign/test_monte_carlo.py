@@ -19,6 +19,7 @@ from scipy.linalg import expm
 import fflin
 from fflin.campaign.report import worst_runs
 from fflin.campaign.runs import ARRAYS, CampaignJob
+from fflin.campaign.statistics import KINDS
 from fflin.simulation.report import courses
 from tests.support.campaigns import both
 from tests.support.measured import FELT, POSITIONS, designed
@@ -489,6 +490,8 @@ def test_goals_are_told_and_say_what_the_worst_is(robots):
     goals = ["position < 1 mm and settle < 5 s", "attitude > 0 deg"]
     case = {"runs": 30, "duration": 6.0, "dt": 0.02, "goals": goals, "confidence": 0.9}
     campaign = fflin.monte_carlo(robot, feedback(robot), START, until="attitude < 2 deg", **case)
+    for name in ("position", "settle", "attitude", "worst attitude", "worst position"):
+        assert f"rank correlations with {name}: " in str(campaign)
     assert campaign.goals == (*goals, "attitude < 2 deg") and campaign.about == "position"
     assert campaign.worst(1) == [int(campaign.values("position").argmax())]
     share = campaign.fraction("attitude < 2 deg", confidence=0.9)
@@ -516,11 +519,17 @@ def test_the_time_to_settle_is_that_of_the_motions_table(robots):
     )
     for run in range(3):
         motion = campaign.replay(run)
-        for course in courses(motion):
-            if course.title in ("attitude", "position", "joints"):
-                when = np.inf if course.late else motion.t[course.settled]
-                found = campaign.values(f"settle {course.title}")[run]
-                assert found == pytest.approx(when, rel=1e-12), course.title
+        made = {course.title: course for course in courses(motion)}
+        # A motion and a campaign call the kinds of error by the same names.
+        assert [*made] == [*KINDS]
+        for title, course in made.items():
+            when = np.inf if course.late else motion.t[course.settled]
+            found = campaign.values(f"settle {title}")[run]
+            assert found == pytest.approx(when, rel=1e-12), title
+    for former, name in (("turning", "omega_b"), ("moving", "v_b"), ("rates", "joint rates")):
+        for of in ("", "worst ", "settle "):
+            assert np.array_equal(campaign.values(of + former), campaign.values(of + name))
+        assert campaign.met(f"worst {former} < 1").all()
     assert np.isfinite(campaign.values("settle")).any()
 
 

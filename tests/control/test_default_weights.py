@@ -438,7 +438,7 @@ def test_panels_on_springs_come_to_rest_as_the_base_does(stiffness, inputs):
 
 LEGGED = (
     *("solo8", "solo12", "hyq", "a1", "b1", "go1", "go2", "laikago", "anymal", "anymal_c"),
-    *("anymal_kinova", "quadruped", "talos_legs", "talos_full", "simple_humanoid"),
+    *("anymal_kinova", "quadruped", "talos_full", "simple_humanoid"),
     *("simple_humanoid_classical", "g1_with_hands", "icub_reduced", "human", "alexander"),
     *("alex_nub_hands", "centauro", "canadarm2", "servicer_7dof"),
 )

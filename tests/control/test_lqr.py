@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 import fflin
 from fflin.control.gain import largest_gain
-from fflin.linear.sampling import held_cost
+from fflin.dynamics.integrators import held_cost
 from tests.support.messages import any_wording
 from tests.support.robots import BUNDLED, random_point
 

@@ -60,7 +60,7 @@ def test_of_samples_it_promises_the_covariance_and_no_other_gain_has_less(moving
     by = moving.B if G else np.tile(np.eye(nx), (41, 1, 1))
     schedule = fflin.tvkalman(moving, W, V, moving.B if G else None, 0.1, sample=0.1)
     assert (schedule.dt, len(schedule.t), schedule.residual < 1e-13) == (0.1, 5, True)
-    linearizer = fflin.Linearizer(moving.robot, moving=True, engine="python")
+    linearizer = fflin.Linearizer(moving.robot, moving=True)
     sampled = moving.discretize(0.1)
     assert (sampled.A == schedule.A).all() and (sampled.B == schedule.B).all()
     assert (sampled.C == schedule.C).all() and (sampled.y == schedule.y).all()

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 import fflin
 from fflin.control.optimal.differential_riccati import Coefficients, Passage, passage, solve_back
-from fflin.linear.sampling import GAUSS
+from fflin.dynamics.integrators import GAUSS
 from tests.support.messages import says
 from tests.support.motions import motion
 
@@ -201,7 +201,7 @@ def test_held_inputs_have_the_cost_that_is_promised_and_no_other_is_less(tumblin
     Q, R = weights(traj)
     schedule = fflin.tvlqr(traj, Q, R, 3.0, sample=0.1)
     assert (schedule.dt, len(schedule.t), schedule.residual < 1e-12) == (0.1, 21, True)
-    linearizer = fflin.Linearizer(robot, moving=True, engine="python")
+    linearizer = fflin.Linearizer(robot, moving=True)
     e = np.random.default_rng(0).normal(size=len(Q))
 
     def cost(gain):

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.dynamics.inertia import STROKE, inertia_bounds
+from fflin.dynamics.rnea import STROKE, inertia_bounds
 from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 

@@ -347,7 +347,7 @@ def test_wrong_numbers_are_refused_by_the_mode(change, message):
         ({"frequency": None, "length": 0.5, "damping": 0.1}, "to which the ratio refers"),
         ({"axis": (0, 0, 0)}, "axis of slosh 'base' is zero"),
         ({"damping": 2.0}, "ratio from 0 to 1"),
-        ({"position": (0, 0)}, "three numbers"),
+        ({"position": (0, 0)}, "three finite numbers"),
     ],
 )
 def test_wrong_liquids_are_refused(change, message):

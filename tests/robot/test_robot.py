@@ -282,7 +282,7 @@ def test_unreadable_and_malformed_files(tmp_path: Path):
     with pytest.raises(fflin.FileError, match="folder"):
         fflin.load(tmp_path)
     for text, message in {
-        "": "URDF",
+        "": "not well-formed",
         "<robot>": "not well-formed|no element found|unclosed",
         "<model/>": "<model>",
         "<robot name='r'><link name='a'/><link name='b'/></robot>": "bad.urdf.*(root|link)",

@@ -180,7 +180,7 @@ def test_limits_that_the_trajectory_itself_breaks_are_told(case):
     ("options", "said"),
     [
         ({"frame": "hybrid"}, "'hybrid'"),
-        ({"linear": "lin"}, "trajectory"),
+        ({"linear": "lin"}, "TrajectoryFeedback"),
     ],
 )
 def test_what_does_not_go_along_a_trajectory_is_refused(case, options, said):

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.linear.sampling import GAUSS, HEAVY, LIGHT
+from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT
 
 # Between two knots P is a cubic; knots are added until it is this accurate, relative to P.
 _ACCURACY = 1e-7
