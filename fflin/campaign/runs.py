@@ -22,7 +22,7 @@ from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.spreads import placed
 from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, outcome_of
 from fflin.control.channel import Saturation
-from fflin.dynamics.state import states_of
+from fflin.dynamics.coordinates import states_of
 from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot

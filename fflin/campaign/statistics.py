@@ -14,13 +14,8 @@ from numpy.typing import NDArray
 
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array
-from fflin.dynamics.state import (
-    StateMap,
-    attitude_errors,
-    moving_errors,
-    states_of,
-    unwound,
-)
+from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
+from fflin.dynamics.state import StateMap
 from fflin.kernel import loop
 from fflin.kernel.arguments import empty, laid_out, words_of
 from fflin.kernel.compiled import kernel

@@ -14,7 +14,7 @@ from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.robot.equipment.wheels import carrier
+from fflin.robot.equipment.mounting import carrier
 from fflin.robot.inputs import named_wheels
 from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot

@@ -14,8 +14,9 @@ from fflin.base.validation import Array, frozen, instance, shaped, vector
 from fflin.control.channel import Law
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.coordinates import states_of, unwound
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import Frame, StateMap, readout
+from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
@@ -113,8 +114,14 @@ class StateFeedback(Feedback):
             If the robot's states or inputs differ from the model's. Its masses may differ.
         """
         state = self.state_map(robot)
-        command = readout(state, *self.terms(state))
-        return lambda _, q, v: command(q, v)
+        K, offset, near = self.terms(state)
+
+        def command(_: float, q: Array, v: Array) -> Array:
+            x = unwound(state, states_of(state, q, state.velocities(v)), near)
+            found: Array = offset - K.dot(x)
+            return found
+
+        return command
 
 
 @dataclass(eq=False)

@@ -20,8 +20,9 @@ from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Compensation, Feedback, Loop, Policy, Sample, decider
 from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import Frame, StateMap, moved_by, moving_error
+from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.fit import require_same, require_turns, sensed
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel

@@ -15,7 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, instance
 from fflin.base.writing import as_path, check_ending
-from fflin.dynamics.state import attitude_errors, moving_errors
+from fflin.dynamics.coordinates import attitude_errors, moving_errors
 from fflin.linear.files import labels, write_table
 from fflin.robot.orbit import CircularOrbit
 from fflin.simulation.report import Passed, Saturated, limited, motion_report, passed, saturated

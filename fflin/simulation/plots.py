@@ -14,7 +14,7 @@ from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing
 from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array
-from fflin.dynamics.state import moving_errors
+from fflin.dynamics.coordinates import moving_errors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,8 @@ from fflin.control.channel import Channel
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Compensation
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
-from fflin.dynamics.state import StateMap, moved_by, moving_errors
+from fflin.dynamics.coordinates import moved_by, moving_errors
+from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.simulation.plant import Plant
 

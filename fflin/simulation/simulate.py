@@ -10,7 +10,8 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.control.policies import Policy, StateFeedback
-from fflin.dynamics.state import Frame, state_history
+from fflin.dynamics.coordinates import state_history
+from fflin.dynamics.state import Frame
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import carried_out, engine_of

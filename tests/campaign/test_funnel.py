@@ -7,7 +7,8 @@ from scipy.integrate import solve_ivp
 
 import fflin
 from fflin.campaign.funnel import ellipsoid_axes, runs_from
-from fflin.dynamics.state import StateMap, moved_by, moving_error
+from fflin.dynamics.coordinates import moved_by, moving_error
+from fflin.dynamics.state import StateMap
 from fflin.view.overlays import tubes
 from fflin.view.playback import default_tool
 from tests.support.commands import refused, run

@@ -9,7 +9,7 @@ import pytest
 import fflin
 from fflin.campaign.runs import CampaignJob
 from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, kinds_of, marks_of, outcome_of
-from fflin.dynamics.state import attitude_errors, moving_errors, states_of, unwound
+from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
 from fflin.kernel.loop import take
 from fflin.kernel.tree import LANES
 from fflin.simulation.report import DWELL, SETTLED, THERE

@@ -332,12 +332,11 @@ def test_every_bundled_robot_in_a_file_is_itself(written, name):
     assert fflin.linearize(robot).A.tobytes() == fflin.linearize(plain).A.tobytes()
 
 
-# Values whose structure is that of no key, and integers that no error could write.
+# Values whose structure is that of no key.
 STRANGE = (
     *("[[1, 2, 3]]", "[[]]", "[1, [2], 3]", "[['joint_1']]", "[{a = 'x'}]", "[{a = 1}]"),
     *("{a = [[1]]}", "{joint_1 = {a = {}}}", "true", "1979-05-27", "inf", "['\\u0000', []]"),
     *("{q = {q_b = [[1]]}}", "{rpy = [[1], 2, 3]}", "{altitude = 5e5, body = ['earth']}"),
-    *(f"{before}0x{'f' * 5000}{after}" for before, after in (("", ""), ("[", "]"), ("{a=", "}"))),
 )
 
 
@@ -348,8 +347,6 @@ def test_a_value_of_a_strange_structure_is_one_line(key, value, written):
     with pytest.raises(fflin.FflinError, match=r"sat\.toml:") as caught:
         fflin.load(written(f"{head}{key} = {value}\n"))
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
-    if "0x" in value:
-        assert key in str(caught.value) and "too many digits" in str(caught.value)
 
 
 def test_the_draft_and_the_guide_have_every_key():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.dynamics.state import moved_by
+from fflin.dynamics.coordinates import moved_by
 from fflin.simulation.plots import resting_from
 from tests.support.motions import tracked
 from tests.support.weights import unit_weights
