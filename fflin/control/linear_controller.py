@@ -178,7 +178,7 @@ class LinearController(Feedback):
     def terms(self) -> Sample:
         """Matrices and offsets that apply at each sample or stage."""
         (A, B, C, D, *_), lin = self.system, self.lin
-        return Sample(A, B, C, D, lin.u0, lin.y0, lin.C, lin.D)
+        return Sample(A, B, C, D, lin.u0, lin.y0)
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot, with a separate state z for each call.

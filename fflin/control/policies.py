@@ -252,8 +252,6 @@ class Sample(NamedTuple):
     D: Array
     u0: Array
     y0: Array
-    seen: Array  # C and D of the linear model, which predict y
-    through: Array
     jump: Array | float = 0.0
 
 

@@ -341,7 +341,7 @@ def _output_law(
 ) -> OutputLaw:
     if isinstance(given, Compensator):
         none = np.zeros((len(given.u0), len(given.y0)))
-        terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0, none.T, none)
+        terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0)
         inputs, outputs = given.output_names, given.input_names
         units = _units_of(robot, inputs, outputs)
     else:

@@ -17,7 +17,6 @@ from fflin.control.linear_controller import growing
 from fflin.control.policies import axes_of, bound, fed_back, feedback_of
 from fflin.control.tracking import (
     Reference,
-    TrajectoryFeedback,
     followed,
     reference_of,
     tracking_of,
@@ -96,7 +95,7 @@ class Plan:
     reference: Reference | None  # the motion that is followed, where there is one
     steered: tuple[str, ...]  # the states that are known to be fed back
     notes: Callable[[], tuple[str, ...]]  # returns the remarks for the report, which take a moment
-    predictor: Predictor | TrajectoryFeedback | None  # of the linear motion under the same law
+    predictor: Predictor | None  # of the linear motion under the same law
 
     @property
     def last_node(self) -> float:
