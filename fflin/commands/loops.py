@@ -234,8 +234,8 @@ def about_point(
 
 def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Feedback:
     """Return the predictive controller of the weights and limits."""
-    from fflin.control.default_weights import rule_weights
     from fflin.control.mpc import mpc
+    from fflin.control.weights import rule_weights
 
     if arguments.sample is None:
         raise InputError("--mpc needs the sample time of the controller; add --sample H")

@@ -137,9 +137,9 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     """Return the regulator of the weights; warn if its margins are small."""
-    from fflin.control.default_weights import rule_weights
     from fflin.control.gain import fragility, one_sided
     from fflin.control.lqr import lqr, require_fixed_point
+    from fflin.control.weights import rule_weights
 
     try:
         require_fixed_point(lin)

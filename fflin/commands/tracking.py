@@ -125,8 +125,9 @@ def schedule_of(
     along: LinearTrajectory, arguments: argparse.Namespace, Qf: Any = "steady"
 ) -> GainSchedule:
     """Return the regulator of the weights along a trajectory."""
-    from fflin.control.default_weights import pace_along, rule_weights
+    from fflin.control.default_weights import pace_along
     from fflin.control.tvlqr import steady_end, tvlqr
+    from fflin.control.weights import rule_weights
 
     settings: dict[str, Any] = {"sample": arguments.sample, "weights": arguments.weights}
     given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
