@@ -68,7 +68,7 @@ def add_commands(commands: parser.Commands) -> None:
     force = "replace the file of -o even if the file contains another campaign"
     options.add_output_file(shown, what, parser.ROWS)
     shown.switch("--force", force)
-    add_pictures(montecarlo, "that plays the worst run, with the paths of other runs as thin lines")
+    add_pictures(montecarlo, "that plays the worst run")
 
 
 def _montecarlo(arguments: argparse.Namespace) -> Report:
@@ -91,7 +91,7 @@ def _montecarlo(arguments: argparse.Namespace) -> Report:
     files = {
         path: None,
         arguments.plot: figure_of("plot_campaign", campaign),
-        **pictures(robot, worst, arguments, campaign),
+        **pictures(robot, worst, arguments),
     }
     text = "\n".join([str(campaign), *worst_runs(campaign, arguments.worst)])
     return Report(robot.name, campaign_record(campaign, arguments.worst), text, files)
