@@ -17,8 +17,8 @@ from fflin.base.tables import cut, grid, matrix, signals, width
 from fflin.base.writing import check_ending
 from fflin.commands import options, parser
 from fflin.commands.points import configuration_of, linear_model, load_robot, velocity_of
+from fflin.commands.regulator import add_trajectory, check_along, checked, linearize_along
 from fflin.commands.results import Report, figure_of
-from fflin.commands.tracking import add_trajectory, check_along, checked, linearize_along
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array

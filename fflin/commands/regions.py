@@ -10,9 +10,8 @@ from fflin.base.errors import InputError
 from fflin.commands import options, parser
 from fflin.commands.loops import along
 from fflin.commands.points import limits_of_options, linear_model, load_robot, once
-from fflin.commands.regulator import add_weights, gain_of, regulated_part
+from fflin.commands.regulator import add_trajectory, add_weights, gain_of, regulated_part
 from fflin.commands.results import Report, figure_of
-from fflin.commands.tracking import add_trajectory
 
 _ERRORS = "attitude [deg], position [m], joints, omega_b, v_b or joint rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
