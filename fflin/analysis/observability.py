@@ -6,7 +6,7 @@ import numpy as np
 
 from fflin.analysis import mechanics
 from fflin.analysis.hautus import split_by_poles, unobservable
-from fflin.analysis.names import combination, undecided, unsettled, with_rates
+from fflin.analysis.names import combination, undecided, unsettled
 from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, echelon, without_rounding
 from fflin.base.errors import InputError
 from fflin.base.tables import folded
@@ -69,7 +69,7 @@ class Observability(FrozenArrays):
             f"({self.method}); {'' if self.detectable else 'not '}detectable"
         ]
         if self.unobservable:
-            lines.append(f"unobservable: {with_rates(self.unobservable)}")
+            lines.append(f"unobservable: {', '.join(self.unobservable)}")
         lines += [f"note: {note}" for note in self.notes]
         return folded(lines)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from fflin.analysis.controllability import controllability
 from fflin.analysis.mechanics import conserved
-from fflin.analysis.names import grouped, with_rates
+from fflin.analysis.names import grouped
 from fflin.analysis.observability import observability
 from fflin.analysis.ranks import Margin, judged
 from fflin.base.errors import (
@@ -57,7 +57,7 @@ def require_detectable(lin: LinearModel) -> None:
         _check_reach(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, DetectabilityError)
         return
     found = observability(lin)
-    words = "" if found.detectable else missed.format(with_rates(found.unobservable))
+    words = "" if found.detectable else missed.format(listed(found.unobservable))
     _conclude(DetectabilityError, words, found.notes, found.margin)
 
 

@@ -125,8 +125,6 @@ def _robots(_: argparse.Namespace) -> Report:
 
 
 def _info(arguments: argparse.Namespace) -> Report:
-    from dataclasses import replace
-
     import numpy as np
 
     from fflin.control.authority import point_properties, point_report
@@ -139,13 +137,7 @@ def _info(arguments: argparse.Namespace) -> Report:
     q = configuration_of(robot, arguments, robot.point)
     v = velocity_of(robot, arguments, robot.point, "velocity")
     properties = point_properties(robot, q, np.zeros(robot.nv) if v is None else v)
-    text = robot_info(robot, point_report(properties))
-    if (
-        arguments.inputs is not None
-        or robot.limits
-        or robot.inputs != replace(robot, inputs=()).inputs
-    ):
-        text += f"\n\n{inputs_report(robot)}"
+    text = f"{robot_info(robot, point_report(properties))}\n\n{inputs_report(robot)}"
     state = StateMap(robot)
     inputs = Actuation(state)
     result = {

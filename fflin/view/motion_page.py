@@ -117,7 +117,7 @@ def motion_page(
         "speed": speed,
         "follow": follow,
         "points": rounded(points, size),
-        "target": _distance(drawing, film.poses, goals) > 0.02 * size,
+        "target": len(goals) > 0,
         "linear": motion.linear is not None,
         "phases": [*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
         "held": list(held),
@@ -155,15 +155,6 @@ def _points(film: Playback, size: float, goal: Moving, held: Iterable[Moving]) -
     for drawing, rows in (goal, *held):
         points += [corner_points(drawing, poses) for poses in rows[:: _step(rows)]]
     return np.concatenate(points)
-
-
-def _distance(drawing: Drawing, poses: Array, goals: Array) -> float:
-    """Return how far the target is from the robot at most [m], along any axis and at any time."""
-    step, largest = _step(poses), 0.0
-    for pose, goal in zip(poses[::step], [*goals[::step]] * len(poses), strict=False):
-        apart = corner_points(drawing, pose) - corner_points(drawing, goal)
-        largest = max(largest, float(np.abs(apart).max()))
-    return largest
 
 
 def _step(rows: Array) -> int:

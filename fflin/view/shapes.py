@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinError
+from fflin.base.errors import FflinError, listed
 from fflin.base.validation import Array
 from fflin.base.writing import shown
 from fflin.robot.catalog import find_mesh
@@ -84,9 +84,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         if "name" in element.attributes and (color := _color(element)) is not None
     }
     bent = bent_links(robot, root)
-    missing: list[str] = []
-    unreadable: list[str] = []
-    odd: list[int] = []
+    missing, unreadable, odd = list[str](), list[str](), list[str]()
     for link in root.find_all("link"):
         frame_id = robot.model.getFrameId(link.attributes.get("name", ""), pin.FrameType.BODY)
         if frame_id >= robot.model.nframes:
@@ -101,7 +99,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
                 placement = at * _placement(visual)
                 color, finish = _material(visual, colors, kind)
             except (ValueError, LookupError):
-                odd.append(visual.line)
+                odd.append(str(visual.line))
                 continue
             file = None
             if mesh is not None:
@@ -128,8 +126,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
     if unreadable:
         notes.append(f"{robot.name}: {named('mesh file', unreadable)} cannot be read and not drawn")
     if odd:
-        lines = ", ".join(map(str, odd[:6])) + ", ..." * (len(odd) > 6)
-        notes.append(f"{path.name}: <visual> in line {lines} is malformed and not drawn")
+        notes.append(f"{path.name}: <visual> in line {listed(odd)} is malformed and not drawn")
 
 
 def _document(path: Path) -> Element:
