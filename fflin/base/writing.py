@@ -19,6 +19,9 @@ from typing import Any, NamedTuple
 
 from fflin.base.errors import FileError, InputError
 
+# Names in larger folders are not compared with the name of a missing file.
+_MANY = 1000
+
 
 class CommandFiles(NamedTuple):
     """Output files that a command has still to write, and input files that it has read."""
@@ -60,6 +63,8 @@ def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
             content = file.read() if limit is None else file.read(limit + 1)
     except FileError:
         raise
+    except FileNotFoundError:
+        raise FileError(f"{shown(path)}: No such file{missing(path)}") from None
     except (OSError, ValueError) as error:
         raise FileError(f"{shown(path)}: cannot be read: {reason(error)}") from None
     if limit is not None and len(content) > limit:
@@ -205,6 +210,21 @@ def reserve(path: Path) -> None:
     if hasattr(os, "posix_fallocate"):
         with path.open("r+b") as file:
             os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+
+
+def missing(path: Path, otherwise: str = "") -> str:
+    """Say in which folder a file does not exist, and which names there are similar, if any."""
+    import difflib
+
+    try:
+        folder = path.absolute().parent
+        names = os.listdir(folder)
+    except OSError:
+        return f": its folder does not exist{otherwise}"
+    few = names if len(names) < _MANY else []
+    near = difflib.get_close_matches(path.name, few, n=3, cutoff=0.75)
+    hint = f"; did you mean {', '.join(map(repr, near))}?" if near else otherwise
+    return f" in the folder {shown(folder)}{hint}"
 
 
 def reason(error: Exception) -> str:

@@ -37,8 +37,9 @@ from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import KINDS, kind_named
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
+from fflin.dynamics.coordinates import moved_by, moving_error, moving_errors, unwound
 from fflin.dynamics.points import point_of
-from fflin.dynamics.state import StateMap, moved_by, moving_error, moving_errors, unwound
+from fflin.dynamics.state import StateMap
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 

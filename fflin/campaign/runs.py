@@ -22,17 +22,15 @@ from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.spreads import placed
 from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, outcome_of
 from fflin.control.channel import Saturation
-from fflin.dynamics.state import states_of
+from fflin.dynamics.coordinates import states_of
 from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
-from fflin.simulation.compiled import engine_of
-from fflin.simulation.conservation import conserved_by
-from fflin.simulation.lanes import LaneLoop, Runs, Statistics, noises, recorded
+from fflin.simulation.lanes import LaneLoop, Runs, Statistics, engine_of, noises, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.packing import SLOTS, noise_of, packed
 from fflin.simulation.plan import Plan, SimulationOptions, law_of, planned
-from fflin.simulation.plant import Plant
+from fflin.simulation.plant import Plant, conserved_by
 from fflin.simulation.run import Recording, go, stop_of
 from fflin.simulation.simulate import motion_of
 
@@ -194,7 +192,7 @@ class CampaignJob:
             run = _recorded(plan, plant, plan.times.every)
         else:
             run = recorded(self.plan, self.plant, self._in_lanes(drawn[None]))
-        return motion_of(plan, plant, self.engine, run)
+        return motion_of(plan, plant, conserved_by(plant.robot, plan.q, plant.field), run)
 
 
 def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:

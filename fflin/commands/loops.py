@@ -93,7 +93,7 @@ def add_loop(command: parser.Command) -> None:
         "T",
     )
     options.add_step(run)
-    methods = "integration method: cf4 (default), rkmk4 or semi_implicit_euler"
+    methods = "integration method: cf4 (default) or semi_implicit_euler"
     run.add("--method", methods, metavar="METHOD", default="cf4")
     options.add_system(command)
     options.add_frame(run)
@@ -241,8 +241,8 @@ def about_point(
 
 def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Feedback:
     """Return the predictive controller of the weights and limits."""
-    from fflin.control.default_weights import rule_weights
     from fflin.control.mpc import mpc
+    from fflin.control.weights import rule_weights
 
     if arguments.sample is None:
         raise InputError("--mpc needs the sample time of the controller; add --sample H")

@@ -141,8 +141,6 @@ def settle_step(arguments: argparse.Namespace) -> None:
             said += ", and the sample time --dt has the new name --sample"
             arguments.sample = arguments.dt
         arguments.dt = arguments.step
-    elif arguments.dt is not None and arguments.sample is None:
-        said = "--dt is the integration step; give the sample time of the controller by --sample"
     if said:
         warnings.warn(said, FflinWarning, stacklevel=2)
 

@@ -176,9 +176,9 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     """Return the regulator of the weights; warn if its margins are small."""
-    from fflin.control.default_weights import rule_weights
     from fflin.control.gain import fragility, one_sided
     from fflin.control.lqr import lqr, require_fixed_point
+    from fflin.control.weights import rule_weights
 
     try:
         require_fixed_point(lin)
@@ -307,8 +307,9 @@ def schedule_of(
     along: LinearTrajectory, arguments: argparse.Namespace, Qf: Any = "steady"
 ) -> GainSchedule:
     """Return the regulator of the weights along a trajectory."""
-    from fflin.control.default_weights import pace_along, rule_weights
+    from fflin.control.default_weights import pace_along
     from fflin.control.tvlqr import steady_end, tvlqr
+    from fflin.control.weights import rule_weights
 
     settings: dict[str, Any] = {"sample": arguments.sample, "weights": arguments.weights}
     if given := weights_of(arguments):

@@ -171,8 +171,8 @@ def _add_montecarlo(commands: parser.Commands) -> None:
         "dispersions",
         metavar="DISPERSIONS",
         type=parser.input_file,
-        help="TOML file with a table [dispersions] that defines the random parameters; see "
-        "fflin.load_dispersions",
+        help='TOML file with a line [dispersions], and a line such as "base.mass" = 0.05 '
+        "(standard deviation) for each random parameter; see fflin.load_dispersions",
     )
     runs = montecarlo.group("runs")
     runs.add("--runs", "number of runs", int, required=True)

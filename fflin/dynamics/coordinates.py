@@ -1,16 +1,29 @@
-"""Coordinates of the state: names, units, axes, and the attitude chart."""
+"""Coordinates of the state: names, units, axes, the attitude chart, and errors of states."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal, NamedTuple, cast, get_args
+from itertools import compress
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.rotation import product, rotation_matrices, rotation_matrix, skew
+from fflin.base.rotation import (
+    conjugate,
+    product,
+    quaternion_product,
+    rotation_matrices,
+    rotation_matrix,
+    skew,
+)
 from fflin.base.validation import Array
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from fflin.dynamics.state import StateMap
 
 Frame = Literal["hybrid", "local", "world", "lvlh", "hill"]
 
@@ -72,7 +85,7 @@ class Groups(NamedTuple):
     qdot_m: slice
 
 
-def states_of(robot: Robot) -> dict[str, str]:
+def state_units(robot: Robot) -> dict[str, str]:
     """Return {name: unit} of the 12 + 2n states."""
     units = dict.fromkeys(("q_b.x", "q_b.y", "q_b.z"), "1")
     units |= dict.fromkeys(("r_b.x", "r_b.y", "r_b.z"), "m")
@@ -111,7 +124,7 @@ class Chart:
     R: Array  # refMb.rotation (.., 3, 3)
 
     @classmethod
-    def of(cls, quaternion: Array) -> "Chart":
+    def of(cls, quaternion: Array) -> Chart:
         """Return the chart at unit quaternions (.., 4) of refMb, of either sign."""
         if quaternion.ndim == 1:
             quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
@@ -199,3 +212,108 @@ def _turn(R: Array, parts: tuple[slice, ...], x: Array) -> Array:
     for rows in parts:
         x[..., rows, :] = product(R, x[..., rows, :])
     return x
+
+
+_TURN = 2.0 * np.pi
+
+
+def states_of(state: StateMap, q: Array, nu: Array) -> Array:
+    """Return the states (.., nx) of valid q (.., nq) and nu (.., 6 + n) in base axes."""
+    return state.compose(state.charts(q), state.positions(q), state.joint_positions(q), nu)
+
+
+def unwound(state: StateMap, x: Array, near: Any = 0.0) -> Array:
+    """Remove full turns of continuous joints from states or errors (.., nx), in place.
+
+    Their angles are then within half a turn of those of `near` (nx,).
+    """
+    joints = 6 + state.unbounded
+    apart = x[..., joints] - np.broadcast_to(near, state.nx)[joints]
+    x[..., joints] -= _TURN * np.round(apart / _TURN)
+    return x
+
+
+def state_history(
+    state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
+) -> Array:
+    """Return the states (N, nx) of a motion; continuous joints count turns, from `near` on."""
+    # With the times t (N,) as many turns as the rates make between rows, else less than half of
+    # one.
+    rates = state.velocities(v)
+    x = states_of(state, q, rates)
+    q_m = x[:, state.groups.q_m]
+    before = np.zeros(q_m.shape[1]) if near is None else near[state.groups.q_m]
+    if (k := state.unbounded).size:
+        q_m[:, k] = np.unwrap(np.vstack((before, q_m))[:, k], axis=0)[1:]
+        if t is not None:
+            turned = 0.5 * np.diff(t)[:, None] * (rates[1:, 6 + k] + rates[:-1, 6 + k])
+            turns = np.round((turned - np.diff(q_m[:, k], axis=0)) / _TURN)
+            q_m[1:, k] += _TURN * turns.cumsum(axis=0)
+    return x
+
+
+def attitude_errors(x: Array, target: Array) -> Array:
+    """Return the angles (N,) [deg] between the attitudes of states and of a target, or of rows."""
+    turned, scalar = _apart(x, target)
+    angles: Array = 2.0 * np.arctan2(np.linalg.norm(turned, axis=1), np.abs(scalar[:, 0]))
+    return np.degrees(angles)
+
+
+def _apart(x: Array, target: Array) -> tuple[Array, Array]:
+    """Return the vector part (N, 3) and the scalar part (N, 1) of target^-1 x."""
+    at, to = x[:, :3], target[..., :3]
+    w, d = (
+        np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
+        for each in (at, to)
+    )
+    return d * at - w * to - np.cross(to, at), w * d + (at * to).sum(axis=-1, keepdims=True)
+
+
+def moving_errors(frame: str, x: Array, target: Array) -> Array:
+    """Return the errors (N, nx) of states from a moving reference, in its axes (9.5)."""
+    e, (_, R), (_, R_target) = x - target, _turned(x), _turned(target)
+    turned, scalar = _apart(x, target)
+    e[:, :3] = turned * np.where(scalar < 0.0, -1.0, 1.0)
+    e[:, 3:6] = (e[:, None, 3:6] @ R_target)[:, 0]
+    for rows in _in_reference(frame, x.shape[1]):
+        e[:, rows] = (x[:, None, rows] @ R - target[:, None, rows] @ R_target)[:, 0]
+    return e
+
+
+def moved_by(frame: str, target: Array, e: Array) -> Array:
+    """Return the states (N, nx) whose `moving_errors` are e; not finite if |q_b| exceeds 1."""
+    x, (turn_target, R_target), (turn, R) = target + e, _turned(target), _turned(e)
+    q_e, q_target = e[:, :3], target[:, :3]
+    x[:, :3] = turn_target * q_e + turn * q_target + np.cross(q_target, q_e)
+    scalar = turn * turn_target - (q_e * q_target).sum(axis=1, keepdims=True)
+    x[:, :3] *= np.where(scalar < 0.0, -1.0, 1.0)
+    x[:, 3:6] = target[:, 3:6] + (R_target @ e[:, 3:6, None])[..., 0]
+    R = R_target @ R
+    for rows in _in_reference(frame, x.shape[1]):
+        own = (target[:, None, rows] @ R_target)[:, 0] + e[:, rows]
+        x[:, rows] = (R @ own[..., None])[..., 0]
+    return x
+
+
+def _turned(x: Array) -> tuple[Array, Array]:
+    """Return the scalar part (N, 1) of the attitude of states, not negative, and the rotation."""
+    scalar = np.sqrt(1.0 - (x[:, :3] ** 2).sum(axis=1, keepdims=True))
+    return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
+
+
+def _in_reference(frame: str, nx: int) -> list[Any]:
+    """Return the rows of the base velocities in reference axes."""
+    velocities = np.arange(nx)[nx // 2 :]
+    return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
+
+
+def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array) -> Array:
+    """Return the error (nx,) from a moving reference, in its axes."""
+    g = state.groups
+    e = np.empty(state.nx)
+    turned = quaternion_product(conjugate(q_star[3:7]), q[3:7])
+    e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
+    e[g.r_b] = rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
+    e[g.q_m] = state.joints_apart(q_star, q)
+    e[-6 - state.robot.n :] = state.velocities(v - v_star)
+    return e

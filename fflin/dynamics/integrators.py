@@ -29,8 +29,6 @@ class Integrator:
     # After each stage: 0 where the way to the next begins at the step's first place, 1 where at the
     # second stage's.
     origins: ClassVar[tuple[int, ...]]
-    # Whether each stage's velocity counts by its rate in the tangent at the step's first place.
-    tangent: ClassVar[bool] = False
 
     def __init__(self, model: pin.Model, dt: float) -> None:
         self.model, self.dt = model, dt
@@ -84,41 +82,6 @@ class CommutatorFree4(Integrator):
         return np.array(way), np.array(speed)
 
 
-class RungeKuttaMuntheKaas4(Integrator):
-    """RKMK4: order 4 in the tangent space at q, with the inverse of dexp at each stage."""
-
-    nodes = CommutatorFree4.nodes
-    weights, moments = CommutatorFree4.weights, CommutatorFree4.moments
-    reach = 2.78
-    origins, tangent = (0, 0, 0, 0), True
-
-    @classmethod
-    def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return the weights of a stage's rate in the next step of q, and of CF4 in the new v."""
-        return np.array([[0.5 * dt], [0.5 * dt], [dt]]), CommutatorFree4.shares(dt)[1]
-
-    def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q and v one step later."""
-        model, h, half = self.model, self.dt, 0.5 * self.dt
-
-        def rate(theta: Array, velocity: Array) -> Array:
-            slope = pin.dIntegrate(model, q, theta, pin.ArgumentPosition.ARG1)
-            return np.linalg.solve(slope, velocity)
-
-        l1 = f(t, q, v)
-        k2, v2 = half * v, v + half * l1
-        d2 = rate(k2, v2)
-        l2 = f(t + half, _integrate(model, q, k2), v2)
-        k3, v3 = half * d2, v + half * l2
-        d3 = rate(k3, v3)
-        l3 = f(t + half, _integrate(model, q, k3), v3)
-        k4, v4 = h * d3, v + h * l3
-        d4 = rate(k4, v4)
-        l4 = f(t + h, _integrate(model, q, k4), v4)
-        moved = h / 6.0 * (v + 2.0 * (d2 + d3) + d4)
-        return _integrate(model, q, moved), v + h / 6.0 * (l1 + 2.0 * (l2 + l3) + l4)
-
-
 class SemiImplicitEuler(Integrator):
     """Semi-implicit Euler: order 1, the new velocity moves the configuration."""
 
@@ -134,7 +97,6 @@ class SemiImplicitEuler(Integrator):
 
 INTEGRATORS: dict[str, type[Integrator]] = {
     "cf4": CommutatorFree4,
-    "rkmk4": RungeKuttaMuntheKaas4,
     "semi_implicit_euler": SemiImplicitEuler,
 }
 

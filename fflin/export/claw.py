@@ -19,8 +19,7 @@ from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.base.record import reading
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, read_file
-from fflin.control.linear_controller import Loop, Sample
-from fflin.control.policies import Policy
+from fflin.control.policies import Loop, Policy, Sample
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap

@@ -17,8 +17,8 @@ from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.kalman import Compensator
-from fflin.control.linear_controller import Compensation, LinearController, Sample
-from fflin.control.policies import Gridded, StateFeedback
+from fflin.control.linear_controller import LinearController
+from fflin.control.policies import Compensation, Gridded, Sample, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
@@ -335,7 +335,7 @@ def _output_law(
 ) -> OutputLaw:
     if isinstance(given, Compensator):
         none = np.zeros((len(given.u0), len(given.y0)))
-        terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0, none.T, none)
+        terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0)
         inputs, outputs = given.output_names, given.input_names
         units = _units_of(robot, inputs, outputs)
     else:

@@ -54,7 +54,6 @@ from fflin.kernel.rnea import (
     joint_axis,
 )
 from fflin.kernel.tree import INERTIA, LANES, PLACE, Tree, layout_of, loads_of, work_space
-from fflin.kernel.vectors import get6, minus6, put6, times6
 
 
 @inlined
@@ -217,18 +216,18 @@ def _solve(work, robot):
     none = (zero, zero, zero), (zero, zero, zero)
     # The first six columns, of the base's turn and shift, are zeros.
     for row in range(size):
-        put6(work, robot.slopes + row * width, none)
+        vec.put6(work, robot.slopes + row * width, none)
     for column in range(width % 6 or 6, width, 6):
         slopes = layout.lower + column
         for k in range(size):
-            put6(work, layout.held + k * 6, get6(work, slopes + k * width))
+            vec.put6(work, layout.held + k * 6, vec.get6(work, slopes + k * width))
         for row in range(size):
             total = none
             for k in range(size):
                 entry = load(work, tree.square + (row * size + k))
-                held = get6(work, layout.held + k * 6)
-                total = minus6(total, times6(held, entry))
-            put6(work, robot.slopes + column + row * width, total)
+                held = vec.get6(work, layout.held + k * 6)
+                total = vec.minus6(total, vec.times6(held, entry))
+            vec.put6(work, robot.slopes + column + row * width, total)
 
 
 @compiled

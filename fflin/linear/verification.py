@@ -13,10 +13,19 @@ from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, Chart, times
+from fflin.dynamics.coordinates import (
+    ANGULAR,
+    LINEAR,
+    PIN_ANGULAR,
+    PIN_LINEAR,
+    Chart,
+    moving_errors,
+    state_history,
+    times,
+)
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.rnea import Inertia
-from fflin.dynamics.state import StateMap, moving_errors, state_history
+from fflin.dynamics.state import StateMap
 from fflin.linear.model import Certificate, LinearModel
 from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.robot import Robot

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, dimension, number, positive, refuse_masked, truth
+from fflin.base.validation import Array, dimension, number, positive, truth
 
 Vector3: TypeAlias = Sequence[float]
 
@@ -31,20 +31,20 @@ class Input:
     min: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
+        for name in ("frame", "joint", "name"):
+            value = getattr(self, name, None)
+            if value is not None and not (value and isinstance(value, str)):
+                raise InputError(f"{self.KEY} {name} is {value!r}, expected a name")
         for name in ("max", "min"):
             value, what = getattr(self, name), f"{self.KEY} {name}"
             if value is not None:
                 several = len(self.ENTRIES) > 1 and dimension(what, value)
                 self._set(name, three_numbers(what, value) if several else number(what, value))
         for least, largest in self.ranges:
-            if largest <= 0.0:
+            if not least <= largest or largest <= 0.0:
                 raise InputError(
-                    f"{self.KEY} max is {largest:g}, expected more than 0; leave it out if there "
-                    "is no limit"
-                )
-            if least > largest:
-                raise InputError(
-                    f"{self.KEY} min is {least:g}, expected at most its max of {largest:g}"
+                    f"{self.KEY} min is {least:g} and max is {largest:g}, expected a max of more "
+                    "than 0 and a min of at most max; leave out what is not limited"
                 )
 
     def _set(self, name: str, value: Any) -> None:
@@ -303,25 +303,19 @@ KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, 
 
 def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
     """Return three finite floats, or raise `InputError` with the given value."""
-    refuse_masked(what, value)
     try:
-        x, y, z = (float(entry) for entry in value)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{what} is {value!r}, expected three numbers") from None
-    if not math.isfinite(x + y + z):
-        raise InputError(f"{what} is {value!r}, expected finite numbers")
+        x, y, z = (number(what, entry) for entry in value)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is {value!r}, expected three finite numbers") from None
     return x, y, z
 
 
 def unit_vector(what: str, value: Vector3, hint: str) -> tuple[float, float, float]:
     """Return three numbers scaled to length 1, or raise `InputError` if they are zero."""
     x, y, z = three_numbers(what, value)
-    largest = max(abs(x), abs(y), abs(z))
-    if largest == 0.0:
-        raise InputError(f"{what} is zero; give {hint}")
-    # Scaled first: squares of very large or small numbers are none.
-    x, y, z = x / largest, y / largest, z / largest
     length = math.hypot(x, y, z)
+    if length == 0.0:
+        raise InputError(f"{what} is zero; give {hint}")
     return x / length, y / length, z / length
 
 

@@ -16,7 +16,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, shaped
-from fflin.control.margins import ACCURACY, gain_crossings, largest_gain
+from fflin.control.gain import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
 
 _CORNERS = 256
@@ -128,7 +128,7 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     physical = np.array([of.makes(corner) for corner in corners])
     # Draws come last, so that more of them find what fewer found before they go on.
     tried = np.vstack((middle, corners[physical], draws))
-    # The disk margin is of (S - T)/2, each input counted in sqrt(R_ii), as in control.margins.
+    # The disk margin is of (S - T)/2, each input counted in sqrt(R_ii), as in control.gain.
     scale = np.sqrt(getattr(gain, "R", np.eye(len(K))).diagonal())
     disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
     whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))

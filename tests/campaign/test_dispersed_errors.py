@@ -10,7 +10,7 @@ import fflin
 from fflin.campaign.pointing import turned
 from fflin.campaign.report import worst_runs
 from fflin.campaign.runs import ARRAYS, CampaignJob
-from fflin.robot.equipment.wheels import turned_to
+from fflin.robot.equipment.mounting import turned_to
 from tests.support import policies
 from tests.support.campaigns import both
 from tests.support.robots import BUNDLED, free_body
@@ -42,7 +42,7 @@ def test_lanes_fly_every_policy(robots, name, make):
     robot, policy, options = make(policies.plain(robots[name]))
     options = {key: value for key, value in options.items() if key not in ("linear", "x0")}
     sample = {"sample": 0.1} if make is policies.state else {}
-    case = {"dt": 0.02, "duration": 1.0, "method": "rkmk4"} | options | sample
+    case = {"dt": 0.02, "duration": 1.0, "method": "cf4"} | options | sample
     drawn = DRAWN[make] | {"base.mass": 0.1}
     tolerance = 1e-8 if make is policies.shared else 1e-10
     both(robot, policy, drawn, tolerance=tolerance, **case)

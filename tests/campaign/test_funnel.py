@@ -7,7 +7,8 @@ from scipy.integrate import solve_ivp
 
 import fflin
 from fflin.campaign.funnel import ellipsoid_axes, runs_from
-from fflin.dynamics.state import StateMap, moved_by, moving_error
+from fflin.dynamics.coordinates import moved_by, moving_error
+from fflin.dynamics.state import StateMap
 from tests.support.commands import refused, run
 
 OUTCOME, DURATION = {"within": 0, "lost": 1, "beyond": 2, "missed": 3}, 12.0

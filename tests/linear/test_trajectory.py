@@ -63,7 +63,7 @@ def test_one_step_of_torque_holds_at_every_spacing(knots):
         ({"sample": 0.1}, "previous", 1e-8),
         ({"sample": 0.1, "every": 10}, "previous", 1e-8),
         ({"sample": 0.1, "every": 5, "delay": 0.05}, "previous", 1e-8),
-        ({"sample": 0.4, "every": 40, "method": "rkmk4"}, "previous", 1e-6),
+        ({"sample": 0.4, "every": 40}, "previous", 1e-6),
     ],
 )
 def test_what_is_simulated_holds(loop, options, hold, largest):
