@@ -434,7 +434,7 @@ def test_its_tables_have_every_figure_with_its_unit(tmp_path):
     campaign = fflin.monte_carlo(robot, policy, given, **options)
     for ending in ("csv", "mat"):
         campaign.save(tmp_path / f"runs.{ending}")
-    with pytest.raises(fflin.FileError, match="expected one of .npz, .h5"):
+    with pytest.raises(fflin.FileError, match="expected one of"):
         fflin.Campaign.load(tmp_path / "runs.csv")
     names, *rows = csv.reader((tmp_path / "runs.csv").read_text().splitlines())
     saved = scipy.io.loadmat(tmp_path / "runs.mat", simplify_cells=True)
