@@ -199,11 +199,6 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
         """Return the quadratic program at time t [s] and error e (nx,), by default zero."""
         return self.horizon.matrices(e, t)
 
-    def law(self) -> Callable[[float, Array], Array]:
-        """Return law(t, e) -> u: the inputs at an error e and a time of the run."""
-        plans = Receding(self.horizon)
-        return lambda t, e: self.commanded(t)[2] + plans.step(t, e)
-
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot with the trajectory's states and inputs."""
         return Receding(self.horizon, self.deviation(robot))
