@@ -10,6 +10,7 @@ from scipy.linalg import eigh
 from fflin.analysis.mechanics import rate_matrix, second_order
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, Complex, Values
+from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.linear.model import LinearModel
 
@@ -314,13 +315,14 @@ def _growth(lin: LinearModel) -> Limit:
 
 
 class _Trial(NamedTuple):
-    """A loop that was tried: its limit, what its efforts leave, and its modes."""
+    """A loop that was tried: its limit and modes, and what its inputs require."""
 
     limit: Limit
     left: float  # factor on the bandwidth that the efforts allow, as far as it is below 1
     effort: str  # the input that allows the least
     rates: Values  # of the modes (nx,) [1/s]
     modes: Complex
+    required: Array  # largest inputs (nu,)
 
 
 def _slowed(
@@ -354,7 +356,7 @@ def _slowed(
             _largest_use(later, driven, lin.state_names).max(axis=0),
         )
         left, what = min(_limits_on("effort", _efforts_left(lin), use, 2.0), default=Limit(1.0, ""))
-        trials.append(_Trial(limit, left, what, rates, modes))
+        trials.append(_Trial(limit, left, what, rates, modes, np.abs(lin.u0) + use))
         if left >= 1.0 - 1e-6:
             return limit, _achieved(lin, trials[-1])
         if limit.bandwidth <= least.bandwidth:
@@ -367,6 +369,10 @@ def _slowed(
     most = max(trial.left for trial in trials)
     trial = next(x for x in trials if x.left >= _IN_VAIN * most)
     limit, effort = trial.limit, trial.effort
+    high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
+    where = "to return from the displacements of the default weights"
+    required = trial.required[None]
+    warn_beyond(lin.robot, where, lin.input_names, lin.input_units, required, -high, high)
     held = limit.what == least.what  # a slower loop loses an unstable mode
     what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
     return limit._replace(what=what), _achieved(lin, trial)

@@ -156,8 +156,8 @@ class TrajectoryFeedback(Feedback):
         e, angles = given[:-3], given[-3:]
         if (e[:3].any() and angles.any()) or not np.linalg.norm(e[:3]) < 1.0:
             raise InputError(
-                f"the offset has q_b = {e[:3]} and roll, pitch, yaw = {angles} deg, expected only "
-                "one of them, and |q_b| less than 1"
+                f"the offset has |q_b| = {np.linalg.norm(e[:3]):.3g} and roll, pitch, yaw = "
+                f"{angles} deg, expected only one of them, and |q_b| less than 1"
             )
         if angles.any():
             turn = pin.Quaternion(pin.rpy.rpyToMatrix(*np.radians(angles))).coeffs()

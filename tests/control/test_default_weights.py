@@ -310,13 +310,21 @@ def test_limits_of_thrusters_wheels_and_the_base_bind_too():
     assert re.search(r"limited by the effort of [xyz]_(plus|minus)_", gain.weights)
 
 
-def test_displacements_that_ask_for_more_than_the_limits_are_reported(loops):
+def test_displacements_that_ask_for_more_than_the_limits_are_warned_of(loops):
     model = loops("talos_arm")[0].model.copy()
     model.effortLimit[6:] *= 0.1
     heavy = fflin.from_model(model, gravity=(0.0, 0.0, -9.81))
     lin = fflin.linearize(heavy, u=fflin.equilibrium(heavy).u)
-    gain = fflin.lqr(lin)
-    assert re.search(r"the effort of \w+,? (which )?is too small", gain.weights)
+    with pytest.warns(fflin.FflinWarning) as told:
+        gain = fflin.lqr(lin)
+    assert says(gain.weights, "too small")
+    (said,) = (str(each.message) for each in told)
+    start = "the input limits are too small for 'talos' to return from the displacements"
+    asked = re.findall(r"(tau_m\.\w+) requires ([\d.]+) N m, its limit is ([\d.]+)", said)
+    assert said.startswith(start) and asked
+    for name, value, limit in asked:
+        assert float(limit) == pytest.approx(lin.limits[name], rel=1e-3)
+        assert float(value) > float(limit) > abs(lin.u0[lin.input_names.index(name)])
 
 
 @pytest.mark.exhaustive
