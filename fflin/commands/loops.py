@@ -20,8 +20,15 @@ from fflin.commands.points import (
     refuse_pose,
     velocity_of,
 )
-from fflin.commands.regulator import add_weights, gain_of, regulated_part
-from fflin.commands.tracking import add_trajectory, models_along, schedule_of
+from fflin.commands.regulator import (
+    add_trajectory,
+    add_weights,
+    gain_of,
+    models_along,
+    regulated_part,
+    schedule_of,
+    weights_of,
+)
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -240,8 +247,7 @@ def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Feedback:
     if arguments.sample is None:
         raise InputError("--mpc needs the sample time of the controller; add --sample H")
     settings: dict[str, Any] = {"weights": arguments.weights}
-    given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
-    if any(given.values()):
+    if given := weights_of(arguments):
         Q, R, _, _ = rule_weights(lin.discretize(arguments.sample), arguments.weights, given)
         settings = {"Q": Q, "R": R}
     limits = limits_of_options(arguments)

@@ -337,14 +337,14 @@ def test_what_is_not_regulated_is_said(tmp_path):
 
 def test_what_cannot_be_held_is_refused():
     for count, words in (
-        (1, "attitude y/z"),
-        (2, "attitude z"),
+        (1, "angular momentum y/z"),
+        (2, "angular momentum z"),
     ):
         with pytest.raises(fflin.StabilizabilityError, match=f"{words}"):
             fflin.lqr(fflin.linearize(wheeled(ORTHOGONAL[:count])))
     arm = fflin.load("ets_vii")
     idle = arm.replace(inputs=[JointTorque("joint_1"), *wheels(ORTHOGONAL, 1.0)])
-    with pytest.raises(fflin.StabilizabilityError, match="joint_2, joint_3"):
+    with pytest.raises(fflin.StabilizabilityError, match=r"momentum of joint_2, .* joint_3"):
         fflin.lqr(fflin.linearize(idle))
 
 
@@ -352,7 +352,7 @@ def test_damping_of_wheels_is_said_to_be_why_nothing_is_held():
     """Their speeds stay in the model with it, and the momentum of all that no input changes."""
     names = [f"wheel_{k}" for k in (1, 2, 3)]
     lin = fflin.linearize(wheeled(ORTHOGONAL).replace(damping=dict.fromkeys(names, 1e-7)))
-    words = "damping of wheel_1, wheel_2, wheel_3 keeps .*remove"
+    words = "remove the damping of the wheels"
     reduced = fflin.momentum_reduction(lin)
     for model in (lin, lin.discretize(0.1), reduced):
         for weights in ((), (1.0, 1.0)):
