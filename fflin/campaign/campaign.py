@@ -6,7 +6,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -334,10 +334,6 @@ class Campaign(FrozenArrays):
         """
         at = whole("run", run, 0, len(self) - 1)
         return self._flown().replay(np.array(self.drawn[at]))
-
-    def courses(self, runs: Sequence[int], most: int) -> list[Array]:
-        """Return up to `most` + 1 evenly spaced configurations (.., nq) of each given run."""
-        return self._flown().paths(np.array(self.drawn[list(runs)]), most)
 
     def _flown(self) -> CampaignJob:
         if self._job is None:

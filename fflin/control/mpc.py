@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError, listed
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
-from fflin.base.tables import folded
 from fflin.base.validation import Array, instance, number, whole
 from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
@@ -131,7 +130,7 @@ def mpc(
             "lin is sampled with another dt, or the model before sampling is not known; give the "
             "continuous model and dt="
         )
-    names, at, rows, ranges = _limits(source, limits)
+    names, at, rows = _limits(source, limits)
     if samples**2 * (len(at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
         raise InputError(
             f"horizon is {samples} samples with {len(at)} limits, which makes the program too "
@@ -141,7 +140,7 @@ def mpc(
     made, stages = designed(source, (Q, R, weights), Qf, samples, dt, names, rows)
     acting = at[at < len(lin.input_names)]
     of: Any = getattr(source.robot, "name", source.robot)
-    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, names, ranges, of))
+    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, names, of))
 
 
 class _Shown:
@@ -151,13 +150,6 @@ class _Shown:
         of = self.horizon
         said = f"'{of.robot}', {of.samples} samples of {of.dt:g} s, {len(of.limited)} limits"
         return f"{type(self).__name__}({said})"
-
-    def __str__(self) -> str:
-        same, of = dict[str, list[str]](), self.horizon
-        for k, (name, ends) in enumerate(zip(of.limited, of.ranges.T, strict=True)):
-            kind = "hard" if k < len(of.acting) else "soft"
-            same.setdefault(f"{kind}, {ends[0]:.6g} to {ends[1]:.6g}", []).append(name)
-        return folded((repr(self), *(f"{key}: {', '.join(at)}" for key, at in same.items())))
 
 
 @dataclass(eq=False, repr=False)
@@ -217,8 +209,8 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
         return Receding(self.horizon, self.deviation(robot))
 
 
-def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any], Array]:
-    """Return the names of limited signals, their indices, a function for a stage, and ranges.
+def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any]]:
+    """Return the names of limited signals, their indices, and a function for a stage.
 
     The indices are among inputs, states and outputs. The function returns a stage's E, D, low and
     high for its output matrices and target.
@@ -254,7 +246,7 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
         of_d = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))[at]
         return of_e, of_d, (low - there)[at], (high - there)[at]
 
-    return tuple(names[i] for i in at), at, rows, np.array((low, high))[:, at]
+    return tuple(names[i] for i in at), at, rows
 
 
 def _about(

@@ -14,7 +14,7 @@ from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR
 from fflin.dynamics.orbital import GravityGradient, field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import Joint
-from fflin.robot.model_checks import coordinate_names
+from fflin.robot.mass_properties import coordinate_names
 from fflin.robot.robot import Robot
 
 # The coupling of a coordinate, M_ii (M^-1)_ii, is 1 where it is decoupled and grows as it loses

@@ -25,7 +25,7 @@ from fflin.linear.state_equations import assemble, at_rest, drift, output_equati
 from fflin.linear.verification import certify, inertia_matrix
 from fflin.robot.joints import ROOT
 from fflin.robot.limits import magnitudes_of
-from fflin.robot.model_checks import require_inertia
+from fflin.robot.mass_properties import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 

@@ -41,14 +41,10 @@ class Input:
                 several = len(self.ENTRIES) > 1 and dimension(what, value)
                 self._set(name, three_numbers(what, value) if several else number(what, value))
         for least, largest in self.ranges:
-            if largest <= 0.0:
+            if not least <= largest or largest <= 0.0:
                 raise InputError(
-                    f"{self.KEY} max is {largest:g}, expected more than 0; leave it out if there "
-                    "is no limit"
-                )
-            if least > largest:
-                raise InputError(
-                    f"{self.KEY} min is {least:g}, expected at most its max of {largest:g}"
+                    f"{self.KEY} min is {least:g} and max is {largest:g}, expected a max of more "
+                    "than 0 and a min of at most max; leave out what is not limited"
                 )
 
     def _set(self, name: str, value: Any) -> None:

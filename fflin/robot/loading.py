@@ -10,22 +10,15 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, ModelError
-from fflin.base.validation import instance
+from fflin.base.validation import instance, is_rotation
 from fflin.base.writing import remember
 from fflin.robot.catalog import RobotFile, find_mesh, find_robot, folders
 from fflin.robot.fields import MERGED
-from fflin.robot.joints import ROOT, Follower, require_room
-from fflin.robot.mass_properties import LinkMass
-from fflin.robot.model_checks import (
-    check_model,
-    check_order,
-    check_root,
-    idle_coordinates,
-    joint_of,
-    massless_note,
-)
+from fflin.robot.joints import ROOT, Follower, joint_of, require_room
+from fflin.robot.mass_properties import LinkMass, massless_note
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.links import is_impossible
 from fflin.robot.urdf.reader import Advice, read_urdf
 from fflin.robot.welding import Lock, locked_model, requested, welded
 
@@ -113,7 +106,7 @@ def load(
             notes.append(text)
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
-    if idle_coordinates(loaded):
+    if loaded.idle_coordinates:
         # No warning: whatever needs the inverse of M refuses with this.
         notes.append(massless_note(loaded))
     return replace(loaded, notes=tuple(notes))
@@ -203,7 +196,7 @@ def from_model(
     copy = model.copy()
     copy.gravity.setZero()
     name = name or model.name or "model"
-    check_model(copy, name)
+    _check_model(copy, name)
     robot = _robot(copy, name, lock, {})
     own = {joint.name: float(robot.model.damping[joint.idx_v]) for joint in robot.joints}
     robot = replace(robot, urdf_damping=own)
@@ -211,7 +204,7 @@ def from_model(
 
 
 def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:
-    check_root(model, name)
+    _check_root(model, name)
     require_room(model, name)
     locked: tuple[str, ...] = ()
     if lock is not None:
@@ -224,8 +217,65 @@ def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, 
         for joint, mimic in mimics.items()
     )
     robot = Robot(model, name, None, "", joints, followers, locked=locked)
-    check_order(model, name)
+    _check_order(model, name)
     return robot
+
+
+def _check_root(model: pin.Model, name: str) -> None:
+    """Refuse a model that is not one tree on one free-flyer."""
+    root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
+    if root != "JointModelFreeFlyer":
+        raise ModelError(
+            f"'{name}': the root joint is {root}, expected JointModelFreeFlyer; build the model "
+            "with pin.JointModelFreeFlyer() as its root joint"
+        )
+    fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
+    if fixed:
+        raise ModelError(
+            f"'{name}': joint '{fixed[0]}' is attached to the world, not the free-flyer; connect "
+            "every moving link to the one base"
+        )
+
+
+def _check_order(model: pin.Model, name: str) -> None:
+    """Refuse joints that are not in depth-first order."""
+    above: list[int] = []
+    for joint, parent in enumerate(model.parents.tolist()):
+        while above and above[-1] != parent:
+            above.pop()
+        if joint and not above:
+            raise ModelError(
+                f"'{name}': the joints are not in depth-first order, which makes Pinocchio's CRBA "
+                "wrong; add all joints of one branch before the joints of the next"
+            )
+        above.append(joint)
+
+
+def _check_model(model: pin.Model, name: str) -> None:
+    """Refuse a model whose numbers no robot has, by the joint that has them."""
+    for index in range(ROOT, model.njoints):
+        body, joint, parent = model.inertias[index], model.joints[index], model.parents[index]
+        armature = model.armature[joint.idx_v : joint.idx_v + joint.nv]
+        moments = np.linalg.eigvalsh(np.nan_to_num(body.inertia)).tolist()
+        shown = ", ".join(f"{moment:.3g}" for moment in moments)
+        finite = np.isfinite([body.mass, *body.lever, *body.inertia.ravel(), *armature]).all()
+        faults = {
+            f"the parent {parent}, expected a joint before {index}": parent >= index,
+            "a placement that is not finite, or whose matrix R is not a rotation": not (
+                is_rotation(model.jointPlacements[index].rotation)
+                and np.isfinite(model.jointPlacements[index].translation).all()
+            ),
+            "a mass, centre of mass, inertia or armature that is not finite": not finite,
+            f"a link with a mass of {body.mass:g} kg, expected 0 or more": body.mass < 0.0,
+            f"a link with principal moments of inertia of {shown} kg m^2, expected 0 or more": (
+                is_impossible(body.mass, moments)
+            ),
+            f"an armature of {armature.tolist()}, expected 0 or more": (armature < 0.0).any(),
+        }
+        for fault in (fault for fault, found in faults.items() if found):
+            raise ModelError(
+                f"'{name}': joint '{model.names[index]}' has {fault}; correct it in the model"
+            )
 
 
 def body_alone(inertia: pin.Inertia, name: str) -> Robot:

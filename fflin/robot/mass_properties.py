@@ -1,4 +1,4 @@
-r"""Mass of each link as in the URDF, and changes to physically realisable bodies.
+r"""Mass of each link as in the URDF, changes of bodies, and motions that move no mass.
 
 A body has mass m, centre of mass c and inertia I about c. With the identity matrix E, the second
 moments of its mass distribution are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The body is
@@ -10,23 +10,34 @@ Automation Letters 3(1), 2018).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, listed, require_known
+from fflin.base.errors import InputError, SingularInertiaError, listed, require_known
 from fflin.base.names import by_name
+from fflin.base.rotation import skew
 from fflin.base.validation import Array, as_double, number, positive, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.urdf.links import TRIANGLE_SLACK, Link, is_impossible
 
+if TYPE_CHECKING:
+    from fflin.robot.robot import Robot
+
 _KEYS = ("mass", "com", "inertia")
 _SYMMETRIC = 1e-9
 # Relative errors of a sum of bodies, and of a second moment, from rounding.
 _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
+
+# Singular values below this share of the largest are zero: rounding leaves 1e-15 of it, and the
+# least that is meant, of links 1e7 m apart, is 1e-7 of it.
+_ZERO = 1e-12
+
+# A coordinate is named where its share in a motion is larger than this.
+_INVOLVED = 0.1
 
 
 def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
@@ -242,3 +253,73 @@ def _squares(com: Array) -> Array:
     """Return the inertias (N, 3, 3) of unit masses at points (N, 3)."""
     squares: Array = (com * com).sum(axis=1)[:, None, None] * np.eye(3)
     return squares - com[:, :, None] * com[:, None]
+
+
+def idle_coordinates(robot: Robot) -> tuple[str, ...]:
+    """Return the coordinates that can move together without moving mass; usually none."""
+    # The energy vanishes only if the velocity of every mass, every turn that has inertia and every
+    # rate that has an armature do: a question of geometry, decided without the masses, whose
+    # rounding could hide it.
+    bodies = robot.model.inertias.tolist()[ROOT:]
+    moments = [np.linalg.eigh(body.inertia) for body in bodies]
+    if all(
+        body.mass > 0.0 and values[0] > _NO_MOMENT * values[2]
+        for body, (values, _) in zip(bodies, moments, strict=True)
+    ):
+        return ()
+    # v = columns nu: joints that mimic others follow them.
+    columns = np.eye(robot.nv)
+    for joint, leader, multiplier, _ in robot.followers:
+        columns[joint.idx_v, leader.idx_v] = multiplier
+    columns = columns[:, [*range(6), *(joint.idx_v for joint in robot.joints)]]
+    names = np.array(coordinate_names(robot))
+    rng = np.random.default_rng(0)
+    idle: tuple[str, ...] = ()
+    # An M that is singular at two random configurations is singular at all.
+    for _ in range(2):
+        velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
+        q = pin.integrate(robot.model, robot.neutral(), velocity)
+        moved = _moved(robot, q, moments) @ columns
+        moved /= np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
+        _, sizes, modes = np.linalg.svd(np.linalg.qr(moved, mode="r"))
+        rank = int(np.count_nonzero(sizes > _ZERO * sizes.max(initial=0.0)))
+        involved = np.linalg.norm(modes[rank:], axis=0) > _INVOLVED
+        idle = tuple(dict.fromkeys(names[involved].tolist()))
+        if not idle:
+            break
+    return idle
+
+
+def coordinate_names(robot: Robot) -> list[str]:
+    """Return the names (6 + n) of the coordinates of velocity, in state order, for a message."""
+    return ["the base"] * 6 + [f"joint '{name}'" for name in robot.joint_names]
+
+
+def massless_note(robot: Robot) -> str:
+    """Return the message about coordinates that can move without moving mass."""
+    idle = listed(robot.idle_coordinates)
+    return (
+        f"the mass matrix of '{robot.name}' is singular at every configuration: {idle} can move "
+        "without moving mass; give the links of these joints an inertia, or lock the joints"
+    )
+
+
+def require_inertia(robot: Robot) -> None:
+    """Refuse an M that is singular at every configuration, which rounding of factors may hide."""
+    if robot.idle_coordinates:
+        raise SingularInertiaError(massless_note(robot))
+
+
+def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:
+    """Return rows (k, nv) that give, from v, every velocity that has inertia."""
+    model, data = robot.model, robot.create_data()
+    pin.computeJointJacobians(model, data, q)
+    rows = [np.eye(model.nv)[model.armature > 0.0]]
+    for index, (values, axes) in enumerate(moments, start=ROOT):
+        body = model.inertias[index]
+        J = pin.getJointJacobian(model, data, index, pin.ReferenceFrame.LOCAL)
+        if body.mass > 0.0:
+            rows.append(J[:3] - skew(body.lever) @ J[3:])
+        turning = values > _NO_MOMENT * values[2]
+        rows.append(axes[:, turning].T @ J[3:])
+    return np.vstack(rows)

@@ -16,8 +16,7 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import with_appendages, with_inputs
-from fflin.robot.equipment.mounting import difference
-from fflin.robot.equipment.wheels import stored_momentum
+from fflin.robot.equipment.mounting import difference, stored_momentum
 from fflin.robot.fields import Range, Scope, checked_fields, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
@@ -25,6 +24,7 @@ from fflin.robot.mass_properties import (
     LinkMass,
     Piece,
     given_bodies,
+    idle_coordinates,
     pieces_of,
     random_bodies,
 )
@@ -363,6 +363,11 @@ class Robot(Coordinates):
         """Names of the model's frames that inputs and outputs use."""
         of_inputs = [name for item in self.inputs for name in item.frames]
         return (*of_inputs, *(name for item in self.outputs for name in item.frames))
+
+    @cached_property
+    def idle_coordinates(self) -> tuple[str, ...]:
+        """Coordinates that can move together without moving mass; usually none."""
+        return idle_coordinates(self)
 
     @cached_property
     def wheels(self) -> dict[str, float]:

@@ -17,9 +17,8 @@ from fflin.base.validation import Array, number
 from fflin.robot.equipment.assembly import with_inputs
 from fflin.robot.equipment.mounting import Mounted, carry_over, with_mounted
 from fflin.robot.inputs import ReactionWheel, named_inputs
-from fflin.robot.joints import ROOT, Follower, Joint, find_frame
+from fflin.robot.joints import ROOT, Follower, Joint, find_frame, joint_of
 from fflin.robot.mass_properties import LinkMass
-from fflin.robot.model_checks import joint_of
 from fflin.robot.outputs import JointOutput
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic

@@ -22,7 +22,7 @@ from fflin.dynamics.orbital import OrbitField
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults, apply_faults
 from fflin.robot.joints import ROOT
-from fflin.robot.model_checks import require_inertia
+from fflin.robot.mass_properties import require_inertia
 from fflin.robot.robot import Robot
 
 # Returns of (t, q, v) a generalised force (nv,) in Pinocchio's order: on the base linear, then

@@ -10,7 +10,7 @@ import fflin
 from fflin.campaign.pointing import turned
 from fflin.campaign.report import worst_runs
 from fflin.campaign.runs import ARRAYS, CampaignJob
-from fflin.robot.equipment.wheels import turned_to
+from fflin.robot.equipment.mounting import turned_to
 from tests.support import policies
 from tests.support.campaigns import both
 from tests.support.robots import BUNDLED, free_body

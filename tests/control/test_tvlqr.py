@@ -354,7 +354,7 @@ def test_models_between_knots_are_computed_in_batches(moving, monkeypatch, sampl
         monkeypatch.setattr(fflin.Linearizer, name, counted)
     Q, R = weights(moving)
     fflin.tvlqr(moving, Q, R, 1.0, sample=sample)
-    assert 2 <= len(calls) < 20
+    assert 2 <= len(calls) < len(moving.t)
 
 
 def test_asking_for_a_gain_solves_nothing(moving, monkeypatch):

@@ -144,16 +144,16 @@ def test_default_weights_leave_modes_to_their_damping_and_name_them():
     ]
     assert decays[1] == pytest.approx(decays[0], rel=0.01)
     said = " ".join(str(flexible).split())
-    assert "decaying by their own damping only: " in said and "kg^0.5 m of the joints" not in said
-    assert "boom_mode_2" in said[said.index("decaying by their own damping") :]
+    assert "decaying more slowly: " in said and "kg^0.5 m of the joints" not in said
+    assert "boom_mode_2" in said[said.index("decaying more slowly") :]
 
 
 def test_a_pendulum_without_gravity_is_named():
-    with pytest.raises(fflin.StabilizabilityError, match=r"'swing_x'.*is a pendulum"):
+    with pytest.raises(fflin.StabilizabilityError, match=r"swing_x.*add inputs"):
         fflin.lqr(fflin.linearize(full().replace(gravity=(0, 0, 0))))
     tank = fflin.Slosh.cylinder("base", 0.1, 0.1, 1000.0, 0.04, name="tank")
     alone = fflin.load("planar_detumble", lock=["*"], appendages=[tank])
-    with pytest.raises(fflin.StabilizabilityError, match=r"'tank_x', 'tank_y' is a pendulum"):
+    with pytest.raises(fflin.StabilizabilityError, match=r"momentum of tank_x, .*a spring"):
         fflin.lqr(fflin.linearize(alone))
 
 
@@ -173,7 +173,7 @@ def test_a_campaign_that_draws_too_light_a_link_is_refused_by_the_mode(engine):
     policy = fflin.StateFeedback(lin, np.zeros((len(lin.input_names), len(lin.state_names))))
     options = {"runs": 8, "duration": 0.1, "dt": 0.05, "engine": engine}
     light = {"base.density": (-0.7, -0.5)}  # the modes have 0.8 of 2 kg
-    with pytest.raises(InputError, match=r"run \d draws .*'beam_mode_\d' has more participation"):
+    with pytest.raises(InputError, match=r"run \d draws .*'beam' has more participation"):
         fflin.monte_carlo(robot, policy, light, **options)
     made = fflin.monte_carlo(robot, policy, {"base.density": (-0.1, 0.2)}, **options)
     assert len(made.largest) == 8

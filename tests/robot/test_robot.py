@@ -241,13 +241,13 @@ def _set_scaled_rotation(model):
     [
         (_set_parent, "parent 5"),
         (_set_mass, "-1 kg"),
-        (_set_nan_mass, "nan kg"),
+        (_set_nan_mass, "finite"),
         (_set_lever, "finite"),
         (_set_inertia, "-0.5, 1, 1"),
         (_set_armature, "armature"),
         (_set_translation, "finite"),
-        (_set_rotation, "det R"),
-        (_set_scaled_rotation, "R^T R"),
+        (_set_rotation, "rotation"),
+        (_set_scaled_rotation, "rotation"),
     ],
 )
 def test_what_no_robot_has_is_refused_by_name(robots, spoil, words):
