@@ -239,10 +239,15 @@ def _momentum(lin: LinearModel) -> str:
     except InputError as error:
         text = f"no reduction: {error}"
     else:
-        text = (
-            f"{len(reduced.momenta)} momenta are conserved for all inputs; the reduced model has "
-            f"{len(reduced.A)} states"
-        )
+        orbit = "the orbit, " * bool(lin.mean_motion)
+        text = f"no momentum is conserved: {orbit}inputs, springs and dampers act on all momenta"
+        if len(reduced.momenta):
+            text = (
+                f"{len(reduced.momenta)} momenta are conserved for all inputs; the reduced model "
+                f"has {len(reduced.A)} states"
+            )
+        elif not lin.is_equilibrium():
+            text = "no momentum can be removed: the operating point is not an equilibrium"
         text = "\n".join((text, *(f"note: {note}" for note in reduced.notes)))
     return folded(text.splitlines())
 
