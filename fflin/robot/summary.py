@@ -4,7 +4,7 @@ import json
 import math
 import re
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from string import Template
 from textwrap import fill
 from typing import Any
@@ -170,15 +170,19 @@ def draft(robot: Robot, urdf: str) -> str:
         name: f"{high:.6g}" if low == -high else f"[{low:.6g}, {high:.6g}]"
         for name, (low, high) in limits_of(robot).items()
     }
+    found = (_candidate(robot, index) for index in sorted(range(model.nframes), key=_order(model)))
+    candidates, joint = [*found], _text(robot.joint_names[0] if robot.n else "joint_1")
+    spun = [_text(name) for _, name in candidates if name]
     template = Template(files("fflin.robot").joinpath("assets", "robot.toml").read_text("utf-8"))
     return template.substitute(
         name=_text(robot.name)[1:-1],
         joints=counted(robot.n, "joint"),
         mass=f"{robot.mass:.6g}",
         urdf=_text(urdf),
-        joint=_text(robot.joint_names[0] if robot.n else "joint_1"),
+        joint=joint,
         passive=passive if names else "",
-        candidates="".join(_candidate(robot, index) for index in range(model.nframes)),
+        candidates="".join(text for text, _ in candidates),
+        lock=", ".join(spun) or joint,
         damping=_lines("", {name: f"{value:.6g}" for name, value in damping.items()}),
         stiffness=_lines("", {name: f"{size * _SWING**2:.6g}" for name, size in inertia.items()}),
         limits=_lines("# ", limits),
@@ -189,34 +193,56 @@ def _lines(mark: str, values: Mapping[str, str]) -> str:
     return "".join(f"{mark}{_text(name)} = {value}\n" for name, value in values.items())
 
 
-def _candidate(robot: Robot, index: int) -> str:
-    """Return the input that a link's name suggests, in comments; empty if it suggests none."""
+def _order(model: pin.Model) -> Callable[[int], list[tuple[float, str]]]:
+    """Return a key that sorts frames by name, with the numbers in names by value."""
+
+    def key(index: int) -> list[tuple[float, str]]:
+        parts = re.split(r"([0-9]+)", model.frames[index].name)
+        return [(float(x), "") if x.isdecimal() else (-1.0, x) for x in parts]
+
+    return key
+
+
+def _candidate(robot: Robot, index: int) -> tuple[str, str]:
+    """Return the input that a link's name suggests, in comments, and the joint of a wheel."""
     model, frame = robot.model, robot.model.frames[index]
     kind = next((kind for kind, look in _LOOKS.items() if look.search(frame.name)), "")
     if not kind or frame.type != pin.FrameType.BODY or frame.parentJoint < ROOT:
-        return ""
+        return "", ""
     data = robot.create_data()
     pin.forwardKinematics(model, data, robot.neutral())
     placement = pin.updateFramePlacement(model, data, index)
-    axis, name, inertia = np.array([0.0, 0.0, 1.0]), frame.name, ""
+    axis, name, limits = np.array([0.0, 0.0, 1.0]), frame.name, "# max = 1.0  # [N]\n"
+    own = ""
     if kind == "reaction_wheel":
         name += "_rotor"  # which may be a joint's, whose name no frame has
+        limits = "# max = 1.0  # [N m]\n"
         joint = model.joints[frame.parentJoint]
         if joint.nv == 1 and model.frames[frame.parentFrame].type == pin.FrameType.JOINT:
             data = joint.createData()
             joint.calc(data, robot.neutral())
             axis = np.asarray(data.S).reshape(6)[3:]
             size = axis @ model.inertias[frame.parentJoint].inertia @ axis
-            inertia = f"# inertia = {size:.6g}  # [kg m^2], if its joint is locked\n"
+            own = model.names[frame.parentJoint]
+            effort, speed = (
+                f"{x:.6g}" if 0.0 < x < 1e100 else "1.0"
+                for x in (model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v])
+            )
+            limits = (
+                f"# inertia = {size:.6g}  # [kg m^2]\n# max = {effort}  # [N m]\n"
+                f"# max_speed = {speed}  # [rad/s]\n"
+            )
     key = "axis" if kind == "reaction_wheel" else "direction"
     at, along = _vector(placement.translation), _vector(placement.rotation @ axis)
-    position = "" if inertia or key == "axis" else "# position = [0, 0, 0]  # [m], in that frame\n"
+    position = "" if key == "axis" else "# position = [0, 0, 0]  # [m], in that frame\n"
     said = f"# Link {_text(frame.name)} at {at} [m], {key} {along}, both in base axes:"
-    return (
-        f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n"
+    lock = f"# To use this wheel, lock joint {_text(own)} above.\n" if own else ""
+    text = (
+        f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n{lock}"
         f'# [[input]]\n# type = "{kind}"\n# name = {_text(name)}\n# frame = {_text(frame.name)}\n'
-        f"{position}# {key} = {_vector(axis)}\n{inertia}"
+        f"{position}# {key} = {_vector(axis)}\n{limits}"
     )
+    return text, own
 
 
 def _vector(values: np.ndarray) -> str:

@@ -317,7 +317,7 @@ def plot_motion(
         Motion to draw. If the motion has a prediction, solid lines show the nonlinear robot and
         dashed lines the linear model. The panel below each group of states shows the difference.
         Along a trajectory, pale lines show the reference, and the panel below each group shows
-        the error, with dashed lines for the linear model. A dotted line marks the time at which
+        the error. A dotted line marks the time at which
         the reference comes to rest.
     path : str or Path, optional
         File to save to: .png, .pdf or .svg.

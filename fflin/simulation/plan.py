@@ -14,11 +14,9 @@ from fflin.base.names import group_of
 from fflin.base.validation import Array, instance, truth, vector
 from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
 from fflin.control.linear_controller import growing
-from fflin.control.plants import notes_of
 from fflin.control.policies import axes_of, bound, fed_back, feedback_of
 from fflin.control.tracking import (
     Reference,
-    TrajectoryFeedback,
     followed,
     reference_of,
     tracking_of,
@@ -97,7 +95,7 @@ class Plan:
     reference: Reference | None  # the motion that is followed, where there is one
     steered: tuple[str, ...]  # the states that are known to be fed back
     notes: Callable[[], tuple[str, ...]]  # returns the remarks for the report, which take a moment
-    predictor: Predictor | TrajectoryFeedback | None  # of the linear motion under the same law
+    predictor: Predictor | None  # of the linear motion under the same law
 
     @property
     def last_node(self) -> float:
@@ -222,7 +220,7 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
         target=goal,
         reference=follows,
         steered=fed_back(policy),
-        notes=lambda: (*growing(policy), *notes_of(policy, robot), *times.notes),
+        notes=lambda: (*growing(policy), *times.notes),
         predictor=foresees,
     )
     return plan, plant

@@ -151,7 +151,7 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
         dt, turn = plan.times.dt, float(np.abs(v[plan.turning]).max()) * plan.times.dt
         detail = f": a joint or the base rotates by {turn:.2g} rad per step"
         known = LARGEST_TURN <= turn <= _LARGEST_SAID
-        return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}"
+        return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}; give a smaller dt"
 
     return ending
 

@@ -117,8 +117,8 @@ def simulate(
         Function callback(t, q, v, u), called at every recorded row.
     linear : LinearModel or bool, optional
         Model that predicts the motion under the same control law; by default the policy's own
-        model, False for no prediction. A motion can be predicted for a StateFeedback, a feedback
-        along a trajectory, an OutputFeedback or LinearController (without its noise), or no policy.
+        model, False for no prediction. A motion can be predicted for a StateFeedback, an
+        OutputFeedback or LinearController (without its noise), or no policy.
         A sampled model that was read from a file predicts nothing.
     target : LinearModel or array_like (nx,), optional
         Target state from which errors are measured, or a model whose operating point is the
@@ -225,7 +225,7 @@ def motion_of(plan: Plan, plant: Plant, conserved: Conserved, run: Recording) ->
         **{name: getattr(run, name) for name in ("t", "q", "v", "u", "stopped", "engine")},
         x=x,
         target=target,
-        prediction=predict(plan, x, run.steps, target),
+        prediction=predict(plan, x, run.steps),
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
         momentum_drift=conserved.momentum_drift(history, run.momentum),

@@ -141,16 +141,16 @@ def test_default_weights_leave_modes_to_their_damping_and_name_them():
     ]
     assert decays[1] == pytest.approx(decays[0], rel=0.01)
     said = " ".join(str(flexible).split())
-    assert "decaying by their own damping only: " in said and "kg^0.5 m of the joints" not in said
-    assert "boom_mode_2" in said[said.index("decaying by their own damping") :]
+    assert "decaying more slowly: " in said and "kg^0.5 m of the joints" not in said
+    assert "boom_mode_2" in said[said.index("decaying more slowly") :]
 
 
 def test_a_pendulum_without_gravity_is_named():
-    with pytest.raises(fflin.StabilizabilityError, match=r"'swing_x'.*is a pendulum"):
+    with pytest.raises(fflin.StabilizabilityError, match=r"swing_x.*add inputs"):
         fflin.lqr(fflin.linearize(full().replace(gravity=(0, 0, 0))))
     tank = fflin.Slosh.cylinder("base", 0.1, 0.1, 1000.0, 0.04, name="tank")
     alone = fflin.load("planar_detumble", lock=["*"], appendages=[tank])
-    with pytest.raises(fflin.StabilizabilityError, match=r"'tank_x', 'tank_y' is a pendulum"):
+    with pytest.raises(fflin.StabilizabilityError, match=r"momentum of tank_x, .*a spring"):
         fflin.lqr(fflin.linearize(alone))
 
 
