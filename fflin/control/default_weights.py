@@ -315,12 +315,11 @@ def _growth(lin: LinearModel) -> Limit:
 
 
 class _Trial(NamedTuple):
-    """A loop that was tried: its limit, its gain and modes, and what its inputs require."""
+    """A loop that was tried: its limit and modes, and what its inputs require."""
 
     limit: Limit
     left: float  # factor on the bandwidth that the efforts allow, as far as it is below 1
     effort: str  # the input that allows the least
-    K: Array
     rates: Values  # of the modes (nx,) [1/s]
     modes: Complex
     required: Array  # largest inputs (nu,)
@@ -357,7 +356,7 @@ def _slowed(
             _largest_use(later, driven, lin.state_names).max(axis=0),
         )
         left, what = min(_limits_on("effort", _efforts_left(lin), use, 2.0), default=Limit(1.0, ""))
-        trials.append(_Trial(limit, left, what, K, rates, modes, np.abs(lin.u0) + use))
+        trials.append(_Trial(limit, left, what, rates, modes, np.abs(lin.u0) + use))
         if left >= 1.0 - 1e-6:
             return limit, _achieved(lin, trials[-1])
         if limit.bandwidth <= least.bandwidth:

@@ -199,8 +199,11 @@ def titled(record: Any, **sizes: int) -> str:
     """Return a one-line title: the robot, the sizes, the sampling time and the residual."""
     time = f"dt={record.dt:g} s" if record.dt else "continuous"
     parts = [f"'{record.robot}'", *(f"{key}={size}" for key, size in sizes.items()), time]
-    if hasattr(record, "residual"):
-        parts += [f"margin={record.margin:.3g}", f"residual={record.residual:.1e}"]
+    parts += [
+        f"{key}={getattr(record, key):{form}}"
+        for key, form in (("margin", ".3g"), ("residual", ".1e"))
+        if hasattr(record, key)
+    ]
     return f"{type(record).__name__}({', '.join(parts)})"
 
 
@@ -270,20 +273,14 @@ def one_sided(gain: Gain) -> str:
 
 
 def _unregulated(gain: Gain) -> str:
-    """Return the states that are not fed back, with the reasons for groups of them."""
+    """Return the states that are not fed back, with the reasons."""
     left = [name for name in gain.state_names if gain.regulated and name not in gain.regulated]
-    reasons = {
-        "base position and velocity": "no input pushes the base",
-        "wheel angles": "ignorable",
-        "wheel speeds": "determined by the other states; any others by wheel_speeds=True",
-    }
-    groups = [("r_b.", "v_b."), ("q_m.",), ("qdot_m.",)]
-    parts = [
-        f"{what} ({why}): {listed(named)}"
-        for (what, why), group in zip(reasons.items(), groups, strict=True)
-        if (named := [name for name in left if name.startswith(group)])
-    ]
-    return "; ".join(parts)
+    if not left:
+        return ""
+    return (
+        f"{listed(left)} (no input reaches them, or other states determine them; "
+        "wheel_speeds=True regulates all controllable wheel speeds)"
+    )
 
 
 def _poles(gain: Gain) -> str:

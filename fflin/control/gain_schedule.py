@@ -14,6 +14,7 @@ from fflin.base.errors import InputError
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import folded
 from fflin.base.validation import Array, number
+from fflin.control.gain import titled
 from fflin.control.optimal.differential_riccati import Coefficients, imbalance
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
@@ -29,22 +30,7 @@ _nothing = partial(np.zeros, 0)
 class Schedule(Design):
     """Gain as a function of time, given at the knots or samples of a trajectory."""
 
-    WIDTH, WIDE = "nu", 1
-
     t: Array
-
-    def __repr__(self) -> str:
-        of: Any = self
-        time, wide = f"dt={of.dt:g} s, " if of.dt else "", self.interpolant.K.shape[self.WIDE]
-        return (
-            f"{type(self).__name__}('{of.robot}', {len(self.t)} knots, {self.t[0]:g} to "
-            f"{self.t[-1]:g} s, {time}nx={of.P.shape[1]}, {self.WIDTH}={wide}, "
-            f"residual={of.residual:.1e})"
-        )
-
-    def __call__(self, t: float) -> Array:
-        """Return the gain at a time."""
-        return self.gain(t)
 
     def gain(self, t: float) -> Array:
         """Return the gain at time t, or raise `InputError` if t is outside the knots.
@@ -132,6 +118,9 @@ class GainSchedule(Schedule):
     hold: str = field(default_factory=str)
     frame: str = field(default_factory=str)
 
+    def __repr__(self) -> str:
+        return titled(self, knots=len(self.t), nx=self.K.shape[2], nu=self.K.shape[1])
+
     def __str__(self) -> str:
         """Return the report: the sizes, the residual and the rule of the weights."""
         verdict = [] if self.verified else [NOT_VERIFIED]
@@ -208,7 +197,6 @@ class FilterSchedule(Schedule):
     """
 
     VECTORS: ClassVar = ("t",)
-    WIDTH, WIDE = "ny", 2
 
     L: Array
     P: Array
@@ -225,6 +213,9 @@ class FilterSchedule(Schedule):
     output_names: tuple[str, ...]
     robot: str
     dt: float = field(default_factory=float)
+
+    def __repr__(self) -> str:
+        return titled(self, knots=len(self.t), nx=self.L.shape[1], ny=self.L.shape[2])
 
     def covariance(self, t: float) -> Array:
         """Return P (nx, nx) of the most recent sample at time t."""

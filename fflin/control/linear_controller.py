@@ -20,35 +20,15 @@ from fflin.base.writing import as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Policy, Sample, decider, feedback_of
 from fflin.dynamics.integrators import held_exponential
-from fflin.dynamics.outputs import KINDS, Measuring, state_indices
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.outputs import Measuring
 from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel
-from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # the names that signals have of themselves
 
 # A pole counts as unstable if it grows faster than this fraction of the fastest pole.
 _ROUNDING = 1e-6
-
-
-def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
-    """Return the state index of each output, and the gyroscopes, which are numbered after states.
-
-    Other sensors raise `InputError`.
-    """
-    found, gyros = list[int](), list[Gyroscope]()
-    for output in state.robot.outputs:
-        if isinstance(output, Gyroscope):
-            first = state.nx + 3 * len(gyros)
-            found += range(first, first + 3)
-            gyros.append(output)
-        elif type(output) in KINDS:
-            raise InputError(f"a {type(output).__name__} is measured in Python")
-        else:
-            found += state_indices(state, output)
-    return found, gyros
 
 
 class System(NamedTuple):

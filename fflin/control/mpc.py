@@ -199,11 +199,6 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
         """Return the quadratic program at time t [s] and error e (nx,), by default zero."""
         return self.horizon.matrices(e, t)
 
-    def law(self) -> Callable[[float, Array], Array]:
-        """Return law(t, e) -> u: the inputs at an error e and a time of the run."""
-        plans = Receding(self.horizon)
-        return lambda t, e: self.commanded(t)[2] + plans.step(t, e)
-
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot with the trajectory's states and inputs."""
         return Receding(self.horizon, self.deviation(robot))
@@ -220,15 +215,14 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
     beside = [name for name in outputs if name not in states]
     known = (*state_keys(robot.joint_names), *input_keys(of))
-    several, found = isinstance(limits, list | tuple), dict[str, Any]()
-    parts = list(limits) if several else [limits]
+    found, parts = dict[str, Any](), list(limits) if isinstance(limits, list | tuple) else [limits]
     for k, part in enumerate(parts):
-        keys = [*part] if isinstance(part, Mapping) and beside else []
-        own = [x for x in keys if stands_for_any(x, beside) and not stands_for_any(x, known)]
-        ranges = by_name("output", {key: range_of(key, part[key]) for key in own}, beside)
-        found |= {beside[i]: limit for i, limit in ranges.items()}
-        parts[k] = {key: part[key] for key in keys if key not in own} if own else part
-    acting = chosen_limits(robot, parts if several else parts[0])[0]
+        if isinstance(part, Mapping) and beside:
+            own = [x for x in part if stands_for_any(x, beside) and not stands_for_any(x, known)]
+            ranges = by_name("output", {key: range_of(key, part[key]) for key in own}, beside)
+            found |= {beside[i]: limit for i, limit in ranges.items()}
+            parts[k] = {key: limit for key, limit in part.items() if key not in own}
+    acting = chosen_limits(robot, parts if len(parts) > 1 else parts[0])[0]
     found |= {name: acting[name] for name in states if name in acting}
     of_inputs = np.array(input_limits(robot, acting))
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))

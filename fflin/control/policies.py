@@ -15,12 +15,13 @@ from fflin.control.channel import Law
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import states_of, unwound
-from fflin.dynamics.outputs import Measuring
+from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.limits import limits_of
+from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
@@ -238,6 +239,24 @@ class Clock:
                 f"{self._dt:g} s; leave out `sample`, or set `sample` to the expected value"
             )
         self._last = t
+
+
+def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
+    """Return the state index of each output, and the gyroscopes, which are numbered after states.
+
+    Other sensors raise `InputError`.
+    """
+    found, gyros = list[int](), list[Gyroscope]()
+    for output in state.robot.outputs:
+        if isinstance(output, Gyroscope):
+            first = state.nx + 3 * len(gyros)
+            found += range(first, first + 3)
+            gyros.append(output)
+        elif type(output) in KINDS:
+            raise InputError(f"a {type(output).__name__} is measured in Python")
+        else:
+            found += state_indices(state, output)
+    return found, gyros
 
 
 class Sample(NamedTuple):

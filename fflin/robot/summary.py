@@ -19,7 +19,6 @@ from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 _LIMITS = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
-_STATE = {"rpy": "[deg]", "position": "[m]", "joints": "[rad | m]", "velocity": "[rad/s | m/s]"}
 
 _LOOKS = {
     "reaction_wheel": re.compile(r"(?<![a-z])(rw|(fly|reaction_?)?wheel)(?![a-z])", re.IGNORECASE),
@@ -91,7 +90,6 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
         *[at_point] * bool(at_point),
         grid(rows, "ll"),
         *[_LIMITS] * limited,
-        *_appendages(robot),
         *_settings(robot),
     ]
     parts.append(f"frames\n{_indented(', '.join(dict.fromkeys(frames)), '  ')}")
@@ -109,34 +107,12 @@ def _masses(robot: Robot) -> list[float]:
     return masses
 
 
-def _appendages(robot: Robot) -> list[str]:
-    """Show flexible appendages and slosh, with their modes if the link is clamped."""
-    rows = [["appendage", "on frame", "mode", "Hz", "damping ratio", "stiffness"]]
-    for item in robot.appendages:
-        for name in item.modes:
-            index = robot.joint_names.index(name)
-            joint = robot.joints[index]
-            stiffness, damping, _ = (each[index].item() for each in robot.springs)
-            cells = [".", ".", "."]
-            if stiffness:
-                omega, ratio = joint.oscillation(stiffness, damping)
-                unit = {"m": "N/m", "rad": "N m/rad"}.get(joint.unit, "1/s^2")
-                cells = [f"{0.5 * omega / math.pi:.6g}", f"{ratio:.4g}", f"{stiffness:.6g} {unit}"]
-            rows.append([item.title, item.frame, name, *cells])
-    return [grid(rows, "lll")] * bool(robot.appendages)
-
-
 def _settings(robot: Robot) -> list[str]:
     """Show settings in addition to the URDF, except inputs and orbit."""
     outputs = [":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ()))) for y in robot.outputs]
-    modes = {joint.name for joint in robot.modes}
-    stiffness, damping = (
-        {name: value for name, value in given.items() if name not in modes}
-        for given in (robot.stiffness, robot.damping)
-    )
     shown = {
-        "stiffness [N m/rad | N/m]": stiffness,
-        "damping [N m s/rad | N s/m]": damping,
+        "stiffness [N m/rad | N/m | 1/s^2]": robot.stiffness,
+        "damping [N m s/rad | N s/m | 1/s]": robot.damping,
         "spring rest positions [rad | m]": robot.rest,
         "passive joints": robot.passive,
         "locked joints": robot.locked,
@@ -145,12 +121,13 @@ def _settings(robot: Robot) -> list[str]:
         "limits": {key: f"{low:g} to {high:g}" for key, (low, high) in robot.limits.items()},
         **{f"weights, {part}": value for part, value in robot.weights.items()},
         **{
-            f"{name}, {part} {_STATE[part]}": value
+            f"{name}, {part}": value
             for name in ("point", "target", "start")
             for part, value in getattr(robot, name).items()
         },
     }
     lines = [f"{title}: {_said(value)}" for title, value in shown.items() if value]
+    lines += [f"{x.title} on frame {x.frame}: modes {', '.join(x.modes)}" for x in robot.appendages]
     return [folded(lines)] * bool(lines)
 
 

@@ -324,7 +324,7 @@ def test_files_keep_every_bit(gain, tmp_path, ending):
         before, after = getattr(gain, item.name), getattr(back, item.name)
         same = np.array_equal(before, after) if isinstance(before, np.ndarray) else before == after
         assert same and np.shape(before) == np.shape(after), item.name
-    for words, name in (("Gain", "else"), ("read", "missing")):
+    for words, name in (("Gain", "else"), ("No such file", "missing")):
         if name == "else":
             (tmp_path / f"else{ending}").write_bytes(path.read_bytes()[:200])
         with pytest.raises(fflin.FileError, match=words):

@@ -124,8 +124,8 @@ def test_filters_are_kept(moving, tmp_path, ending):
     for item in fields(schedule):
         assert np.array_equal(getattr(schedule, item.name), getattr(back, item.name)), item.name
     assert (back.gain(0.1) == schedule.gain(0.1)).all()
-    assert repr(schedule).startswith("FilterSchedule('astrobee_arm', 3 knots, 0 to 0.4 s, dt=0.2")
-    assert "nx=16, ny=14, residual=" in repr(schedule)
+    start = "FilterSchedule('astrobee_arm', knots=3, nx=16, ny=14, dt=0.2 s, residual="
+    assert repr(schedule).startswith(start)
 
 
 def test_what_is_wrong_is_told(moving):

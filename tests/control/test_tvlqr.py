@@ -74,7 +74,7 @@ def test_double_integrators_have_the_closed_form():
         # Within the 1e-7 that interpolation is held to.
         assert schedule.cost_to_go(t) == pytest.approx(expected, abs=3e-7 * np.abs(expected).max())
         K = np.linalg.solve(R, lin.B.T @ expected)
-        assert schedule(t) == pytest.approx(K, abs=1e-6 * np.abs(K).max())
+        assert schedule.gain(t) == pytest.approx(K, abs=1e-6 * np.abs(K).max())
     assert schedule.P[0] == pytest.approx(
         np.linalg.inv(
             (np.eye(12) - 5 * lin.A) @ np.linalg.inv(Qf) @ (np.eye(12) - 5 * lin.A).T

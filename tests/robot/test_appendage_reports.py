@@ -1,6 +1,7 @@
 """Modes of flexible appendages and slosh in reports: of motions, campaigns, robots and modes."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -121,16 +122,12 @@ def test_a_summary_lists_the_appendages():
     from fflin.robot.summary import robot_info
 
     text = robot_info(full())
-    assert row(text, "boom       base             boom_mode_2") == [
-        *("0.8", "0.005", "25.2662", "1/s^2"),
-    ]
-    assert row(text, "tank       base             tank_x")[2:] == ["47.3741", "N/m"]
-    assert row(text, "swing      base             swing_x") == [".", ".", "."]
+    assert "boom on frame base: modes boom_mode_1, boom_mode_2" in " ".join(text.split())
+    assert re.search(r"boom_mode_2 = 25\.2662", text)
     # The modes are neither joints nor bodies nor frames of the user's.
     rigid = robot_info(servicer()[0])
     assert row(text, "(base)")[1] == row(rigid, "(base)")[1]
     assert f"{servicer()[0].n + 1} joints, 10 modes" in text
-    assert text.count("boom_mode_2") == 1
 
 
 def test_default_weights_leave_modes_to_their_damping_and_name_them():
