@@ -41,7 +41,7 @@ _PUBLIC = {
         "linear.linearization": ["linearize", "Linearizer"],
         "linear.model": ["LinearModel", "Certificate"],
         "dynamics.state": ["StateMap"],
-        "linear.nonlinear": ["outputs"],
+        "linear.fit": ["outputs"],
         "linear.equilibrium": ["equilibrium", "Equilibrium"],
         "linear.trajectory": ["Trajectory"],
         "linear.linear_trajectory": ["linearize_trajectory", "LinearTrajectory"],
@@ -50,8 +50,7 @@ _PUBLIC = {
     },
     "Analysis": {
         "analysis.controllability": ["controllability", "Controllability"],
-        "analysis.observability": ["observability", "Observability"],
-        "analysis.gramians": ["gramians", "Gramians"],
+        "analysis.observability": ["observability", "Observability", "gramians", "Gramians"],
         "analysis.modes": ["modes", "Modes", "Mode"],
         "analysis.effective_masses": ["effective_masses", "EffectiveMasses"],
         "analysis.relative_equilibria": [

@@ -45,7 +45,7 @@ from fflin.linear.linearization import Linearizer as Linearizer
 from fflin.linear.model import LinearModel as LinearModel
 from fflin.linear.model import Certificate as Certificate
 from fflin.dynamics.state import StateMap as StateMap
-from fflin.linear.nonlinear import outputs as outputs
+from fflin.linear.fit import outputs as outputs
 from fflin.linear.equilibrium import equilibrium as equilibrium
 from fflin.linear.equilibrium import Equilibrium as Equilibrium
 from fflin.linear.trajectory import Trajectory as Trajectory
@@ -63,8 +63,8 @@ from fflin.analysis.controllability import controllability as controllability
 from fflin.analysis.controllability import Controllability as Controllability
 from fflin.analysis.observability import observability as observability
 from fflin.analysis.observability import Observability as Observability
-from fflin.analysis.gramians import gramians as gramians
-from fflin.analysis.gramians import Gramians as Gramians
+from fflin.analysis.observability import gramians as gramians
+from fflin.analysis.observability import Gramians as Gramians
 from fflin.analysis.modes import modes as modes
 from fflin.analysis.modes import Modes as Modes
 from fflin.analysis.modes import Mode as Mode

@@ -11,7 +11,7 @@ from fflin.analysis.mechanics import floating_inertia
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, grid, width
 from fflin.base.validation import Array, FrozenArrays, instance
-from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 

@@ -15,7 +15,7 @@ from fflin.analysis.reduction import ReducedModel
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, grid, width
 from fflin.base.validation import Array, Complex, FrozenArrays, instance
-from fflin.dynamics.chart import Chart
+from fflin.dynamics.coordinates import Chart
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.appendage_bodies import effective_shares

@@ -12,7 +12,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError, SingularInertiaError
 from fflin.base.tables import grid
 from fflin.base.validation import Array, Complex, FrozenArrays, instance
-from fflin.dynamics.names import frame_of
+from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.orbital import field_of, mean_motion
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot

@@ -32,7 +32,15 @@ import numpy as np
 
 from fflin.base.errors import FileError, InputError
 from fflin.base.validation import FrozenArrays
-from fflin.base.writing import as_path, check_ending, read_file, reason, shown, write_atomically
+from fflin.base.writing import (
+    as_path,
+    check_ending,
+    missing,
+    read_file,
+    reason,
+    shown,
+    write_atomically,
+)
 
 CHECKSUM = "sha256"
 
@@ -84,7 +92,7 @@ def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
     except FileError:
         raise
     except FileNotFoundError:
-        raise FileError(f"{path}: cannot be read: No such file or directory") from None
+        raise FileError(f"{path}: No such file{missing(path)}") from None
     except Exception as error:  # each decoder has its own dozen
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
             raise NoRoomError(f"{shown(path)}: does not fit into memory") from None

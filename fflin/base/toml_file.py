@@ -1,12 +1,11 @@
-"""TOML files: their values, the kinds of values, and the line number of each key."""
+"""TOML files: their values, and the line number of each key."""
 
 import re
-import reprlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from fflin.base.errors import FflinError, InputError
 from fflin.base.names import stands_for_any
@@ -20,22 +19,6 @@ else:
 # Some 1,000 inputs.
 _SIZE_LIMIT = 2**17
 
-# The time for a dotted key grows with the square of its parts.
-_DOTS_LIMIT = 1_000
-
-# Python refuses to write integers of more than 4,300 digits, as an error would.
-_BITS_LIMIT = 10_000
-
-# What may hold a line that looks like a key: strings of several lines. Those of one line and
-# comments are found too, for they may hold the quotes of the former.
-_TEXTS = re.compile(
-    r'"""(?:\\.|[^\\])*?"""+'
-    r"|'''.*?'''+"
-    r'|"(?:\\.|[^"\\\n])*"'
-    r"|'[^'\n]*'"
-    r"|#[^\n]*",
-    re.DOTALL,
-)
 _PART = r"""(?:[\w-]+|"[^"]*"|'[^']*')"""
 _KEY = rf"({_PART}(?:\s*\.\s*{_PART})*)\s*"
 _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
@@ -47,27 +30,6 @@ def is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < 1e100
 
 
-def is_vector(value: Any) -> bool:
-    """Whether a value of TOML is a list of three finite numbers."""
-    return isinstance(value, list) and len(value) == 3 and all(map(is_number, value))
-
-
-class Kind(NamedTuple):
-    """Kind of value in a TOML file: the test of a value, and what a message expects."""
-
-    fits: Callable[[Any], bool]
-    expected: str
-
-
-NAME = Kind(lambda value: isinstance(value, str) and value != "", "a text in quotes")
-NUMBER = Kind(is_number, "a finite number")
-VECTOR = Kind(is_vector, "three finite numbers [x, y, z]")
-NUMBERS = Kind(
-    lambda value: is_number(value) or is_vector(value), "one finite number, or three for [x, y, z]"
-)
-TRUTH = Kind(lambda value: isinstance(value, bool), "true or false")
-
-
 class TomlFile:
     """Content of a TOML file, with the lines of places such as ``input``, 3, ``axis``."""
 
@@ -76,32 +38,14 @@ class TomlFile:
         content = read_file(path, "TOML", _SIZE_LIMIT)
         try:
             text = content.decode("utf-8-sig").replace("\r\n", "\n")
-        except UnicodeDecodeError as error:
-            line = content.count(b"\n", 0, error.start) + 1
-            raise InputError(f"{path}:{line}: is not UTF-8 text; save it as UTF-8") from None
-        for number, written in enumerate(text.split("\n"), start=1):
-            if written.count(".") > _DOTS_LIMIT:
-                raise InputError(
-                    f"{path}:{number}: the line has more than {_DOTS_LIMIT} dots; shorten the line"
-                )
-        try:
             self.record: dict[str, Any] = tomllib.loads(text)
-        except RecursionError:
-            message = f"{path}: tables are nested too deeply; expected tables that contain values"
+        except (ValueError, RecursionError) as error:
+            found = re.search(r"at line (\d+)", str(error))
+            last = getattr(error, "start", len(content.rstrip()))  # of what is not UTF-8 text
+            line = found[1] if found else content.count(b"\n", 0, last) + 1
+            message = f"{path}:{line}: invalid TOML: {error}; correct the file"
             raise InputError(message) from None
-        except ValueError as error:
-            raise InputError(_explain(path, text, str(error))) from None
-        # Keys may be quoted: what stands on one line is left, and is no line of its own.
-        blank = _TEXTS.sub(lambda found: "\n" * found[0].count("\n") or found[0], text)
-        self._lines = _lines_of(blank)
-        for place, value in _values(self.record):
-            if type(value) is int and value.bit_length() > _BITS_LIMIT:
-                name = ".".join(map(str, place))
-                message = (
-                    f"{name} is an integer with too many digits; write the number as a float, such "
-                    "as 1e30"
-                )
-                raise self.error(message, *place)
+        self._lines = _lines_of(text)
 
     def line(self, *place: str | int) -> int:
         """Return the line number of a key, or of the table that contains it."""
@@ -114,12 +58,6 @@ class TomlFile:
         """Build an error that names the file and the line of a key, of the problem's own type."""
         kind = type(problem) if isinstance(problem, FflinError) else InputError
         return kind(f"{self.path}:{self.line(*place)}: {problem}")
-
-    def require(self, kind: Kind, value: Any, *place: str | int, of: str = "") -> None:
-        """Raise `InputError` if a value is not of a kind; `of` names its table in the message."""
-        if not kind.fits(value):
-            name = of or ".".join(map(str, place))
-            raise self.error(f"{name} is {reprlib.repr(value)}, expected {kind.expected}", *place)
 
     @contextmanager
     def located(self, *table: str | int) -> Iterator[None]:
@@ -200,13 +138,3 @@ def _lines_of(text: str) -> dict[str, int]:
             lines[name] = number
             name = name.rpartition(".")[0]
     return lines
-
-
-def _explain(path: Path, text: str, problem: str) -> str:
-    """Move the line and column of a TOML error to the front of its message."""
-    found = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", problem)
-    what, line, column = found.groups() if found else (problem, None, None)
-    if line is None:
-        place = f"{path}:{text.rstrip().count(chr(10)) + 1}" if found else str(path)
-        return f"{place}: invalid TOML: {what}; correct the file"
-    return f"{path}:{line}: invalid TOML: {what} at column {column}; correct the line there"

@@ -58,8 +58,8 @@ def shaped(name: str, value: ArrayLike, shape: tuple[int, ...], hint: str = "") 
 def number(name: str, value: Any) -> float:
     """Return a finite float, or raise `InputError` with the given value."""
     refuse_masked(name, value)
-    if isinstance(value, bool | np.bool_):
-        raise InputError(f"{name} is {value}, expected a number")
+    if isinstance(value, bool | np.bool_ | str):
+        raise InputError(f"{name} is {value!r}, expected a number")
     try:
         result = float(value)
     except (TypeError, ValueError, OverflowError):

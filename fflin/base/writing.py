@@ -19,6 +19,9 @@ from typing import Any, NamedTuple
 
 from fflin.base.errors import FileError, InputError
 
+# Names in larger folders are not compared with the name of a missing file.
+_MANY = 1000
+
 
 class CommandFiles(NamedTuple):
     """Output files that a command has still to write, and input files that it has read."""
@@ -50,16 +53,17 @@ def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
     """Return the content of a regular file of at most `limit` bytes, or raise `FileError`."""
     what = f"; give the path of a {kind} file"
     try:
-        # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
-        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-        if path.is_dir():
-            raise FileError(f"{path}: is a folder{what}")
-        with open(os.open(path, flags | getattr(os, "O_CLOEXEC", 0)), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise FileError(f"{path}: is not a regular file{what}")
-            content = file.read() if limit is None else file.read(limit + 1)
+        # Opening a pipe would wait for somebody to write into it.
+        if path.exists() and not path.is_file():
+            raise FileError(
+                f"{path}: is {'a folder' * path.is_dir() or 'not a regular file'}{what}"
+            )
+        with path.open("rb") as file:
+            content = file.read(-1 if limit is None else limit + 1)
     except FileError:
         raise
+    except FileNotFoundError:
+        raise FileError(f"{shown(path)}: No such file{missing(path)}") from None
     except (OSError, ValueError) as error:
         raise FileError(f"{shown(path)}: cannot be read: {reason(error)}") from None
     if limit is not None and len(content) > limit:
@@ -198,6 +202,21 @@ def check_distinct(*targets: Path | None) -> None:
                 said = f"outputs {target} and {first} are the same file"
                 raise FileError(f"{said}; give each output its own file")
         seen.append(target)
+
+
+def missing(path: Path, otherwise: str = "") -> str:
+    """Say in which folder a file does not exist, and which names there are similar, if any."""
+    import difflib
+
+    try:
+        folder = path.absolute().parent
+        names = os.listdir(folder)
+    except OSError:
+        return f": its folder does not exist{otherwise}"
+    few = names if len(names) < _MANY else []
+    near = difflib.get_close_matches(path.name, few, n=3, cutoff=0.75)
+    hint = f"; did you mean {', '.join(map(repr, near))}?" if near else otherwise
+    return f" in the folder {shown(folder)}{hint}"
 
 
 def reason(error: Exception) -> str:

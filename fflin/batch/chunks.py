@@ -16,9 +16,8 @@ from fflin.base.errors import FflinError, FflinWarning, InputError
 from fflin.base.validation import Array
 from fflin.batch.rows import Points
 from fflin.batch.run import ChunkResult
-from fflin.dynamics.chart import SMALLEST_Q0, Chart, Standing
-from fflin.dynamics.inertia import Inertia
-from fflin.dynamics.rnea import AccelerationDerivatives
+from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
+from fflin.dynamics.rnea import AccelerationDerivatives, Inertia
 from fflin.kernel.compiled import checked_engine
 from fflin.kernel.tree import LANES
 from fflin.linear.linearization import LARGEST, Linearizer, Prepared

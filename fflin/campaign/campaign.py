@@ -6,7 +6,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,12 +18,12 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import reading
 from fflin.base.validation import Array, FrozenArrays, share, whole
-from fflin.base.writing import as_path, write_atomically
+from fflin.base.writing import as_path, check_ending, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
 from fflin.campaign.spreads import SEED
-from fflin.campaign.statistics import KINDS
-from fflin.linear.trajectory_files import labels, write_table
+from fflin.campaign.statistics import KINDS, kind_named
+from fflin.linear.files import labels, write_table
 
 if TYPE_CHECKING:
     from fflin.campaign.runs import CampaignJob
@@ -68,6 +68,7 @@ def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> lis
                 f"condition {part!r} cannot be read, expected NAME < NUMBER UNIT, such as "
                 "'attitude < 1 deg'"
             ) from None
+        name = kind_named(name)
         values, own = figure(name)
         factors = [_FACTORS.get((unit, each), 0.0) for each in own.split("|")]
         factor = 1.0 if unit in ("", own, *own.split("|")) else max(factors)
@@ -84,8 +85,8 @@ class Campaign(FrozenArrays):
 
     Statistics and conditions refer to the figures of a run by these names:
 
-    - ``attitude`` [deg], ``position`` [m], ``joints``, ``turning`` (omega_b), ``moving`` (v_b) and
-      ``rates`` (of the joints): final error in these states. The names before the colon are the
+    - ``attitude`` [deg], ``position`` [m], ``joints``, ``omega_b``, ``v_b`` and ``joint rates``:
+      final error in these states. The names before the colon are the
       kinds of error.
     - The name of a state or input: final value of this signal, with sign.
     - ``worst NAME``: largest value over the whole run, or largest error if NAME is a state.
@@ -205,6 +206,7 @@ class Campaign(FrozenArrays):
 
     def figure(self, name: str) -> tuple[Array, str]:
         """Return the named figure of every run (N,), and its unit."""
+        name = kind_named(name)
         if name == "end":
             return self.end, "s"
         if name == "settle":
@@ -333,10 +335,6 @@ class Campaign(FrozenArrays):
         at = whole("run", run, 0, len(self) - 1)
         return self._flown().replay(np.array(self.drawn[at]))
 
-    def courses(self, runs: Sequence[int], most: int) -> list[Array]:
-        """Return up to `most` + 1 evenly spaced configurations (.., nq) of each given run."""
-        return self._flown().paths(np.array(self.drawn[list(runs)]), most)
-
     def _flown(self) -> CampaignJob:
         if self._job is None:
             raise InputError(
@@ -392,6 +390,8 @@ class Campaign(FrozenArrays):
             If the file cannot be read, is damaged or does not contain a campaign.
         """
         source = as_path(path)
+        if source.suffix in (".csv", ".mat"):
+            check_ending(source, (".npz", ".h5"))
         with reading(source, "Campaign"):
             arrays, _, texts, _ = read_rows(source, verify=True)
             header = json.loads(texts["header"])

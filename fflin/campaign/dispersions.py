@@ -20,7 +20,7 @@ from fflin.base.writing import reason
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
 from fflin.campaign.spreads import SEED, deviation_of, inverse_of, is_closed_form, whole_number
 from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Allocation, Policy, StateFeedback, bound
+from fflin.control.policies import Allocation, Policy, StateFeedback, bound, decider
 from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
@@ -63,9 +63,10 @@ class Draws(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """A policy that a function makes for a robot."""
+    """A policy that a function makes for a robot, with the model of its design if it has one."""
 
     bind: Callable[[Robot], Policy]
+    lin: Any = None
 
 
 class Dispersions:
@@ -78,12 +79,12 @@ class Dispersions:
         self._times = times
         self._model = plant.robot._bare.model
         self._sensors: tuple[str, ...] = ()
-        if isinstance(policy, StateFeedback | LinearController):
-            lin = policy.lin
-            of_states = isinstance(policy, StateFeedback)
-            self._sensors = lin.state_names if of_states else lin.output_names
-        if isinstance(policy, TrajectoryOutputFeedback):
-            self._sensors = policy.filter.output_names
+        self._senses_states = isinstance(reads := decider(policy), StateFeedback)
+        if isinstance(reads, StateFeedback | LinearController):
+            lin = reads.lin
+            self._sensors = lin.state_names if self._senses_states else lin.output_names
+        if isinstance(reads, TrajectoryOutputFeedback):
+            self._sensors = reads.filter.output_names
         known = {
             "state": plant.state.names,
             **dict.fromkeys(_OF_SENSORS, self._sensors),
@@ -139,7 +140,7 @@ class Dispersions:
         if kind in _OF_SENSORS and not names:
             raise InputError(
                 f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy "
-                f"({type(self._policy).__name__}) has no sensors; use a StateFeedback, "
+                f"({type(decider(self._policy)).__name__}) has no sensors; use a StateFeedback, "
                 "OutputFeedback or LinearController"
             )
         if kind in ("noise", "delay") and not self._times.sample:
@@ -361,7 +362,7 @@ class Dispersions:
             turned["bodies"] += runs.get("bodies", tree.bodies)
             runs |= turned
         if self._kinds & {*_OF_SENSORS}:
-            names = plant.state.names if isinstance(self._policy, StateFeedback) else self._sensors
+            names = plant.state.names if self._senses_states else self._sensors
             fed = [names.index(name) for name in self._sensors]
             *errors, seed = self._sensing(drawn)
             for key, values in zip(("sensed", "noise"), errors, strict=True):
@@ -388,13 +389,13 @@ class Dispersions:
             values = self._springs(kind, rows)[0].tolist()
             of: Any = {kind: dict(zip(robot.joint_names, values, strict=True))}
             robot = replace(robot, **of)
+        if self._kinds & {*_OF_SENSORS}:
+            policy = _with_sensor_errors(policy, *(each[0] for each in self._sensing(rows)))
         if "misalignment" in self._kinds:
             robot = misaligned(robot, self._angles(rows)[0])
             if isinstance(policy, Allocation):  # it allocates to the nominal directions
                 given = policy
                 policy = Bound(lambda _: bound(given, plant.robot))
-        if self._kinds & {*_OF_SENSORS}:
-            policy = _with_sensor_errors(policy, *(each[0] for each in self._sensing(rows)))
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         faults = ActuatorFaults(*(x[0] for x in self._faults(rows)))
         faulty = faults if self._kinds & {*_OF_INPUTS, "misalignment"} else None
@@ -403,6 +404,8 @@ class Dispersions:
 
 def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: float) -> Any:
     """Return a policy that reads its states or outputs (ny,) with these errors."""
+    if isinstance(policy, Allocation):
+        return replace(policy, policy=_with_sensor_errors(policy.policy, bias, deviation, seed))
     generator, given = noise_generator(seed), getattr(policy, "noise", None)
 
     def error(t: float) -> Array:
@@ -414,7 +417,7 @@ def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: float)
         return lambda t, q, v: np.asarray(inner(t, q, v)) - policy.K @ error(t)
 
     if isinstance(policy, StateFeedback):
-        return Bound(bind)
+        return Bound(bind, policy.lin)
     noisy = copy(policy)
     noisy.noise = error
     return noisy

@@ -32,11 +32,12 @@ from fflin.base.writing import as_path
 from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
-from fflin.campaign.statistics import KINDS
+from fflin.campaign.statistics import KINDS, kind_named
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
+from fflin.dynamics.coordinates import moved_by, moving_error, moving_errors, unwound
 from fflin.dynamics.points import point_of
-from fflin.dynamics.state import StateMap, moved_by, moving_error, moving_errors, unwound
+from fflin.dynamics.state import StateMap
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
@@ -204,12 +205,9 @@ class Funnel(Design):
         P: Array = (1.0 - part) * self.P[k] + part * self.P[k + 1]
         return P
 
-    def root(self, t: float, *, smooth: bool = False) -> Array:
-        """Return W (nx, nx): the ellipsoid at time t is the set of all W z with norm(z) <= 1.
-
-        With `smooth`, the level is interpolated between knots, as in figures.
-        """
-        size = np.interp(t, self.t, np.sqrt(self.rho)) if smooth else np.sqrt(self.level(t))
+    def root(self, t: float) -> Array:
+        """Return W (nx, nx): the ellipsoid at time t is the set of all W z with norm(z) <= 1."""
+        size = np.sqrt(self.level(t))
         return size * ellipsoid_axes(self.cost(t))
 
     def contains(self, t: float, x: Any = None, *, q: Any = None, v: Any = None) -> bool:
@@ -298,9 +296,9 @@ def funnel(
     schedule : GainSchedule or TrajectoryFeedback
         Schedule designed by `tvlqr`, continuous or sampled.
     goal : mapping or float
-        {"attitude" [deg], "position" [m], "joints" [rad|m], "turning" [rad/s], "moving" [m/s],
-        "rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`. A number
-        is the largest final value of ``e' P e``.
+        {"attitude" [deg], "position" [m], "joints" [rad|m], "omega_b" [rad/s], "v_b" [m/s],
+        "joint rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`.
+        A number is the largest final value of ``e' P e``.
     within : mapping, optional
         Largest errors allowed at any time of a run, as a mapping with the same keys as `goal`.
     knots : int or sequence of float
@@ -473,7 +471,8 @@ def _judged(
 
 def _bounds(name: str, given: Any, kinds: Iterable[str]) -> dict[str, float]:
     """Return the checked bounds {kind: largest error}."""
-    for key in by_name(name, given, "kind"):
+    given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
+    for key in given:
         if key not in kinds:
             raise unknown(f"kind of error in {name}", str(key), list(kinds))
     if name == "goal" and not given:

@@ -12,7 +12,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Loads, Tree
-from fflin.robot.equipment.wheels import turned_to
+from fflin.robot.equipment.mounting import turned_to
 from fflin.robot.inputs import Input, JointTorque, ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot

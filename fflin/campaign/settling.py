@@ -22,7 +22,8 @@ from fflin.base.validation import Array, as_double
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.control.policies import StateFeedback
-from fflin.dynamics.state import StateMap, states_of, unwound
+from fflin.dynamics.coordinates import states_of, unwound
+from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel

@@ -14,14 +14,9 @@ from numpy.typing import NDArray
 
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array
-from fflin.dynamics.state import (
-    StateMap,
-    attitude_errors,
-    moving_errors,
-    states_of,
-    unwound,
-)
-from fflin.kernel import statistics as kernel_statistics
+from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
+from fflin.dynamics.state import StateMap
+from fflin.kernel import loop
 from fflin.kernel.arguments import empty, laid_out, words_of
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES
@@ -36,10 +31,19 @@ KINDS = {
     "attitude": "deg",
     "position": "m",
     "joints": "rad|m",
-    "turning": "rad/s",
-    "moving": "m/s",
-    "rates": "rad/s|m/s",
+    "omega_b": "rad/s",
+    "v_b": "m/s",
+    "joint rates": "rad/s|m/s",
 }
+# Former names of kinds, which conditions and goals may still use.
+_FORMER = {"turning": "omega_b", "moving": "v_b", "rates": "joint rates"}
+
+
+def kind_named(name: str) -> str:
+    """Return a name of a kind of error, such as ``worst turning``, with its present words."""
+    of, _, kind = name.rpartition(" ")
+    kind = _FORMER.get(kind, kind) if of in ("", "worst", "settle") else kind
+    return f"{of} {kind}".strip()
 
 
 class Outcome(NamedTuple):
@@ -119,7 +123,7 @@ def outcome_of(
 
 def marks_of(
     plan: Plan, state: StateMap, target: Array, steps: Array, path: Sequence[Array]
-) -> kernel_statistics.RunStatistics:
+) -> loop.RunStatistics:
     """Return what the kernel's statistics of a run read and write.
 
     Errors are those from the state `target` (nx,), or from a moving one (steps + 1, nx) whose q and
@@ -129,7 +133,7 @@ def marks_of(
     first = target if target.ndim == 1 else target[0]
     x, y, z = first[:3].tolist()
     attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
-    law, marks = no_law(state, plan.initial), empty(kernel_statistics.RUN_STATISTICS)
+    law, marks = no_law(state, plan.initial), empty(loop.RUN_STATISTICS)
     law.path.point.q[3:7] = quaternion_product(conjugate(state.origin_quaternion), attitude)
     q_ref, nu_ref = path or (np.zeros(0), np.zeros(0))
     return marks._replace(
@@ -177,10 +181,8 @@ class RunStatistics:
         self.over = np.zeros(LANES, dtype=bool)  # every run goes on to its end
         marks = marks_of(plan, state, target, steps, path)
         self._fresh: list[tuple[Array, Array]] = []
-        self._marks = laid_out(
-            marks, kernel_statistics.RUN_STATISTICS, lambda *pair: self._fresh.append(pair)
-        )
-        self._words = words_of(self._marks, kernel_statistics.RUN_STATISTICS)
+        self._marks = laid_out(marks, loop.RUN_STATISTICS, lambda *pair: self._fresh.append(pair))
+        self._words = words_of(self._marks, loop.RUN_STATISTICS)
 
     def reset(self) -> None:
         """Begin with eight other runs."""
@@ -189,7 +191,7 @@ class RunStatistics:
 
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Add the rows (steps, count, ..) of q, nu, u, .. from step `first` on, also as `raw`."""
-        take = kernel("statistics", "take", "the run statistics")
+        take = kernel("loop", "take", "the run statistics")
         take(self._words, raw, first, len(rows[0]))
         self._last = [each[-1] for each in rows[:3]]
 

@@ -63,7 +63,7 @@ def add_commands(commands: parser.Commands) -> None:
     )
     options.add_point(held)
     what = "q, u, the deflections and the poles"
-    options.add_output_file(held.group(parser.OUTPUT), what, parser.RECORD, "Equilibrium")
+    options.add_output_file(held.group(parser.OUTPUT), what, parser.RECORD)
     _add_sensitivity(commands)
     _add_uncertain(commands)
 
@@ -95,7 +95,7 @@ def _add_sensitivity(commands: parser.Commands) -> None:
         metavar="NAME",
     )
     what = "dA, dB, df0 for each parameter"
-    options.add_output_file(sensitivity.group(parser.OUTPUT), what, parser.RECORD, "Sensitivity")
+    options.add_output_file(sensitivity.group(parser.OUTPUT), what, parser.RECORD)
 
 
 def _add_uncertain(commands: parser.Commands) -> None:
@@ -127,7 +127,7 @@ def _add_uncertain(commands: parser.Commands) -> None:
         required=True,
     )
     what = "A, B1 .. D22 and the blocks"
-    options.add_output_file(uncertain.group(parser.OUTPUT), what, parser.RECORD, "LFT")
+    options.add_output_file(uncertain.group(parser.OUTPUT), what, parser.RECORD)
 
 
 def _range(text: str) -> tuple[str, Any]:
@@ -239,16 +239,12 @@ def _momentum(lin: LinearModel) -> str:
     except InputError as error:
         text = f"no reduction: {error}"
     else:
-        count, left = len(reduced.momenta), len(reduced.A)
-        wheels = ", the wheels" * (len(lin.A) > left + 2 * count)
-        field = "orbit's field, the " * bool(lin.mean_motion)
-        text = (
-            f"no momentum is conserved: the {field}inputs, springs and dampers act on all momenta"
-        )
-        if count:
+        orbit = "the orbit, " * bool(lin.mean_motion)
+        text = f"no momentum is conserved: {orbit}inputs, springs and dampers act on all momenta"
+        if len(reduced.momenta):
             text = (
-                f"{count} momenta are conserved for all inputs; without these momenta{wheels} and "
-                f"the coordinates that they drive, {left} states remain"
+                f"{len(reduced.momenta)} momenta are conserved for all inputs; the reduced model "
+                f"has {len(reduced.A)} states"
             )
         elif not lin.is_equilibrium():
             text = "no momentum can be removed: the operating point is not an equilibrium"

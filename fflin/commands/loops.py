@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from fflin.base.errors import FflinWarning, InputError, listed
+from fflin.base.errors import InputError
 from fflin.commands import options, parser
 from fflin.commands.points import (
     attitude,
@@ -15,21 +16,27 @@ from fflin.commands.points import (
     held_at,
     limits_of_options,
     once,
+    refuse,
     refuse_pose,
     velocity_of,
 )
-from fflin.commands.regulator import add_weights, gain_of, regulated_part
-from fflin.commands.tracking import add_trajectory, models_along, schedule_of
+from fflin.commands.regulator import (
+    add_trajectory,
+    add_weights,
+    gain_of,
+    models_along,
+    regulated_part,
+    schedule_of,
+    weights_of,
+)
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
     from fflin.base.validation import Array
     from fflin.control.gain import Gain
-    from fflin.control.gain_schedule import GainSchedule
-    from fflin.control.policies import Allocation, Feedback, StateFeedback
+    from fflin.control.policies import Allocation, Feedback
     from fflin.linear.model import LinearModel
-    from fflin.linear.trajectory import Trajectory
     from fflin.robot.robot import Robot
 
 _WEIGHTS = ("weights", "q", "r", "bryson", "sample")
@@ -38,29 +45,22 @@ _TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce"
 
 
 class Loop(NamedTuple):
-    """A policy and its simulation options; for state feedback also the feedback and its model."""
+    """A policy, its simulation options, and for state feedback the model of the prediction."""
 
     policy: Any
     options: dict[str, Any]
-    feedback: StateFeedback | None = None
-    lin: LinearModel | None = None
-
-
-def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
-    """Refuse options that have no effect with others."""
-    if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
-        raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
+    prediction: Mapping[str, Any] = MappingProxyType({})
 
 
 def refuse_law(arguments: argparse.Namespace) -> None:
     """Refuse the options of a regulator together with --free."""
-    _refuse(
+    refuse(
         arguments,
         ("limit", "delay"),
         "--free means no inputs, so that limits and delays have no effect",
     )
     names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "reduce", "allocate", "gain", "controller", "mpc")
-    _refuse(
+    refuse(
         arguments,
         names,
         "--free means no regulator, so that weights, a target or thrusters have no effect",
@@ -93,7 +93,7 @@ def add_loop(command: parser.Command) -> None:
         "T",
     )
     options.add_step(run)
-    methods = "integration method: cf4 (default), rkmk4 or semi_implicit_euler"
+    methods = "integration method: cf4 (default) or semi_implicit_euler"
     run.add("--method", methods, metavar="METHOD", default="cf4")
     options.add_system(command)
     options.add_frame(run)
@@ -153,7 +153,7 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         "duration": arguments.duration,
     }
     if not arguments.controller:
-        _refuse(arguments, ("negative_feedback",), "only --controller has a feedback sign")
+        refuse(arguments, ("negative_feedback",), "only --controller has a feedback sign")
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
         return Loop(policy, settings | start)
@@ -166,12 +166,11 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         return Loop(None, settings | {"frame": arguments.frame})
     policy, feedback, lin = about_point(robot, arguments)
     settings["q0"], settings["v0"] = q, v = start_of(robot, arguments, feedback.lin.reference)
-    require_held(robot, feedback, q)
     if arguments.duration is None:
         linear = StateFeedback(feedback.lin, feedback.gain.K) if arguments.mpc else feedback
         settings["duration"] = time_to_settle(robot, linear, q, v)
     alone = policy is feedback and not (arguments.controller or arguments.mpc)
-    return Loop(policy, settings, *([feedback, lin] if alone else []))
+    return Loop(policy, settings, {"linear": lin} if alone else {})
 
 
 def start_of(
@@ -206,7 +205,7 @@ def about_point(
     gain: Gain | None = None
     if arguments.mpc:
         names = ("allocate", "gain", "controller", "reduce")
-        _refuse(arguments, names, "--mpc computes the inputs itself")
+        refuse(arguments, names, "--mpc computes the inputs itself")
         arguments.allocate = False
     allocate = (
         thrusters_give_every_wrench(robot) if arguments.allocate is None else arguments.allocate
@@ -214,7 +213,7 @@ def about_point(
     if arguments.gain:
         from fflin.control.gain import Gain
 
-        _refuse(
+        refuse(
             arguments, (*_WEIGHTS, *_TARGETS), "--gain contains its weights and its operating point"
         )
         gain = Gain.load(arguments.gain)
@@ -227,7 +226,7 @@ def about_point(
         design = _without_thrusters(robot) if allocate else robot
         lin = _about_target(design, arguments)
     if arguments.controller:
-        _refuse(arguments, (*_WEIGHTS, "gain", "reduce"), "--controller replaces the regulator")
+        refuse(arguments, (*_WEIGHTS, "gain", "reduce"), "--controller replaces the regulator")
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback: Any = LinearController(arguments.controller, lin, sign=sign)
     elif arguments.mpc:
@@ -242,14 +241,13 @@ def about_point(
 
 def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Feedback:
     """Return the predictive controller of the weights and limits."""
-    from fflin.control.default_weights import rule_weights
     from fflin.control.mpc import mpc
+    from fflin.control.weights import rule_weights
 
     if arguments.sample is None:
         raise InputError("--mpc needs the sample time of the controller; add --sample H")
     settings: dict[str, Any] = {"weights": arguments.weights}
-    given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
-    if any(given.values()):
+    if given := weights_of(arguments):
         Q, R, _, _ = rule_weights(lin.discretize(arguments.sample), arguments.weights, given)
         settings = {"Q": Q, "R": R}
     limits = limits_of_options(arguments)
@@ -261,50 +259,27 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
     from fflin.control.gain_schedule import GainSchedule
     from fflin.control.policies import Allocation
     from fflin.control.tracking import TrajectoryFeedback
-    from fflin.linear.trajectory import Trajectory
 
-    _refuse(
+    refuse(
         arguments,
         ("free", "mpc", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS),
         "the trajectory defines the target",
     )
     poses = ("joint", "rpy", "position", "velocity")
-    _refuse(arguments, poses, "the start is on the trajectory, or displaced from it by --offset")
+    refuse(arguments, poses, "the start is on the trajectory, or displaced from it by --offset")
     design = _without_thrusters(robot) if arguments.allocate else robot
     if arguments.schedule is None:
         models = models_along(arguments, design)
         policy = TrajectoryFeedback(models, schedule_of(models, arguments))
     else:
-        _refuse(arguments, _WEIGHTS, "--schedule contains its weights and its sample time")
+        why = "--schedule contains its trajectory, its weights and its sample time"
+        refuse(arguments, ("trajectory", "hold", *_WEIGHTS), why)
         schedule = GainSchedule.load(arguments.schedule)
-        if arguments.trajectory is None:
-            _refuse(arguments, ("hold",), "--schedule contains its trajectory")
-            motion = schedule.trajectory(design)
-        else:
-            settings = {"hold": arguments.hold, "frame": arguments.frame}
-            motion = Trajectory.load(arguments.trajectory, design, **settings)
-            motion.require(strict=arguments.strict)
-            _require_own(schedule, motion, arguments)
-        policy = TrajectoryFeedback(motion, schedule)
+        policy = TrajectoryFeedback(schedule.trajectory(design), schedule)
     start: dict[str, Any] = {}
     if offset := once("--offset", arguments.offset):
         start["q0"], start["v0"] = policy.beside(offset)
     return (Allocation(policy, design) if arguments.allocate else policy), start
-
-
-def _require_own(schedule: GainSchedule, motion: Trajectory, arguments: argparse.Namespace) -> None:
-    """Refuse gains of another trajectory."""
-    import numpy as np
-
-    knots = (schedule.knots, motion.t), (schedule.q, motion.q), (schedule.v, motion.v)
-    size = max(1.0, *(float(np.abs(each).max()) for _, each in knots))
-    if any(
-        own.shape != there.shape or np.abs(own - there).max() > 1e-6 * size for own, there in knots
-    ):
-        raise InputError(
-            f"{arguments.schedule} has the gains of another motion than {arguments.trajectory}; "
-            "design gains for this trajectory with fflin tvlqr, or leave --trajectory out"
-        )
 
 
 def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> LinearModel:
@@ -324,35 +299,12 @@ def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> Linea
         require_same(made, robot, kind, own, (there.names, there.units))
     q, v = state.to_pinocchio(gain.x0)
     if gain.x0[:6].any():
-        _refuse(arguments, _POSE, "--gain contains the pose of the base")
+        refuse(arguments, _POSE, "--gain contains the pose of the base")
     else:
         q[:7] = target_of(robot, arguments)[0][:7]
     if number := arguments.relative_equilibrium:
         q, reference = attitude(robot, q, number, gain.frame)
     return linearize(robot, q, v, gain.u0, frame=gain.frame, reference=reference)
-
-
-def require_held(robot: Robot, policy: Feedback, q: Array) -> None:
-    """Warn of initial errors without feedback; refuse a start with no other errors."""
-    from fflin.control.policies import fed_back
-    from fflin.dynamics.state import StateMap
-
-    lin = policy.lin
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    start, target = (state.read(at, lin.v, near=state.read(lin.q, lin.v)) for at in (q, lin.q))
-    beside = [name for name, x in zip(state.names, abs(start - target), strict=True) if x > 1e-9]
-    loose = [name for name in beside if name not in fed_back(policy)]
-    if loose and loose == beside:
-        raise InputError(
-            f"the start differs from the target only in states that are not regulated: "
-            f"{listed(loose)}, so that no input would act; give inputs that move these states, or "
-            "another start"
-        )
-    if loose:
-        text = (
-            f"the start differs from the target in states that are not regulated: {listed(loose)}"
-        )
-        warnings.warn(text, FflinWarning, stacklevel=2)
 
 
 def _without_thrusters(robot: Robot) -> Robot:

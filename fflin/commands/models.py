@@ -17,8 +17,8 @@ from fflin.base.tables import cut, grid, matrix, signals, width
 from fflin.base.writing import check_ending
 from fflin.commands import options, parser
 from fflin.commands.points import configuration_of, linear_model, load_robot, velocity_of
+from fflin.commands.regulator import add_trajectory, check_along, checked, linearize_along
 from fflin.commands.results import Report, figure_of
-from fflin.commands.tracking import add_trajectory, check_along, checked, linearize_along
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
@@ -51,12 +51,9 @@ def add_commands(commands: parser.Commands) -> None:
     urdf = "path of a URDF, or a robot name listed by `fflin robots`"
     init.add_argument("robot", metavar="URDF", type=parser.input_name, help=urdf)
     what = "the robot file (by default the URDF's name with .toml, in the current folder)"
-    options.add_output_file(
-        init.group(parser.OUTPUT),
-        what,
-        parser.OutputFile((".toml",)),
-        force="replace an existing file",
-    )
+    output = init.group(parser.OUTPUT)
+    options.add_output_file(output, what, parser.OutputFile((".toml",)))
+    output.switch("--force", "replace an existing file")
     _add_linearize(commands)
     _add_check(commands)
 
@@ -82,9 +79,7 @@ def _add_linearize(commands: parser.Commands) -> None:
     )
     add_trajectory(linearize)
     what = "A, B, C, D (with .csv one file per matrix: NAME.A.csv, ...)"
-    options.add_output_file(
-        made, what, parser.TABLE, "LinearModel", "LinearTrajectory", "ToolModel"
-    )
+    options.add_output_file(made, what, parser.TABLE)
     options.add_figure(linearize, "the magnitudes of the entries of A and B")
 
 
@@ -130,8 +125,6 @@ def _robots(_: argparse.Namespace) -> Report:
 
 
 def _info(arguments: argparse.Namespace) -> Report:
-    from dataclasses import replace
-
     import numpy as np
 
     from fflin.control.authority import point_properties, point_report
@@ -144,13 +137,7 @@ def _info(arguments: argparse.Namespace) -> Report:
     q = configuration_of(robot, arguments, robot.point)
     v = velocity_of(robot, arguments, robot.point, "velocity")
     properties = point_properties(robot, q, np.zeros(robot.nv) if v is None else v)
-    text = robot_info(robot, point_report(properties))
-    if (
-        arguments.inputs is not None
-        or robot.limits
-        or robot.inputs != replace(robot, inputs=()).inputs
-    ):
-        text += f"\n\n{inputs_report(robot)}"
+    text = f"{robot_info(robot, point_report(properties))}\n\n{inputs_report(robot)}"
     state = StateMap(robot)
     inputs = Actuation(state)
     result = {

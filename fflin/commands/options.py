@@ -141,8 +141,6 @@ def settle_step(arguments: argparse.Namespace) -> None:
             said += ", and the sample time --dt has the new name --sample"
             arguments.sample = arguments.dt
         arguments.dt = arguments.step
-    elif arguments.dt is not None and arguments.sample is None:
-        said = "--dt is the integration step; give the sample time of the controller by --sample"
     if said:
         warnings.warn(said, FflinWarning, stacklevel=2)
 
@@ -254,21 +252,17 @@ def add_system(command: Command) -> None:
 
 
 def add_output_file(
-    group: Group, what: str, endings: OutputFile, *kinds: str, force: str = ""
+    group: Group, what: str, endings: OutputFile, *, required: bool = False
 ) -> None:
-    """Add -o FILE.
-
-    With the `kinds` of results that are written there, add --force too; see `require_own_kind`.
-    """
-    what = f"save {what} to FILE: {endings}"
-    group.add_argument("-o", "--output-file", metavar="FILE", type=endings, help=what)
-    if kinds:
-        force = (
-            "let -o replace a file of any content; by default -o replaces only results of the same "
-            "kind"
-        )
-        group.set_defaults(kinds=kinds)
-    group.switch("--force", force)
+    """Add -o FILE."""
+    group.add_argument(
+        "-o",
+        "--output-file",
+        metavar="FILE",
+        type=endings,
+        required=required,
+        help=f"save {what} to FILE: {endings}",
+    )
 
 
 def add_figure(command: Command, what: str) -> None:

@@ -190,7 +190,9 @@ class Command(argparse.ArgumentParser):
             file.flush()
 
     def error(self, message: str) -> NoReturn:
-        """Report wrong arguments in one line, and exit."""
+        """Report wrong arguments in one line, with the meaning of missing ones, and exit."""
+        if message.endswith("required: DISPERSIONS"):
+            message += ', a TOML file with lines such as [dispersions] and "base.mass" = 0.05'
         print_error(f"fflin: error: {message} (see {self.prog} --help)")
         self.exit(BAD_INPUT)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinError, FflinWarning, InputError
@@ -69,6 +69,12 @@ def limits_of_options(arguments: argparse.Namespace) -> Any:
     """Return the limits of --limits and --limit."""
     given = once("--limit", arguments.limit)
     return ["urdf", given] if arguments.limits == "urdf" else given or None
+
+
+def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Refuse options that have no effect with others."""
+    if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
+        raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 
 def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:

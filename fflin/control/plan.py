@@ -19,7 +19,7 @@ from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.names import refuse_orbit
+from fflin.dynamics.coordinates import refuse_orbit
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory

@@ -16,14 +16,14 @@ from fflin.base.names import by_name
 from fflin.base.validation import Array, instance
 from fflin.control.gain_schedule import FilterSchedule, GainSchedule
 from fflin.control.kalman import kalman
-from fflin.control.linear_controller import Compensation, LinearController, Loop, Sample
-from fflin.control.policies import Allocation, Feedback, Policy, decider
+from fflin.control.linear_controller import LinearController
+from fflin.control.policies import Allocation, Feedback, Loop, Policy, Sample, decider
 from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import Frame, StateMap, moved_by, moving_error
+from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.fit import require_same, require_turns, sensed
-from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
@@ -80,12 +80,6 @@ class TrajectoryFeedback(Feedback):
     def duration(self) -> float:
         """Time [s] from the first knot to the last."""
         return float(self.trajectory.t[-1] - self.trajectory.t[0])
-
-    @cached_property
-    def models(self) -> LinearTrajectory:
-        """The linear models along the trajectory."""
-        motion = self.trajectory
-        return motion if isinstance(motion, LinearTrajectory) else along(motion)
 
     @cached_property
     def end(self) -> LinearModel:
@@ -157,23 +151,17 @@ class TrajectoryFeedback(Feedback):
         # The chart is centred at the start, whose attitude may be any rotation.
         chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame=self.frame)
         values = by_name("state", offset, (*chart.names, "roll", "pitch", "yaw"))
-        e, angles = np.zeros(chart.nx), np.zeros(3)
-        for index, value in values.items():
-            if index < chart.nx:
-                e[index] = value
-            else:
-                angles[index - chart.nx] = value
+        given = np.zeros(chart.nx + 3)
+        given[list(values)] = list(values.values())
+        e, angles = given[:-3], given[-3:]
+        if (e[:3].any() and angles.any()) or not np.linalg.norm(e[:3]) < 1.0:
+            raise InputError(
+                f"the offset has |q_b| = {np.linalg.norm(e[:3]):.3g} and roll, pitch, yaw = "
+                f"{angles} deg, expected only one of them, and |q_b| less than 1"
+            )
         if angles.any():
-            if e[:3].any():
-                raise InputError(
-                    "the offset has both q_b and an angle roll, pitch or yaw; give only one of them"
-                )
             turn = pin.Quaternion(pin.rpy.rpyToMatrix(*np.radians(angles))).coeffs()
             e[:3] = turn[:3] if turn[3] >= 0.0 else -turn[:3]
-        if not np.linalg.norm(e[:3]) < 1.0:
-            raise InputError(
-                f"|q_b| of the offset is {np.linalg.norm(e[:3]):.3g}, expected less than 1"
-            )
         return chart.to_pinocchio(moved_by(self.frame, chart.to_state(q, v)[None], e[None])[0])
 
     def gain(self, t: float) -> Array:
@@ -182,10 +170,6 @@ class TrajectoryFeedback(Feedback):
         if t > self.over:
             return self.end_gain
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
-
-    def law(self) -> Callable[[float, Array], Array]:
-        """Return law(t, e) -> u: the inputs for an error e at time t of the run."""
-        return lambda t, e: self.commanded(t)[2] - self.gain(t) @ e
 
     def state_map(self, robot: Robot) -> StateMap:
         """Return the robot's states in base axes; `InputError` if the trajectory does not fit."""
@@ -335,13 +319,6 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
 
         return Loop(home, self.filter.dt, self.noise, self._size, self._sample, there)
 
-    def law(self) -> Callable[[float, Array], Array]:
-        """Return law(t, e) -> u at the samples, with the outputs of the linear models."""
-        law = Compensation(self._size, self._sample)
-        return lambda t, e: law.step(
-            t, lambda by, u: by.y0 + by.seen @ (e + by.jump) + by.through @ (u - by.u0)
-        )
-
     @property
     def _size(self) -> int:
         return len(self.filter.state_names)
@@ -367,4 +344,4 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
                 # From here on the error is relative to the robot at rest.
                 stop = self.reference(self.duration)[1] - lin.v
                 jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(stop)
-        return Sample(A - B @ K - L @ (C - D @ K), L, -K, 0.0 * D.T, u, y, C, D, jump)
+        return Sample(A - B @ K - L @ (C - D @ K), L, -K, 0.0 * D.T, u, y, jump)

@@ -6,7 +6,7 @@ import pinocchio as pin
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.names import PIN_ANGULAR
+from fflin.dynamics.coordinates import PIN_ANGULAR
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT

@@ -8,8 +8,7 @@ import pinocchio as pin
 import fflin.robot.inputs as kinds
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.dynamics.chart import Chart
-from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import find_frame
 

@@ -1,5 +1,6 @@
-"""Fixed-step integrators on the configuration manifold, for an acceleration f(t, q, v)."""
+"""Integrators: fixed steps on the configuration manifold, and exact samples of linear models."""
 
+import math
 from collections.abc import Callable
 from typing import ClassVar, TypeAlias
 
@@ -28,8 +29,6 @@ class Integrator:
     # After each stage: 0 where the way to the next begins at the step's first place, 1 where at the
     # second stage's.
     origins: ClassVar[tuple[int, ...]]
-    # Whether each stage's velocity counts by its rate in the tangent at the step's first place.
-    tangent: ClassVar[bool] = False
 
     def __init__(self, model: pin.Model, dt: float) -> None:
         self.model, self.dt = model, dt
@@ -83,41 +82,6 @@ class CommutatorFree4(Integrator):
         return np.array(way), np.array(speed)
 
 
-class RungeKuttaMuntheKaas4(Integrator):
-    """RKMK4: order 4 in the tangent space at q, with the inverse of dexp at each stage."""
-
-    nodes = CommutatorFree4.nodes
-    weights, moments = CommutatorFree4.weights, CommutatorFree4.moments
-    reach = 2.78
-    origins, tangent = (0, 0, 0, 0), True
-
-    @classmethod
-    def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return the weights of a stage's rate in the next step of q, and of CF4 in the new v."""
-        return np.array([[0.5 * dt], [0.5 * dt], [dt]]), CommutatorFree4.shares(dt)[1]
-
-    def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q and v one step later."""
-        model, h, half = self.model, self.dt, 0.5 * self.dt
-
-        def rate(theta: Array, velocity: Array) -> Array:
-            slope = pin.dIntegrate(model, q, theta, pin.ArgumentPosition.ARG1)
-            return np.linalg.solve(slope, velocity)
-
-        l1 = f(t, q, v)
-        k2, v2 = half * v, v + half * l1
-        d2 = rate(k2, v2)
-        l2 = f(t + half, _integrate(model, q, k2), v2)
-        k3, v3 = half * d2, v + half * l2
-        d3 = rate(k3, v3)
-        l3 = f(t + half, _integrate(model, q, k3), v3)
-        k4, v4 = h * d3, v + h * l3
-        d4 = rate(k4, v4)
-        l4 = f(t + h, _integrate(model, q, k4), v4)
-        moved = h / 6.0 * (v + 2.0 * (d2 + d3) + d4)
-        return _integrate(model, q, moved), v + h / 6.0 * (l1 + 2.0 * (l2 + l3) + l4)
-
-
 class SemiImplicitEuler(Integrator):
     """Semi-implicit Euler: order 1, the new velocity moves the configuration."""
 
@@ -133,7 +97,6 @@ class SemiImplicitEuler(Integrator):
 
 INTEGRATORS: dict[str, type[Integrator]] = {
     "cf4": CommutatorFree4,
-    "rkmk4": RungeKuttaMuntheKaas4,
     "semi_implicit_euler": SemiImplicitEuler,
 }
 
@@ -143,3 +106,71 @@ def integrator(name: str) -> type[Integrator]:
     if not isinstance(name, str) or name not in INTEGRATORS:
         raise unknown("method", str(name), list(INTEGRATORS))
     return INTEGRATORS[name]
+
+
+# Of the commutator-free method of order four (10.3): its Gauss nodes, and how much the one and the
+# other count in the first of its two exponentials; in the second it is the other way round.
+GAUSS = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
+HEAVY, LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
+
+
+def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, Array]:
+    r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) of B = `driven`.
+
+    Rows of matrices (.., n, n) and (.., n, k) may be given, with the times h (..) of each.
+    """
+    n, k = driven.shape[-2:]
+    h = np.asarray(h)[..., None, None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        if not (A @ A).any():
+            return np.eye(n) + A * h, driven * h + A @ driven * (h * h / 2.0)
+        from scipy.linalg import expm
+
+        block = np.zeros((*A.shape[:-2], n + k, n + k))
+        block[..., :n, :n], block[..., :n, n:] = A, driven
+        exponential = expm(block * h)
+        return exponential[..., :n, :n], exponential[..., :n, n:]
+
+
+def held_derivatives(
+    A: Array, driven: Array, h: float, dA: Array, d_driven: Array
+) -> tuple[Array, ...]:
+    """Return the derivatives of `held_exponential` along (dA, d_driven)."""
+    n = len(A)
+    if not dA.any() and not (A @ A).any():
+        return np.zeros_like(A), d_driven * h + A @ d_driven * (h * h / 2.0)
+    from scipy.linalg import expm_frechet
+
+    block, along = np.zeros((2, n + driven.shape[1], n + driven.shape[1]))
+    block[:n], along[:n] = np.hstack((A, driven)) * h, np.hstack((dA, d_driven)) * h
+    derivative = expm_frechet(block, along, compute_expm=False)
+    return derivative[:n, :n], derivative[:n, n:]
+
+
+def held_cost(F: Array, W: Array, h: float | Array) -> Array:
+    """Return the integral of e^(F' t) W e^(F t) over [0, h]; of rows (.., n, n) for times (..)."""
+    # The exponential rounds relative to its largest block, so that W is scaled to the size of F.
+    square, h, n = F @ F, np.asarray(h)[..., None, None], F.shape[-1]
+    if not (square @ F).any():
+        total = np.zeros(F.shape)
+        terms = (np.eye(n), F, 0.5 * square)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, left in enumerate(terms):
+                for j, right in enumerate(terms):
+                    total += left.mT @ W @ right * (h ** (i + j + 1) / (i + j + 1))
+            return 0.5 * (total + total.mT)
+    from scipy.linalg import expm
+
+    rate, weight = (float(np.abs(X).sum(axis=-2).max()) for X in (F, W))
+    doublings = math.ceil(math.log2(max(2.0 * float(h.max()) * rate, 1.0)))
+    block = np.zeros((*F.shape[:-2], 2 * n, 2 * n))
+    size = weight / rate or 1.0
+    block[..., :n, :n], block[..., :n, n:], block[..., n:, n:] = -F.mT, W / size, F
+    with np.errstate(over="ignore", invalid="ignore"):
+        exponential = expm(block * (h / 2**doublings))
+        step = exponential[..., n:, n:]
+        total = step.mT @ exponential[..., :n, n:]
+        for _ in range(doublings):
+            total = total + step.mT @ total @ step
+            step = step @ step
+        return 0.5 * size * (total + total.mT)

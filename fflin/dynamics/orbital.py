@@ -10,7 +10,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.names import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 

@@ -10,7 +10,7 @@ import fflin.robot.outputs as kinds
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.names import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT, Carried, by_joint, find_frame

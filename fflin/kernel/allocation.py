@@ -15,8 +15,8 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.kernel import vectors as vec
 from fflin.kernel.arguments import INDICES, LANED, Struct, empty
-from fflin.kernel.displacements import columns_of
 from fflin.kernel.forward import MECHANICS, POINT, configure, push, seen, turn_held
 from fflin.kernel.inertia import factorise
 from fflin.kernel.lanes import (
@@ -34,7 +34,6 @@ from fflin.kernel.lanes import (
     write_scaled,
 )
 from fflin.kernel.rnea import write_columns
-from fflin.kernel.vectors import copy, put3
 
 # Weight of the inputs themselves: of all inputs with the same effect it selects the smallest.
 LEAST = 1e-7
@@ -112,7 +111,7 @@ def half_solve(work, tree, x, first):
 def allocate(allocation, point, commanded):
     """Write the inputs of a command, or the inputs that realise it where there is an allocation."""
     if len(allocation.problem.least) == 0:
-        copy(commanded, 0, point.u, 0, len(point.u))
+        vec.copy(commanded, 0, point.u, 0, len(point.u))
     else:
         _realise(allocation, point, commanded)
 
@@ -123,13 +122,13 @@ def _realise(allocation, point, commanded):
     work, asking, giving = allocation.work, allocation.asking, allocation.giving
     own, tree, problem = allocation.point, asking.tree, allocation.problem
     size, count, columns = len(tree.row), len(problem.least), problem.columns
-    copy(point.q, 0, own.q, 0, len(own.q))
+    vec.copy(point.q, 0, own.q, 0, len(own.q))
     configure(work, asking, own.q)
     factorise(work, tree)
-    copy(commanded, 0, own.pushing, 0, len(commanded))
+    vec.copy(commanded, 0, own.pushing, 0, len(commanded))
     turn_held(asking, own)
     push(work, asking, own.pushing)
-    copy(work, asking.layout.c, columns, count * size, size)
+    vec.copy(work, asking.layout.c, columns, count * size, size)
     _write_all(work, giving, own, columns)
     for column in range(count + 1):
         half_solve(work, tree, columns, column * size)
@@ -150,10 +149,10 @@ def _write_all(work, giving, own, columns):
         if giving.row[index] >= 0:
             store(columns, index * size + giving.row[index], 1.0)
     for index in range(len(giving.held)):
-        at, axes = giving.held[index], columns_of(seen(giving, own.q))
+        at, axes = giving.held[index], vec.columns_of(seen(giving, own.q))
         for axis in range(3):
             turned = axes[0][axis], axes[1][axis], axes[2][axis]
-            put3(columns, (at + axis) * size + giving.row[at], turned)
+            vec.put3(columns, (at + axis) * size + giving.row[at], turned)
     write_columns(work, tree, layout, loads)
     for index in range(carried):
         first = loads.input[index] * size

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections import namedtuple
 
+from fflin.kernel import vectors as vec
 from fflin.kernel.arguments import FLAGS, INDICES, LANED, REAL, WHOLE, Struct
 from fflin.kernel.lanes import chosen, inlined, load, peek, poke, store, whole, width
-from fflin.kernel.vectors import copy
 
 
 class Wheels(
@@ -89,7 +89,7 @@ def transmit(channel, step, nu, u):
         if channel.sample > 0:
             count = len(channel.low)
             first = (step // channel.sample) % channel.slots * count
-            copy(u, 0, channel.pending, first, count)
+            vec.copy(u, 0, channel.pending, first, count)
     if channel.sample > 0:
         _arrive(channel, step, u)
     _limit_wheel_speeds(channel, nu, u)
@@ -112,7 +112,7 @@ def _arrive(channel, step, u):
         any_fresh = any_fresh or fresh
     if any_fresh:
         _begin_pulses(channel, step, channel.held)
-    copy(channel.held, 0, u, 0, count)
+    vec.copy(channel.held, 0, u, 0, count)
     pulses = channel.pulses
     for index in range(len(pulses.at)):
         level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)

@@ -12,42 +12,9 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, sections 6.2 an
 
 from __future__ import annotations
 
-import numpy as np
-
 from fflin.kernel import vectors as vec
-from fflin.kernel.lanes import floor, inlined, load, splat, store
+from fflin.kernel.lanes import inlined, load, splat, store
 from fflin.kernel.tree import INERTIA, LANES, PLACE
-
-
-@inlined
-def cosine_and_sine(x):
-    """Return both of |x| < 1e6: taken to one octant in three steps, and there by polynomials.
-
-    The numbers are those of fdlibm (Sun Microsystems, 1993), exact to a unit in the last place.
-    """
-    turns = floor(x * (2.0 / np.pi) + 0.5)
-    x = x - turns * 1.57079632673412561417e00
-    x = x - turns * 6.07710050630396597660e-11
-    x = x - turns * 2.02226624879595063154e-21
-    z = x * x
-    p = -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10
-    p = 2.75573137070700676789e-06 + z * p
-    p = -1.98412698298579493134e-04 + z * p
-    p = 8.33333333332248946124e-03 + z * p
-    p = -1.66666666666666324348e-01 + z * p
-    sine = x + x * z * p
-    p = 2.08757232129817482790e-09 + z * -1.13596475577881948265e-11
-    p = -2.75573143513906633035e-07 + z * p
-    p = 2.48015872894767294178e-05 + z * p
-    p = -1.38888888888741095749e-03 + z * p
-    p = 4.16666666666666019037e-02 + z * p
-    cosine = (1.0 - 0.5 * z) + z * z * p
-    # Add the quarter turns again, whose cosine and sine are (1, 0), (0, 1), (-1, 0) or (0, -1).
-    half = floor(turns * 0.5)
-    odd = turns - half - half
-    sign = 1.0 - 2.0 * (half - 2.0 * floor(half * 0.5))
-    even, odd = sign * (1.0 - odd), sign * odd
-    return even * cosine - odd * sine, odd * cosine + even * sine
 
 
 @inlined
@@ -126,7 +93,7 @@ def outwards(work, tree, q):
         if tree.unbounded[body]:
             cosine, sine = value, load(q, tree.index[body] + 1)
         elif tree.turns[body] != 0.0:
-            cosine, sine = cosine_and_sine(tree.turns[body] * value)
+            cosine, sine = vec.cosine_and_sine(tree.turns[body] * value)
         else:
             cosine, sine = one, zero
         above = places + tree.parent[body] * PLACE

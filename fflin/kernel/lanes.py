@@ -31,8 +31,6 @@ def _decorator(how: str) -> Callable[[F], F]:
 
 
 inlined = _decorator("inlined")
-# For a list of calls: compiled with its caller, and not for itself before.
-listed = _decorator("listed")
 # Called where it is seldom needed: inlined functions take longest to compile.
 called = _decorator("called")
 # Called from Python; its machine code is kept on disk.

@@ -1,44 +1,41 @@
-"""The closed loop, step after step: a policy, forward dynamics, and steps on the manifold."""
+"""The closed loop: a policy, forward dynamics, steps on the manifold, and statistics of a run."""
 
 from __future__ import annotations
 
 from collections import namedtuple
 
+import numpy as np
+
+from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate
 from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, Opener, Struct
 from fflin.kernel.channel import CHANNEL, is_asked, transmit
-from fflin.kernel.conservation import (
+from fflin.kernel.forward import (
+    MECHANICS,
     MOMENTUM_REFERENCE,
+    POINT,
+    accelerate,
     add_wrench,
+    apply_faults,
     begin_step,
+    configure,
     end_step,
     impose,
     kept_at,
     start_at,
-)
-from fflin.kernel.displacements import attitude, displace, quaternion_times, turn_back
-from fflin.kernel.forward import (
-    MECHANICS,
-    POINT,
-    accelerate,
-    apply_faults,
-    configure,
     turn_held,
 )
-from fflin.kernel.lanes import below, called, compiled, inlined, listed, load, store
-from fflin.kernel.policies import LAW, NOTHING, command
-from fflin.kernel.vectors import copy, put3, put6
+from fflin.kernel.lanes import angle, below, chosen, compiled, inlined, load, root, store
+from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
 
 
-class Method(namedtuple("Method", "h origin shift speed nodes weights moments tangent")):
+class Method(namedtuple("Method", "h origin shift speed nodes weights moments")):
     """Steps of h [s], s stages each, by what its displacements and velocities are made of.
 
     Row by row: shares of v and the stages' accelerations in the displacement after each stage, and
     the second one after the last (`shift`), and in the velocity there (`speed`). A displacement
     begins at the configuration of the first stage, or of the second stage if `origin` is 1. `nodes`
     [s] are the stages' times, `weights` and `moments` their shares in sums along, with h and h^2.
-    With `tangent` it is a share of the rate in the tangent at the first configuration, and the last
-    is the sum of all by `weights`.
     """
 
 
@@ -49,7 +46,7 @@ class StopConditions(namedtuple("StopConditions", "squares sign")):
     """
 
 
-class Stages(namedtuple("Stages", "rates along total first second u")):
+class Stages(namedtuple("Stages", "rates along first second u")):
     """Work space: v and the accelerations of the stages, displacements, and two stages' q.
 
     `u` (nu,) is what acted as the last step began.
@@ -65,7 +62,7 @@ class Arguments(
 ARGUMENTS = Struct(
     Arguments,
     robot=MECHANICS,
-    method=Struct(Method, h=REAL, origin=INDICES, tangent=FLAG),
+    method=Struct(Method, h=REAL, origin=INDICES),
     law=LAW,
     channel=CHANNEL,
     reference=MOMENTUM_REFERENCE,
@@ -96,17 +93,18 @@ def _record(rows, row, point, reference, t):
     """Write a row: q, nu, u, and momentum and centre of mass as they are to be."""
     at = row * (len(point.q) + len(point.nu) + len(point.u) + 9)
     for values in (point.q, point.nu, point.u):
-        copy(values, 0, rows, at, len(values))
+        vec.copy(values, 0, rows, at, len(values))
         at += len(values)
     momentum, center = kept_at(reference, t)
-    put6(rows, at, momentum)
-    put3(rows, at + 6, center)
+    vec.put6(rows, at, momentum)
+    vec.put3(rows, at + 6, center)
 
 
 @inlined
 def goes_on(stop, origin, q, rates):
     """Whether all rates are finite and within bounds, and the base is in the chart of an origin."""
-    scalar = quaternion_times(attitude(origin), attitude(q))[1]
+    vector, scalar = vec.get3(origin, 3), load(origin, 6)
+    scalar = scalar * load(q, 6) - vec.dot(vector, vec.get3(q, 3))
     good = below(-(load(stop.sign, 0) * scalar), 1e-300)
     for index in range(len(stop.squares)):
         rate = load(rates, index)
@@ -126,43 +124,32 @@ def _act(work, channel, law, robot, point, step, stage, t):
     turn_held(robot, point)
 
 
-@called
-def _turn_shift(method, stages, nu, stage, last):
-    """Write the displacement in the tangent after a stage, from the one of the stage before."""
-    along, total = stages.along, stages.total
-    for index in range(len(along)):
-        if stage == 0:
-            store(along, index, 0.0)
-            store(total, index, 0.0)
-    turn_back(along, nu)
-    for index in range(len(along)):
-        rate = load(along, index)
-        store(total, index, load(total, index) + method.weights[stage] * rate)
-        store(along, index, load(total, index) if last else load(method.shift, stage) * rate)
-
-
 @inlined
 def _move(robot, method, stages, point, stage):
     """Go from a stage, whose acceleration is there, to the next one, or to the end of the step."""
     rates, along = stages.rates, stages.along
     if stage == 1:
-        copy(point.q, 0, stages.second, 0, len(point.q))
-    last = stage == len(method.origin) - 1
-    if method.tangent:
-        _turn_shift(method, stages, point.nu, stage, last)
-    else:
-        _combine(method.shift, stage, rates, along)
+        vec.copy(point.q, 0, stages.second, 0, len(point.q))
+    _combine(method.shift, stage, rates, along)
     _combine(method.speed, stage, rates, point.nu)
     begin = stages.first if method.origin[stage] == 0 else stages.second
-    displace(robot.tree, begin, along, point.q)
-    if last and not method.tangent:
+    vec.displace(robot.tree, begin, along, point.q)
+    if stage == len(method.origin) - 1:
         _combine(method.shift, stage + 1, rates, along)
-        displace(robot.tree, point.q, along, point.q)
+        vec.displace(robot.tree, point.q, along, point.q)
 
 
-@listed
-def go_on(of, clock, last, every, rows, work):
-    """Do as `advance`, of arguments that are opened."""
+@compiled
+def advance(words, clock, last, every, rows, work):
+    """Advance eight runs up to a step, or to a step that meets a stop condition.
+
+    `words` are of `Arguments`. The point, the momentum reference and the memory of policy and
+    channel are updated; clock (1,) is the number of steps done of `last`. At the first step the
+    momentum and the centre of mass of the start are written into the momentum reference. Every
+    `every` steps, if that is not 0, a row gets q, nu, u, and the momentum (6,) and centre of mass
+    (3,) of the reference. `work` has `Layout.size` entries.
+    """
+    of = _opened(words)
     robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
     point, stages = of.point, of.stages
     h, row = method.h, 0
@@ -171,13 +158,13 @@ def go_on(of, clock, last, every, rows, work):
         start_at(work, robot, kept, point)
     for step in range(clock[0], last):
         begin_step(kept)
-        copy(point.q, 0, stages.first, 0, len(point.q))
-        copy(point.nu, 0, stages.rates, 0, len(point.nu))
+        vec.copy(point.q, 0, stages.first, 0, len(point.q))
+        vec.copy(point.nu, 0, stages.rates, 0, len(point.nu))
         for stage in range(len(method.origin)):
             t = step * h + method.nodes[stage]
             _act(work, channel, law, robot, point, step, stage, t)
             if stage == 0:
-                copy(point.u, 0, stages.u, 0, len(point.u))
+                vec.copy(point.u, 0, stages.u, 0, len(point.u))
                 if every > 0 and step % every == 0:
                     _record(rows, row, point, kept, step * h)
                     row += 1
@@ -198,14 +185,102 @@ def go_on(of, clock, last, every, rows, work):
             break
 
 
-@compiled
-def advance(words, clock, last, every, rows, work):
-    """Advance eight runs up to a step, or to a step that meets a stop condition.
+class RunStatistics(
+    namedtuple(
+        "RunStatistics",
+        "robot law path x_ref q_ref nu_ref kind settled tolerance steps at "
+        "sizes largest_x largest_u largest outside errors inputs",
+    )
+):
+    """Reference of the errors of eight runs, and their statistics so far.
 
-    `words` are of `Arguments`. The point, the momentum reference and the memory of policy and
-    channel are updated; clock (1,) is the number of steps done of `last`. At the first step the
-    momentum and the centre of mass of the start are written into the momentum reference. Every
-    `every` steps, if that is not 0, a row gets q, nu, u, and the momentum (6,) and centre of mass
-    (3,) of the reference. `work` has `Layout.size` entries.
+    The `law` reads states. Errors are from the state `x_ref` (nx,), whose attitude the point of
+    `path` has, or from the rows `q_ref` and `nu_ref` of a moving reference. `kind` (nx,) is 0 for a
+    state without a kind, and -1 for a state whose error is not kept. An error has settled if it is
+    below the fraction `settled` of its largest value, or below `tolerance` (kinds,). At `steps`
+    (times,) errors and inputs are kept. `at` is work space. The fields after it are in lanes.
     """
-    go_on(_opened(words), clock, last, every, rows, work)
+
+
+_IN_LANES = "sizes largest_x largest_u largest outside errors inputs"
+RUN_STATISTICS = Struct(
+    RunStatistics,
+    robot=MECHANICS,
+    law=LAW,
+    path=PATH,
+    settled=REAL,
+    at=POINT,
+    **dict.fromkeys(("kind", "steps"), INDICES),
+    **dict.fromkeys(_IN_LANES.split(), LANED),
+)
+_opened_statistics = Opener(RUN_STATISTICS)
+
+
+@inlined
+def _size(value):
+    return chosen(value, 0.0, -value, value)
+
+
+@inlined
+def _grow(stats, index, value):
+    """Write the larger of an entry and a number."""
+    store(stats, index, chosen(load(stats, index), value, value, load(stats, index)))
+
+
+@inlined
+def _compare(stats, step):
+    """Write the errors at a step, and the size of each kind."""
+    at, there, sizes, e = stats.at, stats.path.point, stats.sizes, stats.path.e
+    if len(stats.q_ref) > 0:
+        vec.copy(stats.q_ref, step * len(there.q), there.q, 0, len(there.q))
+        vec.copy(stats.nu_ref, step * len(there.nu), there.nu, 0, len(there.nu))
+        error(stats.robot, stats.path, at)
+    else:
+        read_state(stats.robot, stats.law, at, 0)
+        for index in range(len(e)):
+            store(e, index, load(stats.law.x, index) - load(stats.x_ref, index))
+    for kind in range(len(sizes)):
+        store(sizes, kind, 0.0)
+    for index in range(len(e)):
+        value, kind = _size(load(e, index)), stats.kind[index]
+        if kind >= 0:
+            _grow(stats.largest_x, index, value)
+        if kind > 0:
+            _grow(sizes, kind, value)
+    (x, y, z), w = vec.attitude(there.q)
+    vector, scalar = vec.quaternion_times(((-x, -y, -z), w), vec.attitude(at.q))
+    half = angle(root(vec.dot(vector, vector)), _size(scalar))
+    store(sizes, 0, half * (360.0 / np.pi))
+
+
+@compiled
+def take(words, rows, first, count):
+    """Update the statistics with `count` rows of `advance`, the first one of step `first`.
+
+    `words` are of `RunStatistics`.
+    """
+    stats = _opened_statistics(words)
+    at, sizes, kept = stats.at, stats.sizes, 0
+    width, inputs = len(at.q) + len(at.nu), len(stats.largest_u)
+    while kept < len(stats.steps) and stats.steps[kept] < first:
+        kept += 1
+    for row in range(count):
+        step, begin = first + row, row * (width + inputs + 9)
+        vec.copy(rows, begin, at.q, 0, len(at.q))
+        vec.copy(rows, begin + len(at.q), at.nu, 0, len(at.nu))
+        _compare(stats, step)
+        for kind in range(len(sizes)):
+            value = load(sizes, kind)
+            _grow(stats.largest, kind, value)
+            # A new maximum is never within the bound, so it resets the settling time.
+            bound = stats.settled * load(stats.largest, kind)
+            bound = chosen(bound, stats.tolerance[kind], stats.tolerance[kind], bound)
+            store(stats.outside, kind, chosen(bound, value, float(step), load(stats.outside, kind)))
+        for index in range(inputs):
+            _grow(stats.largest_u, index, _size(load(rows, begin + width + index)))
+        if kept < len(stats.steps) and stats.steps[kept] == step:
+            vec.copy(sizes, 0, stats.errors, kept * len(sizes), len(sizes))
+            vec.copy(rows, begin + width, stats.inputs, kept * inputs, inputs)
+            kept += 1
+    if count > 0:
+        read_state(stats.robot, stats.law, at, 0)

@@ -193,7 +193,6 @@ _PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
 _DECORATORS = {
     "inlined": numba.njit(forceinline=True, **_PART),
-    "listed": numba.njit(inline="always", **_OPTIONS),
     "called": numba.njit(**_PART),
     "compiled": numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS),
 }

@@ -9,9 +9,9 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import ALLOCATION
 from fflin.kernel.arguments import FLAG, FLAGS, INDICES, LANED, REAL, WHOLE, Struct
-from fflin.kernel.displacements import attitude, axes_of, columns_of, displace, quaternion_times
 from fflin.kernel.forward import COMMON_POINT, joint_position
 from fflin.kernel.lanes import (
     angle,
@@ -28,7 +28,6 @@ from fflin.kernel.lanes import (
 )
 from fflin.kernel.rnea import move_bodies
 from fflin.kernel.tree import MOTION, PLACE
-from fflin.kernel.vectors import across, copy, get3, get_columns, minus, plus, product, put3, times
 
 _NEAR = 1e-9  # a time this near to a knot, relative to the interval, is the knot's
 
@@ -103,7 +102,7 @@ def _follow(robot, path, t):
     at, share = _placed(knots, min(time + path.ahead, knots[last + 1]))
     if after:
         k, at, share = last + 2, last + 2, 0.0
-    copy(path.q, k * len(point.q), point.q, 0, len(point.q))
+    vec.copy(path.q, k * len(point.q), point.q, 0, len(point.q))
     count = len(point.u)
     for index in range(count):
         value = path.u[at * count + index]
@@ -111,14 +110,14 @@ def _follow(robot, path, t):
             value += share * (path.u[(at + 1) * count + index] - value)
         point.u[index] = value
     if after:
-        copy(path.speed, 4 * (last + 1) * len(point.nu), point.nu, 0, len(point.nu))
+        vec.copy(path.speed, 4 * (last + 1) * len(point.nu), point.nu, 0, len(point.nu))
     else:
         _cubic(path.shift, k, s, path.along)
         _cubic(path.speed, k, s, point.nu)
-        displace(robot.tree, point.q, path.along, point.q)
+        vec.displace(robot.tree, point.q, path.along, point.q)
     for index in range(len(path.held)):
         at = path.held[index]
-        put3(point.u, at, across(axes_of(point.q), get3(point.u, at)))
+        vec.put3(point.u, at, vec.across(vec.axes_of(point.q), vec.get3(point.u, at)))
     return after
 
 
@@ -126,11 +125,11 @@ def _follow(robot, path, t):
 def error(robot, path, point):
     """Write the error relative to the followed trajectory, in its axes."""
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
-    (x, y, z), w = attitude(there.q)
-    vector, scalar = quaternion_times(((-x, -y, -z), w), attitude(q))
-    put3(e, 0, times(vector, chosen(scalar, 0.0, -1.0, 1.0)))
-    apart = minus(get3(q, 0), get3(there.q, 0))
-    put3(e, 3, across(axes_of(there.q), apart))
+    (x, y, z), w = vec.attitude(there.q)
+    vector, scalar = vec.quaternion_times(((-x, -y, -z), w), vec.attitude(q))
+    vec.put3(e, 0, vec.times(vector, chosen(scalar, 0.0, -1.0, 1.0)))
+    apart = vec.minus(vec.get3(q, 0), vec.get3(there.q, 0))
+    vec.put3(e, 3, vec.across(vec.axes_of(there.q), apart))
     for joint in range(n):
         at = robot.index[joint]
         if robot.circling[joint]:
@@ -227,25 +226,25 @@ LAW = Struct(
 def read_state(robot, law, point, row):
     """Write the state in the chart."""
     x, q, nu, n = law.x, point.q, point.nu, len(robot.index)
-    place, turn = get3(law.origin, 7 * row), get3(law.origin, 7 * row + 3)
+    place, turn = vec.get3(law.origin, 7 * row), vec.get3(law.origin, 7 * row + 3)
     turn = turn, load(law.origin, 7 * row + 6)
-    vector, scalar = quaternion_times(turn, (get3(q, 3), load(q, 6)))
+    vector, scalar = vec.quaternion_times(turn, (vec.get3(q, 3), load(q, 6)))
     sign = chosen(scalar, 0.0, -1.0, 1.0)
-    put3(x, 0, times(vector, sign))
-    put3(x, 3, plus(place, product(columns_of(turn), get3(q, 0))))
+    vec.put3(x, 0, vec.times(vector, sign))
+    vec.put3(x, 3, vec.plus(place, vec.product(vec.columns_of(turn), vec.get3(q, 0))))
     for joint in range(n):
         value = joint_position(robot, q, joint)
         if robot.circling[joint]:
             turns = whole((load(law.near, row * n + joint) - value) * (0.5 / np.pi))
             value = value + 2.0 * np.pi * turns
         store(x, 6 + joint, value)
-    axes = columns_of((vector, scalar))
+    axes = vec.columns_of((vector, scalar))
     for part in range(2):
-        rate = get3(nu, 3 * part)
+        rate = vec.get3(nu, 3 * part)
         if law.turned[part]:
-            rate = product(axes, rate)
-        put3(x, 6 + n + 3 * part, rate)
-    copy(nu, 6, x, 12 + n, n)
+            rate = vec.product(axes, rate)
+        vec.put3(x, 6 + n + 3 * part, rate)
+    vec.copy(nu, 6, x, 12 + n, n)
 
 
 @inlined
@@ -254,9 +253,9 @@ def _turn_gyros(work, robot, gyros, nu, x, first):
     move_bodies(work, robot.tree, robot.layout, nu)
     for index in range(len(gyros.body)):
         body = gyros.body[index]
-        rate = get3(work, robot.layout.motion + body * MOTION)
-        rate = across(get_columns(work, robot.tree.places + body * PLACE), rate)
-        put3(x, first + 3 * index, across(get_columns(gyros.axes, 9 * index), rate))
+        rate = vec.get3(work, robot.layout.motion + body * MOTION)
+        rate = vec.across(vec.get_columns(work, robot.tree.places + body * PLACE), rate)
+        vec.put3(x, first + 3 * index, vec.across(vec.get_columns(gyros.axes, 9 * index), rate))
 
 
 @inlined
@@ -345,9 +344,9 @@ def _filter(by, y, u, row, stage):
         at = row * inputs + index
         store(u, index, load(by.u0, at) + _times(by.C, at, by.z) + _times(by.D, at, y))
     if first == size:
-        copy(by.z, 0, by.rates, 0, size)
+        vec.copy(by.z, 0, by.rates, 0, size)
     for index in range(size):
         at = row * size + index
         store(by.rates, first + index, _times(by.A, at, by.z) + _times(by.B, at, y))
     if not along:
-        copy(by.rates, 0, by.z, 0, size)
+        vec.copy(by.rates, 0, by.z, 0, size)

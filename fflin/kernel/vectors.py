@@ -1,11 +1,19 @@
-"""Vectors of three and spatial vectors in numba code, each entry a number or lanes.
+"""Vectors of three, spatial vectors, attitudes and displacements, each entry a number or lanes.
 
-A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force).
+A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force). A
+displacement has the order of the state: the base's rotation and translation in base axes, then the
+joints.
 """
 
 from __future__ import annotations
 
-from fflin.kernel.lanes import inlined, load, store
+from math import factorial
+
+import numpy as np
+
+from fflin.kernel.lanes import floor, inlined, load, store
+
+_TERMS = 10  # exact to rounding up to half a turn, and the turn of a step is less than a radian
 
 
 @inlined
@@ -133,3 +141,115 @@ def minus6(s, t):
 def times6(s, value):
     """Return a spatial vector times a number."""
     return times(s[0], value), times(s[1], value)
+
+
+@inlined
+def cosine_and_sine(x):
+    """Return both of |x| < 1e6: taken to one octant in three steps, and there by polynomials.
+
+    The numbers are those of fdlibm (Sun Microsystems, 1993), exact to a unit in the last place.
+    """
+    turns = floor(x * (2.0 / np.pi) + 0.5)
+    x = x - turns * 1.57079632673412561417e00
+    x = x - turns * 6.07710050630396597660e-11
+    x = x - turns * 2.02226624879595063154e-21
+    z = x * x
+    p = -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10
+    p = 2.75573137070700676789e-06 + z * p
+    p = -1.98412698298579493134e-04 + z * p
+    p = 8.33333333332248946124e-03 + z * p
+    p = -1.66666666666666324348e-01 + z * p
+    sine = x + x * z * p
+    p = 2.08757232129817482790e-09 + z * -1.13596475577881948265e-11
+    p = -2.75573143513906633035e-07 + z * p
+    p = 2.48015872894767294178e-05 + z * p
+    p = -1.38888888888741095749e-03 + z * p
+    p = 4.16666666666666019037e-02 + z * p
+    cosine = (1.0 - 0.5 * z) + z * z * p
+    # Add the quarter turns again, whose cosine and sine are (1, 0), (0, 1), (-1, 0) or (0, -1).
+    half = floor(turns * 0.5)
+    odd = turns - half - half
+    sign = 1.0 - 2.0 * (half - 2.0 * floor(half * 0.5))
+    even, odd = sign * (1.0 - odd), sign * odd
+    return even * cosine - odd * sine, odd * cosine + even * sine
+
+
+def _series(first):
+    """Return the function sum_k (-x)^k first! / (first + 2 k)!."""
+    shares = [(-1) ** k * factorial(first) / factorial(first + 2 * k) for k in range(_TERMS)]
+    last, rest = shares[-1], tuple(shares[-2::-1])
+
+    @inlined
+    def series(x):
+        total = rest[0] + x * last
+        for share in rest[1:]:
+            total = share + x * total
+        return total
+
+    return series
+
+
+_cosine, _sine, _sixth = _series(0), _series(1), _series(3)
+
+
+@inlined
+def quaternion_times(a, b):
+    """Return the product of quaternions (x, y, z, w) that are pairs of a vector and a scalar."""
+    v, w = a
+    other, scalar = b
+    vector = plus(cross(v, other), plus(times(v, scalar), times(other, w)))
+    return vector, w * scalar - dot(v, other)
+
+
+@inlined
+def columns_of(quaternion):
+    """Return the columns of a unit quaternion's rotation."""
+    (x, y, z), w = quaternion
+    xx, yy, zz = 2.0 * x * x, 2.0 * y * y, 2.0 * z * z
+    xy, xz, yz = 2.0 * x * y, 2.0 * x * z, 2.0 * y * z
+    wx, wy, wz = 2.0 * w * x, 2.0 * w * y, 2.0 * w * z
+    return (
+        (1.0 - yy - zz, xy + wz, xz - wy),
+        (xy - wz, 1.0 - xx - zz, yz + wx),
+        (xz + wy, yz - wx, 1.0 - xx - yy),
+    )
+
+
+@inlined
+def attitude(q):
+    """Return the base's quaternion in a configuration."""
+    return get3(q, 3), load(q, 6)
+
+
+@inlined
+def axes_of(q):
+    """Return the base's axes in the world."""
+    return columns_of(attitude(q))
+
+
+@inlined
+def displace(tree, q, along, out):
+    """Write q displaced along a tangent vector, the base by its exponential."""
+    w, v = get3(along, 0), get3(along, 3)
+    square = dot(w, w)
+    quarter = 0.25 * square
+    sine, cosine = _sine(quarter), _cosine(quarter)  # sin(a/2) / (a/2), cos(a/2)
+    shift = plus(times(v, sine * cosine), times(cross(w, v), 0.5 * sine * sine))
+    shift = plus(shift, times(w, dot(w, v) * _sixth(square) * (1.0 / 6.0)))
+    quaternion = attitude(q)
+    put3(out, 0, plus(get3(q, 0), product(axes_of(q), shift)))
+    vector, scalar = quaternion_times(quaternion, (times(w, 0.5 * sine), cosine))
+    short = 1.5 - 0.5 * (dot(vector, vector) + scalar * scalar)
+    put3(out, 3, times(vector, short))
+    store(out, 6, scalar * short)
+    for body in range(1, len(tree.parent)):
+        at, value = tree.index[body], tree.factor[body] * load(along, tree.coordinate[body])
+        if tree.unbounded[body]:
+            c, s = load(q, at), load(q, at + 1)
+            cosine, sine = cosine_and_sine(value)
+            c, s = c * cosine - s * sine, s * cosine + c * sine
+            short = 1.5 - 0.5 * (c * c + s * s)
+            store(out, at, c * short)
+            store(out, at + 1, s * short)
+        else:
+            store(out, at, load(q, at) + value)

@@ -1,37 +1,34 @@
 """Check of A and B against ABA derivatives and against differences of the nonlinear model."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.tables import folded, grid, width
+from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, instance, share
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.names import Groups
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
-from fflin.linear.certificate import (
+from fflin.linear.fit import require_same, sensed
+from fflin.linear.model import LinearModel
+from fflin.linear.verification import (
+    ErrorDynamics,
+    Nonlinear,
     aba_route,
     compare,
+    difference_steps,
+    flow_error,
     inertia_matrix,
     inertia_residual,
     inverse_inertia,
+    jacobian,
     mobilities,
     scaled_condition,
     speeds,
-)
-from fflin.linear.fit import require_same, sensed
-from fflin.linear.model import LinearModel
-from fflin.linear.nonlinear import (
-    ErrorDynamics,
-    Nonlinear,
-    difference_steps,
-    flow_error,
-    jacobian,
 )
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
@@ -49,45 +46,6 @@ class Row(NamedTuple):
     def ok(self) -> bool:
         """Whether the error is within the tolerance; False if the error is NaN."""
         return self.error <= self.tolerance
-
-
-# The independent computations that A and B are compared with, and the rows of each.
-_ROUTES = {"ABA derivatives": "ABA", "differences": "diff"}
-
-
-def _block_table(every: Sequence[Row]) -> str:
-    """Show the errors of the blocks of A and B, one row for each state and computation."""
-    cells: dict[tuple[str, str], dict[str, Row]] = {}
-    allowed: dict[str, str] = {}
-    for row in every:
-        state, column = row.block[2:-1].split(", ")
-        route = _ROUTES[row.test]
-        cells.setdefault((route, state), {})[column] = row
-        allowed[route] = f"{route}: {row.test} (allowed {row.tolerance:.1e})"
-    body = [
-        [*key, *map(_error, found.values())]
-        for key, found in cells.items()
-        if any(row.error for row in found.values())
-    ]
-    if not body:
-        said = f"A and B compared with {' and '.join(_ROUTES)}: no difference in any of "
-        return folded([f"{said}{len(every) // len(_ROUTES)} blocks"])
-    said = f"relative errors of the blocks of A and B compared with {', '.join(allowed.values())}; "
-    said += "a dot is an error of exactly zero"
-    heads, split = ["", "", *next(iter(cells.values()))], 2 + len(Groups._fields)
-    tables = [grid([heads, *body], "ll")]
-    if max(map(len, tables[0].splitlines())) > width():  # the columns of B below those of A
-        halves = [[row[:split] for row in body], [[*row[:2], *row[split:]] for row in body]]
-        tables = [
-            grid([head, *(row for row in half if any(cell != "." for cell in row[2:]))], "ll")
-            for head, half in zip((heads[:split], ["", "", *heads[split:]]), halves, strict=True)
-        ]
-    return "\n\n".join((folded([said]), *tables))
-
-
-def _error(row: Row) -> str:
-    text = "." if row.error == 0.0 else f"{row.error:.0e}"
-    return text if row.ok else f"{text}!"
 
 
 _EPS = float(np.finfo(float).eps)
@@ -148,7 +106,7 @@ class Check:
         return tuple(row for row in self.rows if not row.ok)
 
     def __str__(self) -> str:
-        """Show the verdict, a table of blocks, and the single figures."""
+        """Show the verdict, and the largest error of each kind of comparison."""
         if failures := self.failures:
             names = [f"{row.block} ({row.test})" for row in failures[:6]]
             names += ["..."] * (len(failures) > 6)
@@ -158,20 +116,14 @@ class Check:
             largest = max(self.rows, key=lambda row: row.error)
             said = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
             verdict = f"A and B are verified: largest error {said}"
+        table = [["compared with", "comparisons", "largest error", "of", "allowed"]]
+        for test in dict.fromkeys(row.test for row in self.rows):
+            rows = [row for row in self.rows if row.test == test]
+            worst = max(rows, key=lambda row: (not row.ok, row.error))
+            figures = f"{worst.error:.1e}", worst.block, f"{worst.tolerance:.1e}"
+            table.append([test, str(len(rows)), *figures])
         title = f"{self.title}, {len(self.rows)} comparisons"
-        blocks = [row for row in self.rows if row.test in _ROUTES]
-        parts = [folded([verdict]), folded([title]), _block_table(blocks)]
-        rest, exact = [["figure", "error", "allowed"]], list[str]()
-        for row in self.rows[len(blocks) :]:
-            if row.error:
-                rest.append([f"{row.test}: {row.block}", _error(row), f"{row.tolerance:.1e}"])
-            else:
-                exact.append(f"{row.test}: {row.block}")
-        if rest[1:]:
-            parts.append(grid(rest, "l"))
-        if exact:
-            parts.append(folded([f"without any error: {', '.join(exact)}"]))
-        return "\n\n".join(parts)
+        return "\n\n".join((folded([verdict]), folded([title]), grid(table, "lrrlr")))
 
 
 def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> Check:

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, instance, number, shaped, vector
+from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel, StateSpace
-from fflin.linear.sampling import held_exponential
 from fflin.linear.tool_coordinates import Jacobians, ToolCoordinates, tool_coordinates
 from fflin.robot.robot import Robot
 

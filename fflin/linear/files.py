@@ -1,69 +1,88 @@
-"""Linear models on disk: npz, mat, json, and csv with a table for each matrix."""
+"""Linear models and trajectories on disk: npz, mat, json and csv.
+
+A model in csv is a table for each matrix, named on its rows and columns, one for each of the
+signals, one for the point in Pinocchio's order, and the table ``info`` of texts and figures, whose
+last line is the digest of all tables. The last column of a trajectory in csv is the digest of the
+other columns, the same in every row, so that other programs read the columns by their names.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base import record
-from fflin.base.record import Record, figure, figures, text, texts
+from fflin.base.errors import FflinError, FileError, InputError, unknown
+from fflin.base.record import Record, figure, figures, read_record, reading, text, texts
+from fflin.base.validation import as_double, frozen
 from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.coordinates import Frame
+from fflin.dynamics.state import StateMap
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from fflin.base.validation import Array
+    from fflin.linear.model import LinearModel
+    from fflin.linear.trajectory import Trajectory
+    from fflin.robot.robot import Robot
 
-# Of what the rows and columns of each matrix are, and the entries of each vector.
-_MATRICES = {
+FORMATS = (*record.FORMATS, ".csv")
+
+_SIGNALS = ("state", "input", "output")
+# Fields of a model in a file. Of each array: what stands along its dimensions.
+_ARRAYS: dict[str, tuple[str, ...]] = {
     "A": ("state", "state"),
     "B": ("state", "input"),
     "C": ("output", "state"),
     "D": ("output", "input"),
     "M": ("velocity", "velocity"),
+    "x0": ("state",),
+    "f0": ("state",),
+    "u0": ("input",),
+    "y0": ("output",),
+    "q": ("coordinate",),
+    "v": ("coordinate",),
+    "reference": ("placement",),
+    "drift": ("drift",),
+    "limits": ("limit",),
 }
-_VECTORS = {"x0": "state", "f0": "state", "u0": "input", "y0": "output"}
-_SIGNALS = ("state", "input", "output")
-_POINT = ("q", "v", "reference", "drift", "limits")
-_LISTS = (
-    *(f"{signal}_{what}" for what in ("names", "units") for signal in _SIGNALS),
-    *("locked", "ignorable", "limit_names"),
-)
-# Which older files have not.
-_LATER: Record = {"ignorable": (), "drift": (), "limit_names": (), "limits": ()}
-_LATER |= {"weights": "{}", "mean_motion": 0.0}
+_NAMED = [f"{signal}_{what}" for what in ("names", "units") for signal in _SIGNALS]
+_LISTS = ("locked", "ignorable", "limit_names")
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
 _FIGURES = ("dt", "moving", "mean_motion")
 
-# Of csv, the last of which has the digest of all.
+_MATRICES = {key: of for key, of in _ARRAYS.items() if len(of) == 2}
+_POINT = [key for key, of in _ARRAYS.items() if len(of) == 1 and of[0] not in _SIGNALS]
 _TABLES = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "point", "info")
 
 T = TypeVar("T")
 
-FORMATS = (*record.FORMATS, ".csv")
 
-
-def record_of(lin: Any) -> Record:
-    """Return the entries of a file for a `LinearModel`."""
-    entries: Record = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS, "q", "v")}
-    entries["reference"] = lin.placement
-    entries["drift"] = np.zeros(0) if lin.drift is None else lin.drift
-    entries["limits"] = np.array(list(lin.limits.values()))
-    entries |= {key: list(getattr(lin, key)) for key in _LISTS[:-1]}
-    entries["limit_names"] = list(lin.limits)
-    entries |= {key: getattr(lin, key) for key in _TEXTS[:-1]}
-    entries["weights"] = json.dumps(dict(lin.weights))
-    entries |= {key: float(getattr(lin, key)) for key in _FIGURES}
-    entries["certificate"] = asdict(lin.certificate)
-    return entries
+def record_of(lin: LinearModel) -> Record:
+    """Return the entries of a file for a model."""
+    special: Record = {
+        "reference": lin.placement,
+        "drift": np.zeros(0) if lin.drift is None else lin.drift,
+        "limits": np.array(list(lin.limits.values())),
+        "limit_names": list(lin.limits),
+        "weights": json.dumps(dict(lin.weights)),
+    }
+    entries: Record = {
+        key: special[key] if key in special else getattr(lin, key)
+        for key in (*_ARRAYS, *_NAMED, *_LISTS, *_TEXTS, *_FIGURES)
+    }
+    entries |= {key: list(entries[key]) for key in (*_NAMED, *_LISTS)}
+    entries |= {key: float(entries[key]) for key in _FIGURES}
+    return entries | {"certificate": asdict(lin.certificate)}
 
 
 def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
@@ -82,72 +101,50 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
 def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, Any], T]:
     """Return the fields of a model, and its certificate; see `LinearModel.load`."""
     check_ending(path, FORMATS)
-    with record.reading(path, "linear model"):
-        entries, verified = _from_csv(path) if path.suffix == ".csv" else record.read_record(path)
-        fields = _fields(_LATER | entries)
+    with reading(path, "linear model"):
+        entries, verified = _from_csv(path) if path.suffix == ".csv" else read_record(path)
+        fields = _fields(entries)
         return fields | {"verified": verified}, certificate(**figures(entries["certificate"]))
 
 
 def _fields(entries: Record) -> dict[str, Any]:
-    fields: dict[str, Any] = {key: texts(entries[key]) for key in _LISTS}
+    fields: dict[str, Any] = {key: texts(entries[key]) for key in (*_NAMED, *_LISTS)}
     fields |= {key: text(entries[key]) for key in _TEXTS}
-    if fields["frame"] not in ("hybrid", "local", "world", "lvlh", "hill"):
+    fields |= {key: figure(entries[key]) for key in _FIGURES}
+    if fields["frame"] not in get_args(Frame):
         raise ValueError(f"unknown frame '{fields['frame']}'")
     sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}
-    sizes["velocity"] = sizes["state"] // 2
-    for signal in _SIGNALS:
-        _check_size(f"{signal}_units", len(fields[f"{signal}_units"]), sizes[signal])
-    for key, (rows, columns) in _MATRICES.items():
-        fields[key] = _numbers(key, entries[key]).reshape(sizes[rows], sizes[columns])
-    for key in (*_VECTORS, *_POINT):
-        fields[key] = _numbers(key, entries[key]).reshape(-1)
-    for key, signal in _VECTORS.items():
-        _check_size(key, fields[key].size, sizes[signal])
-    reference, drift, M = (fields.pop(key) for key in ("reference", "drift", "M"))
-    names, limits = fields.pop("limit_names"), fields.pop("limits")
-    _check_size("limits", limits.size, len(names))
-    _check_size("reference", reference.size, 7)
-    _check_size("drift", drift.size, sizes["state"] if drift.size else 0)
-    M.setflags(write=False)
-    return fields | {
-        "dt": figure(entries["dt"]),
-        "mean_motion": figure(entries["mean_motion"]),
-        "moving": bool(figure(entries["moving"])),
-        "weights": _weights(fields.pop("weights")),
-        "_reference": reference,
-        "_drift": drift if drift.size else None,
-        "_inertia": partial(given, M),
-        "_ignorable": partial(given, fields.pop("ignorable")),
-        "_limits": partial(dict, dict(zip(names, limits.tolist(), strict=True))),
-    }
-
-
-def _weights(written: str) -> dict[str, Any]:
-    found = json.loads(written)
-    if not isinstance(found, dict) or not all(isinstance(x, dict | str) for x in found.values()):
+    units = {signal: len(fields[f"{signal}_units"]) for signal in _SIGNALS}
+    if sizes != units:
+        raise ValueError("its signals differ in number from their units")
+    sizes |= {"velocity": sizes["state"] // 2, "coordinate": -1, "placement": 7}
+    sizes |= {"drift": sizes["state"] if np.size(entries["drift"]) else 0}
+    sizes |= {"limit": len(fields["limit_names"])}
+    for key, dimensions in _ARRAYS.items():
+        array = np.array(entries[key], dtype=float)
+        if not np.isfinite(array).all():
+            raise ValueError(f"{key} has entries that are not finite")
+        fields[key] = frozen(array.reshape([sizes[each] for each in dimensions]))
+    weights, drift = json.loads(fields["weights"]), fields.pop("drift")
+    if not isinstance(weights, dict) or not all(
+        isinstance(x, dict | str) for x in weights.values()
+    ):
         raise ValueError("its weights are not a table")
-    return found
-
-
-def _numbers(key: str, raw: ArrayLike) -> Array:
-    array = np.array(raw, dtype=float)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{key} has entries that are not finite")
-    return array
-
-
-def _check_size(key: str, size: int, expected: int) -> None:
-    if size != expected:
-        raise ValueError(f"{key} has {size} entries, expected {expected}")
+    limits = dict(zip(fields.pop("limit_names"), fields.pop("limits").tolist(), strict=True))
+    return fields | {
+        "moving": bool(fields["moving"]),
+        "weights": weights,
+        "_reference": fields.pop("reference"),
+        "_drift": drift if drift.size else None,
+        "_inertia": partial(given, fields.pop("M")),
+        "_ignorable": partial(given, fields.pop("ignorable")),
+        "_limits": partial(dict, limits),
+    }
 
 
 def given(value: Any, _: object) -> Any:
     """Return the content of a file for any kind of model."""
     return value
-
-
-# One table a matrix, named on its rows and columns; one for each of the signals, with units;
-# one for the point in Pinocchio's own order; and one of everything that is a single figure.
 
 
 def _tables(entries: Record) -> dict[str, list[list[Any]]]:
@@ -158,21 +155,22 @@ def _tables(entries: Record) -> dict[str, list[list[Any]]]:
         body = zip(names[rows], entries[key].tolist(), strict=True)
         tables[key] = [["", *names[columns]], *([name, *row] for name, row in body)]
     for signal in _SIGNALS:
-        vectors = _vectors_of(signal)
-        values = (entries[key].tolist() for key in vectors)
-        lines = zip(names[signal], entries[f"{signal}_units"], *values, strict=True)
-        tables[f"{signal}s"] = [["name", "unit", *vectors], *map(list, lines)]
+        keys = _columns_of(signal)
+        lines = zip(*(np.asarray(entries[key]).tolist() for key in keys), strict=True)
+        tables[f"{signal}s"] = [["name", "unit", *keys[2:]], *map(list, lines)]
     point = [[f"{key}[{i}]", x] for key in _POINT for i, x in enumerate(entries[key].tolist())]
     tables["point"] = [["name", "value"], *point]
     info = {key: entries[key] for key in (*_TEXTS, *_FIGURES)}
-    info |= {key: ";".join(entries[key]) for key in _LISTS[-3:]}
+    info |= {key: ";".join(entries[key]) for key in _LISTS}
     info |= {f"certificate.{key}": value for key, value in entries["certificate"].items()}
     tables["info"] = [["name", "value"], *map(list, info.items())]
     return tables
 
 
-def _vectors_of(signal: str) -> list[str]:
-    return [key for key, of in _VECTORS.items() if of == signal]
+def _columns_of(signal: str) -> list[str]:
+    """Return the entries that the table of a signal has as columns."""
+    vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
+    return [f"{signal}_names", f"{signal}_units", *vectors]
 
 
 def _from_csv(path: Path) -> tuple[Record, bool]:
@@ -190,37 +188,148 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
         key: list(csv.reader(io.StringIO(content.decode(), newline="")))[1:]
         for key, content in contents.items()
     }
-    entries: Record = {
-        key: [[float(x) for x in row[1:]] for row in tables[key]] for key in _MATRICES
-    }
+    entries: Record = {key: [row[1:] for row in tables[key]] for key in _MATRICES}
     for signal in _SIGNALS:
-        keys = (f"{signal}_names", f"{signal}_units", *_vectors_of(signal))
+        keys = _columns_of(signal)
         columns = list(zip(*tables[f"{signal}s"], strict=True)) or [()] * len(keys)
         entries |= zip(keys, columns, strict=True)
-    for key in _VECTORS:
-        entries[key] = [float(x) for x in entries[key]]
     for key in _POINT:
-        entries[key] = [float(x) for name, x in tables["point"] if name.startswith(f"{key}[")]
-    info = dict(tables["info"])
-    prefix = "certificate."
+        entries[key] = [x for name, x in tables["point"] if name.startswith(f"{key}[")]
+    info, prefix = dict(tables["info"]), "certificate."
+    entries |= {key: info[key] for key in (*_TEXTS, *_FIGURES)}
+    entries |= {key: [each for each in info[key].split(";") if each] for key in _LISTS}
     entries["certificate"] = {
-        key.removeprefix(prefix): float(x) for key, x in info.items() if key.startswith(prefix)
+        key.removeprefix(prefix): x for key, x in info.items() if key.startswith(prefix)
     }
-    for key in _LISTS[-3:]:
-        entries[key] = [entry for entry in info.get(key, "").split(";") if entry]
-    return {
-        **entries,
-        **{key: info[key] for key in (*_TEXTS, *_FIGURES) if key in info},
-    }, bool(mark)
-
-
-def foreign_table(path: Path) -> Path | None:
-    """Return a file in the place of a table of NAME.csv if these are not the tables of a model."""
-    info = _csv_path(path, "info")
-    own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
-    tables = [] if own else [_csv_path(path, key) for key in _TABLES]
-    return next((table for table in tables if table.is_file() and table.stat().st_size), None)
+    return entries, bool(mark)
 
 
 def _csv_path(path: Path, key: str) -> Path:
     return path.with_name(f"{path.stem}.{key}.csv")
+
+
+def write_csv(path: Path, traj: Trajectory) -> None:
+    """Write named columns, as `Trajectory.load` reads them."""
+    columns = [f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])]
+    names = ["t", *columns, *Actuation(StateMap(traj.robot)).names, "hold", "frame"]
+    rows = np.column_stack((traj.t, traj.q, traj.v, traj.u)).tolist()
+    table = [names, *([*row, traj.hold, traj.frame] for row in rows)]
+    if traj.verified:
+        checksum = _digest(table)
+        table = [[*names, record.CHECKSUM], *([*row, checksum] for row in table[1:])]
+    write_atomically({path: csv_table(table)})
+
+
+def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
+    """Return the names with their units, such as ``t [s]``; none for a figure without dimension."""
+    pairs = zip(names, units, strict=True)
+    return [name if unit in ("", "1") else f"{name} [{unit}]" for name, unit in pairs]
+
+
+def write_table(path: Path, names: Sequence[str], rows: Array) -> None:
+    """Write named columns."""
+    write_atomically({path: csv_table([names, *rows.tolist()])})
+
+
+def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dict[str, Any]:
+    """Return the arguments of `Trajectory` from a file, see `Trajectory.load`."""
+    check_ending(source, FORMATS)
+    with reading(source, "trajectory"):
+        table = source.suffix == ".csv"
+        entries, verified = _columns(source) if table else read_record(source)
+        if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
+            entries = struct  # of MATLAB
+    try:
+        entries = _entries(entries, StateMap(robot)) if table else entries
+        hold = hold or (text(entries["hold"]) if "hold" in entries else None)
+        frame = frame or (text(entries["frame"]) if "frame" in entries else "local")
+        return arguments(entries, robot, hold, frame, verified)
+    except FflinError as error:
+        raise type(error)(f"{source}: {error}") from None
+
+
+def arguments(
+    entries: Record, robot: Robot, hold: str | None, frame: Any, verified: bool
+) -> dict[str, Any]:
+    """Return the arguments of `Trajectory` from named entries: t, u, and q, v or x."""
+    states = "q" in entries and "v" in entries
+    if not {"t", "u"} <= {*entries} or not (states or "x" in entries):
+        found = ", ".join(sorted(entries))
+        raise FileError(
+            f"the file has the entries {found}; expected t, u, and either x or both q and v"
+        )
+    reference = pin.XYZQUATToSE3(np.ravel(entries.get("placement", [0, 0, 0, 0, 0, 0, 1.0])))
+    state = StateMap(robot, reference=reference, frame=frame)
+    u = as_double("u", entries["u"])
+    u = u[:, None] if u.ndim == 1 else u
+    for columns in Actuation(state).held:
+        # In the axes of the world, which those of the reference may not be.
+        u[:, columns] = u[:, columns] @ reference.rotation.T
+    found_as: dict[str, Any] = {"t": np.ravel(entries["t"]), "u": u}
+    found_as |= {"hold": hold, "frame": frame, "verified": verified}
+    if states:
+        return found_as | {name: entries[name] for name in "qv"}
+    x = as_double("x", entries["x"])
+    if x.ndim != 2 or x.shape[1] != state.nx:
+        raise InputError(
+            f"x has shape {x.shape}, expected (N, {state.nx}): a row of states for each knot"
+        )
+    q, v = map(np.array, zip(*map(state.to_pinocchio, x), strict=True))
+    return found_as | {"q": q, "v": v}
+
+
+def _digest(table: Sequence[Sequence[Any]]) -> str:
+    """Return the digest of a table without its column of digests."""
+    return record.content_digest({"table": csv_table(table)})
+
+
+def _columns(path: Path) -> tuple[Record, bool]:
+    """Return the columns of a csv by their names, as texts, and whether they are verified."""
+    lines = csv.reader(io.StringIO(read_file(path, ".csv").decode("utf-8-sig"), newline=""))
+    header, *rows = [[cell.strip() for cell in line] for line in lines if any(line)]
+    if len({*header}) < len(header):
+        raise ValueError("two of its columns have the same name")
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise ValueError(f"row {number} has {len(row)} cells, the header has {len(header)}")
+    checksummed = header[-1] == record.CHECKSUM
+    if checksummed:
+        *header, _ = header
+        found, rows = {row[-1] for row in rows}, [row[:-1] for row in rows]
+        if found != {_digest([header, *rows])}:
+            raise ValueError(
+                f"{record.DAMAGED}; to read it as it is, delete the column {record.CHECKSUM}"
+            )
+    return dict(zip(header, zip(*rows, strict=True), strict=True)), checksummed
+
+
+def _entries(columns: Record, state: StateMap) -> Record:
+    """Return the entries that the named columns of a csv are."""
+    inputs = Actuation(state).names
+    rows = {key: [name for name in columns if name.startswith(f"{key}[")] for key in "qv"}
+    rows = rows if any(rows.values()) else {"x": list(state.names)}
+    rows["t"] = ["t"]
+    known = [name for names in rows.values() for name in names]
+    for name in known:
+        if name not in columns:
+            raise unknown("column", name, columns)
+    for name in columns:
+        if name not in {*known, *inputs, "hold", "frame"}:
+            raise unknown("state or input", name, (*known, *inputs))
+    entries: Record = {key: columns[key][0] for key in ("hold", "frame") if key in columns}
+    acting = [name for name in inputs if name in columns]
+    # Of held inputs the last row may be empty.
+    short = bool(acting) and not any(columns[name][-1] for name in acting)
+    for key, names in rows.items():
+        entries[key] = np.column_stack([_numbers(name, columns[name]) for name in names])
+    u = np.zeros((len(columns["t"]) - short, len(inputs)))
+    for name in acting:
+        u[:, inputs.index(name)] = _numbers(name, columns[name][: len(u)])
+    return entries | {"u": u}
+
+
+def _numbers(name: str, cells: tuple[str, ...]) -> Array:
+    try:
+        return np.array(cells, dtype=float)
+    except ValueError as error:
+        raise InputError(f"column {name}: {error}; expected numbers") from None

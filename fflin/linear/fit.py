@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import InputError
-from fflin.base.validation import Array, instance
+from fflin.base.errors import InputError, listed
+from fflin.base.validation import Array, instance, vector
+from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.outputs import Sensing
+from fflin.dynamics.outputs import Measuring, Sensing
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 # Names and units, in their order.
 Signals: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
-
-_SHOWN = 4
 
 
 def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
@@ -54,9 +51,8 @@ def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signal
     mine, others = (dict(zip(*each, strict=True)) for each in (own, there))
     lacking, beside = ([n for n in a if n not in b] for a, b in ((mine, others), (others, mine)))
     if names := lacking or beside:
-        shown = ", ".join([*names[:_SHOWN], *["..."] * bool(names[_SHOWN:])])
-        lacks_or_adds = "lacks" if lacking else "also has"
-        said = f"{lacks_or_adds} the {kind}{'s' * bool(names[1:])} {shown}"
+        said = "lacks" if lacking else "also has"
+        said += f" the {kind}{'s' * bool(names[1:])} {listed(names)}"
     elif other := [name for name in mine if mine[name] != others[name]]:
         said = f"has its {kind} {other[0]} in {others[other[0]]}, not {mine[other[0]]}"
     elif own != there:
@@ -65,25 +61,77 @@ def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signal
         return
     subject = made.partition(" was ")[0]
     raise InputError(
-        f"{made}, but {_given(made, robot)} {said}; make {subject} again for the given robot, or "
-        "use Robot.replace to give the robot the same joints, inputs and outputs"
+        f"{made}, but the given robot '{robot.name}' {said}; make {subject} again for the given "
+        "robot, or use Robot.replace to give the robot the same joints, inputs and outputs"
     )
-
-
-def _given(made: str, robot: Robot) -> str:
-    """Name the given robot; its name alone does not tell it from a robot of the same name."""
-    same = f"'{robot.name}'" in made
-    return "the given robot of the same name" if same else f"the given robot '{robot.name}'"
 
 
 def require_turns(made: str, size: int, robot: Robot) -> None:
     """Raise `InputError` if a configuration has another size than the robot's."""
     if size != robot.nq:
         raise InputError(
-            f"{made}, but {_given(made, robot)} has other continuous joints, so that its "
+            f"{made}, but the given robot '{robot.name}' has other continuous joints, so that its "
             f"configuration has {robot.nq} entries instead of {size}; make "
             f"{made.partition(' was ')[0]} again for the given robot"
         )
+
+
+def outputs(
+    robot: Robot, lin: LinearModel, q: Array, v: Array | None = None, u: Array | None = None
+) -> Array:
+    """Return the outputs y of a robot in the coordinates of a linear model.
+
+    - Attitudes are in the model's chart, with q0 >= 0.
+    - Rotations of frames are relative to the point of linearisation.
+    - Angles of continuous joints are unwrapped to be nearest to the point of linearisation.
+
+    The input of a controller designed for the linear model is ``y - lin.y0``.
+
+    Parameters
+    ----------
+    robot : Robot
+        Robot with the states, inputs and outputs of the model; its masses may differ.
+    lin : LinearModel
+        Model that defines the reference and the point.
+    q, v : array_like (nq,), (nv,)
+        Configuration and velocity in Pinocchio's order; v is zero by default.
+    u : array_like (nu,), optional
+        Inputs; u0 by default. Only accelerometer outputs depend on u.
+
+    Returns
+    -------
+    ndarray (ny,)
+        Outputs in the order of ``lin.output_names``.
+
+    Raises
+    ------
+    InputError
+        If a size is wrong, the model does not fit the robot, or the model has a moving reference.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", outputs=[fflin.JointPositions()])
+    >>> lin = fflin.linearize(robot)
+    >>> fflin.outputs(robot, lin, fflin.configuration(robot, {"joint_2": 0.4}))
+    array([0. , 0.4, 0. ])
+    """
+    instance("robot", robot, Robot, "a fflin.Robot")
+    if instance("lin", lin, LinearModel, "a fflin.LinearModel").moving:
+        raise InputError(
+            "the model has a moving reference, expected a fixed one; linearise with moving=False"
+        )
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    require_fit(lin, robot, state)
+    require_sensed(lin, robot, state)
+    at = robot.checked_configuration(q)
+    moving = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
+    u = lin.u0 if u is None else vector("u", u, len(lin.u0), "one for each input")
+    a: Array = np.zeros(robot.nv)
+    if any(output.FEELS_ACCELERATION for output in robot.outputs):
+        aba = Aba(state)
+        a = aba.acceleration(at, moving, aba.actuation.in_base_axes(state.chart(at), u))
+    x = state.read(at, moving, near=state.read(lin.q, lin.v))
+    return Measuring(state, lin.q)(x, at, moving, a)
 
 
 def line_up(gain: Any, lin: LinearModel) -> Array:

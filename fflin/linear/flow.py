@@ -12,8 +12,8 @@ import pinocchio as pin
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.inertia import rotor_names
 from fflin.dynamics.integrators import CommutatorFree4
+from fflin.dynamics.rnea import rotor_names
 from fflin.dynamics.state import StateMap
 
 # Steps are halved until the end of an interval is this accurate, relative to the largest rates.
@@ -109,10 +109,8 @@ class Flow:
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v and u (base axes) at a time, from cubics with the robot's own rates."""
-        k, s = interval_of(self._t, t)
-        powers, (turns, speeds) = np.array((1.0, s, s * s, s**3)), self.cubics
-        q: Array = pin.integrate(self._model, self._q[k], powers.dot(turns[k]))
-        return q, powers.dot(speeds[k]), self._in_base_axes(q, self._input(k, s))
+        q, v, u = self.points(np.array([t]))
+        return q[0], v[0], u[0]
 
     def points(self, times: Array) -> tuple[Array, Array, Array]:
         """Return q, v and u (k, ..) at times (k,), as `at` does at one time."""

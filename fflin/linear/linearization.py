@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from math import hypot
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -16,19 +15,17 @@ from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, truth, vector
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.chart import Chart, Standing
-from fflin.dynamics.inertia import rotor_names
-from fflin.dynamics.names import refuse_orbit, unknown_frame
+from fflin.dynamics.coordinates import Chart, Standing, refuse_orbit, unknown_frame
 from fflin.dynamics.orbital import mean_motion
-from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
+from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, rotor_names
 from fflin.dynamics.state import Frame, StateMap
-from fflin.kernel.compiled import checked_engine, numba_is_there
-from fflin.linear.certificate import certify, inertia_matrix
+from fflin.kernel.compiled import numba_is_there
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, at_rest, drift, output_equations
+from fflin.linear.verification import certify, inertia_matrix
 from fflin.robot.joints import ROOT
 from fflin.robot.limits import magnitudes_of
-from fflin.robot.model_checks import require_inertia
+from fflin.robot.mass_properties import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -37,7 +34,7 @@ LARGEST = 1e200
 
 if TYPE_CHECKING:
     from fflin.dynamics.outputs import Sensing
-    from fflin.kernel.derivatives import CompiledAccelerations, RowAccelerations
+    from fflin.kernel.derivatives import RowAccelerations
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +172,6 @@ def own_reference(robot: Robot, lin: LinearModel) -> Array:
     return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))
 
 
-# With velocities and inputs below this nothing overflows on the way to `LARGEST`.
-_MODERATE = 1e50
-
 _STANDING: Chart = Standing()
 
 
@@ -228,10 +222,6 @@ class Linearizer:
         :math:`q_b = \mathrm{vec}(q^{*-1} q)` and :math:`r_b = R^{*T} (p - p^*)`, the frame is
         "local", and f0 is zero. Trajectories require a moving reference, and so do relative
         equilibria such as a steady spin.
-    engine : {"python", "compiled"}, optional
-        Engine for the accelerations at operating points with velocity, springs or forces:
-        Python by default, or the compiled kernel of sweeps. The Python engine and the compiled
-        engine agree to machine precision.
 
     Raises
     ------
@@ -239,16 +229,12 @@ class Linearizer:
         If one of these conditions is true:
 
         - the frame is unknown, or the reference is not a pin.SE3;
-        - `moving` is given with a reference, or with a frame other than "local";
-        - the compiled engine is requested, but numba is not installed, or the engine does not
-          support the robot.
+        - `moving` is given with a reference, or with a frame other than "local".
     SingularInertiaError
         If M is singular at every configuration.
     ModelError
         If Pinocchio's Data for the robot would exceed 1 GiB, or its model was changed after the
         robot was made.
-    UnknownNameError
-        If there is no such engine.
 
     Attributes
     ----------
@@ -278,22 +264,14 @@ class Linearizer:
         frame: Frame | None = None,
         reference: pin.SE3 | None = None,
         moving: bool = False,
-        engine: str | None = None,
     ) -> None:
         self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
-        self.robot, self._engine = robot, checked_engine(engine)
+        self.robot = robot
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
-        self._source: Accelerations | CompiledAccelerations = self._accelerations
-        if engine == "compiled":
-            from fflin.kernel.derivatives import CompiledAccelerations
-
-            self._source = CompiledAccelerations(ready.kernel(), self._accelerations)
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
-        given = np.concatenate((robot.gravity, *robot.springs))
-        self._moderate = hypot(*given.tolist()) < _MODERATE
         self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
         # What stands for rest and no input.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
@@ -315,10 +293,7 @@ class Linearizer:
         with self._lock:
             if known:
                 return self._at_rest(q)
-            if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
-                return self._anywhere(q, v, u)
-            # An overflow is refused below, so NumPy need not warn of it. Not always done, since
-            # every call of NumPy costs more in here.
+            # An overflow is refused below, so NumPy need not warn of it.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
 
@@ -326,12 +301,8 @@ class Linearizer:
         # A copy, in this process or another, needs a work space of its own.
         ready = self.prepared
         reference = None if ready.own_reference else ready.map.reference
-        options: dict[str, Any] = {
-            "frame": ready.map.frame,
-            "reference": reference,
-            "moving": ready.moving,
-        }
-        return partial(type(self), **options, engine=self._engine), (self.robot,)
+        options: dict[str, Any] = {"frame": ready.map.frame, "reference": reference}
+        return partial(type(self), **options, moving=ready.moving), (self.robot,)
 
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
@@ -349,7 +320,7 @@ class Linearizer:
         nu, q_m = state.velocities(v), state.joint_positions(q)
         u_base = actuation.in_base_axes(chart, u)
         A, B = ready.rest["A"].copy(), np.zeros(self._shape_B)
-        rates = self._source.rates(q, v, nu, q_m, u_base, A[lower], B[lower])
+        rates = self._accelerations.rates(q, v, nu, q_m, u_base, A[lower], B[lower])
         seen: dict[str, Array] = {}
         if ready.sensing is not None:
             x0, point = state.compose(chart, r_b, q_m, nu), (q, v, nu, u_base)
@@ -383,7 +354,7 @@ class Linearizer:
         with self._lock:
             for k in range(count):
                 slopes, by_u = A[k, lower], B[k, lower]
-                rates = self._source.rates(q[k], v[k], nu[k], q_m[k], u[k], slopes, by_u)
+                rates = self._accelerations.rates(q[k], v[k], nu[k], q_m[k], u[k], slopes, by_u)
                 c[k], gravity[k] = rates.c, rates.gravity
                 if sensing is not None:
                     point = (q[k], v[k], nu[k], u[k])

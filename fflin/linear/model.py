@@ -13,7 +13,7 @@ import numpy as np
 
 from fflin.base.errors import InputError, MissingPackageError
 from fflin.base.validation import Array, FrozenArrays, frozen, number, positive
-from fflin.linear.sampling import held_exponential
+from fflin.dynamics.integrators import held_exponential
 
 if TYPE_CHECKING:
     import pinocchio as pin

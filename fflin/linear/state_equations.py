@@ -13,8 +13,7 @@ import pinocchio as pin
 from fflin.base.rotation import product, skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.chart import Chart, times
-from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart, times
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.rnea import AccelerationDerivatives
 from fflin.dynamics.state import StateMap

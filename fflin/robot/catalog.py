@@ -4,13 +4,14 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
-from fflin.base.errors import FileError, InputError, UrdfError, require_known, unknown
+from fflin.base.errors import FileError, InputError, require_known, unknown
+from fflin.base.writing import as_path, missing, shown
 
-# example-robot-data's talos_legs is talos cut off at the torso, done in its loader's code.
-_PRUNED = {"talos_legs": ("torso_1_joint",)}
+# Robots of example-robot-data that its loader's code makes from the URDF of another robot.
+_MADE_BY_CODE = ("talos_legs",)
 
 
 class RobotFile(NamedTuple):
@@ -20,7 +21,6 @@ class RobotFile(NamedTuple):
     path: Path  # of the URDF
     origin: str  # "fflin", "example-robot-data" or "file"
     package_dirs: tuple[Path, ...] = ()  # where ``package://`` paths of meshes are looked up
-    prune: tuple[str, ...] = ()  # joints that are cut off with all that hangs on them
 
 
 @cache
@@ -44,11 +44,11 @@ def _example_robot_data() -> dict[str, RobotFile]:
 
     found = {}
     for name, loader in ROBOTS.items():
-        if loader.urdf_filename:
+        if loader.urdf_filename and name not in _MADE_BY_CODE:
             inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
             root = Path(getModelPath(str(inner))).resolve()
-            folders, prune = (root.parents[1], root.parent), _PRUNED.get(name, ())
-            found[name] = RobotFile(name, root / inner, "example-robot-data", folders, prune)
+            folders = (root.parents[1], root.parent)
+            found[name] = RobotFile(name, root / inner, "example-robot-data", folders)
     return found
 
 
@@ -83,31 +83,29 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
         name = path.stem.encode(errors="backslashreplace").decode()
         return RobotFile(name, path, "file", (path.resolve().parent,))
     if isinstance(robot, Path) or path.suffix or len(Path(robot).parts) != 1:
-        raise FileError(
-            f"no file at '{path}'; give the path of a URDF or a name that `fflin robots` lists"
-        )
-    if text == "cassie":
-        raise UrdfError(
-            "'cassie' exists only as SDF, which the packaged Pinocchio cannot read; load another "
-            "robot, or build a pin.Model for fflin.from_model"
-        )
+        hint = "; give the path of a URDF or a name that `fflin robots` lists"
+        raise FileError(f"no file at '{shown(path)}'{missing(path, hint)}")
     require_known("robot", [text], list_robots())
     return _example_robot_data()[text]
 
 
 def find_inputs(inputs: str | Path) -> Path:
     """Find a file of inputs by the name of the bundled one's robot, else by its path."""
-    if not isinstance(inputs, str | os.PathLike) or "\0" in str(inputs):
-        raise InputError(f"{inputs!r} is not a path; give the path of a TOML file of inputs")
-    if not str(inputs):
-        raise InputError("the path of the inputs is empty; give the path of a TOML file")
+    path = as_path(inputs)
     bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
-    path = Path(inputs)
     if str(inputs) in bundled:
         return bundled[str(inputs)]
     if path.name == str(inputs) and not path.suffix and not os.path.lexists(path):
         raise unknown("file or bundled set of inputs", str(inputs), sorted(bundled))
     return path
+
+
+def folders(given: Any, within: str | Path = "") -> tuple[Path, ...]:
+    """Return one folder or a list of folders, relative to a folder."""
+    listed = [given] if isinstance(given, str | os.PathLike) else given
+    if not isinstance(listed, Sequence):
+        raise InputError(f"package_dirs is {given!r}, expected a list of folders")
+    return tuple(within / as_path(folder) for folder in listed)
 
 
 def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:

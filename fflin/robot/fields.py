@@ -1,4 +1,4 @@
-"""Fields of a robot that the user may set: their checks, and their form in robot files."""
+"""Checks of the fields of a robot that the user may set."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -6,15 +6,14 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
-from fflin.base.errors import InputError, ModelError, require_known
+from fflin.base.errors import InputError, require_known
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
-from fflin.base.toml_file import NAME, NUMBER, Kind
 from fflin.base.validation import dimension, number, numbers
 from fflin.robot import inputs as kinds
 from fflin.robot.inputs import Input, JointTorque, named_inputs, named_wheels, three_numbers
 from fflin.robot.joints import Find, by_joint
 from fflin.robot.orbit import checked_orbit
-from fflin.robot.outputs import Output
+from fflin.robot.outputs import Output, parse_output
 
 # The least and the largest value; infinite where there is no limit.
 Range: TypeAlias = tuple[float, float]
@@ -38,13 +37,8 @@ class Scope(NamedTuple):
 
 def checked_fields(fields: Mapping[str, Any], scope: Scope) -> dict[str, Any]:
     """Return the checked fields of `Robot.replace`, except for passive joints and inputs."""
-    if "friction" in fields:
-        raise ModelError(
-            "dry friction is not differentiable at rest, so a linear model cannot contain it; use "
-            "damping, or add the friction in a simulation"
-        )
     require_known("field of a robot", fields, FIELDS)
-    return {name: FIELDS[name].check(value, scope) for name, value in fields.items()}
+    return {name: FIELDS[name](value, scope) for name, value in fields.items()}
 
 
 def checked_inputs(
@@ -62,16 +56,10 @@ def checked_inputs(
     value = [one for item in value for one in _spread(item, find, joints, passive)]
     if not value:
         raise InputError("all inputs are torques of passive joints; add another input")
-    # Thrusters and wheels differ by their names, other inputs by what they are but for limits.
-    identities: list[str | Input] = [name for name, _ in named_wheels(value)]
-    for item in value:
-        if isinstance(item, kinds.Thruster):
-            identities += [item.name] if item.name else []
-        elif not isinstance(item, kinds.WrenchInput):
-            identities.append(replace(item, min=None, max=None))
-    for each in identities:
-        if identities.count(each) > 1:
-            raise InputError(f"input {each} is given twice; remove one of the two")
+    names = [name for item, own in named_inputs(value) for name in own]
+    for each in names:
+        if names.count(each) > 1:
+            raise InputError(f"input '{each}' is given twice; remove one of the two")
     return tuple(value)
 
 
@@ -118,12 +106,16 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) 
 
 
 def _outputs(value: object, _: Scope) -> tuple[Output, ...]:
-    if isinstance(value, str) or not isinstance(value, Sequence) or not value:
+    """Return outputs, some of which may be words as on the command line."""
+    given = [value] if isinstance(value, str) else value
+    if not isinstance(given, Sequence) or not given:
         raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
-    for item in value:
-        if not isinstance(item, Output):
+    found: list[Output] = []
+    for item in given:
+        if not isinstance(item, str | Output):
             raise InputError(f"{item!r} is not an output; expected one such as FramePose('tool')")
-    return tuple(value)
+        found += parse_output(item) if isinstance(item, str) else [item]
+    return tuple(found)
 
 
 def _rest(value: object, scope: Scope) -> dict[str, float]:
@@ -215,27 +207,16 @@ def _weights(value: object, scope: Scope) -> dict[str, Any]:
             if entry < 0.0 or (part != "q" and not entry):
                 least = "0 or more" if part == "q" else "more than 0"
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
-    for key in weights["bryson"]:
-        if key in weights["q"] or key in weights["r"]:
-            raise InputError(
-                f"'{key}' has both a weight and a largest value; give only one of the two"
-            )
+    for key in weights["bryson"].keys() & (weights["q"].keys() | weights["r"].keys()):
+        raise InputError(f"'{key}' has both a weight and a largest value; give only one of the two")
     return {part: value for part, value in weights.items() if value}
 
 
-def checked_passive(
-    value: object, find: Find, joints: Sequence[str], locked: Sequence[str]
-) -> tuple[str, ...]:
+def checked_passive(value: object, find: Find, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the joints without a motor, in the order of the state."""
     keys = [value] if isinstance(value, str) else value
     if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
         raise InputError(f"passive is {value!r}, expected names of joints")
-    for key in keys:
-        if any(each.rpartition("=")[0] == key for each in locked):
-            raise InputError(
-                f"joint '{key}' is both locked and passive; remove the joint from one of the two "
-                "lists"
-            )
     found = by_joint(dict.fromkeys(keys), joints, find)
     return tuple(name for name in joints if name in found)
 
@@ -247,50 +228,21 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, Any]:
     return dict(value)
 
 
-class Field(NamedTuple):
-    """Key of a robot file: the types of its values, and the check of a field."""
-
-    check: Callable[[Any, Scope], object] = lambda value, _: value
-    kind: Kind = NUMBER  # of a value, and of the entries of a list
-    table: Kind | None = NUMBER  # of the entries of a table; None if it must not be a table
-    parts: bool = False  # whether it is a table of named parts, some of which are tables
-    word: str | None = None  # the part that may be a word; empty for the value itself
-    merged: bool = False  # whether the entries of a call are added to the entries of a file
-
-
-def _number(expected: str) -> Kind:
-    return NUMBER._replace(expected=expected)
-
-
 # In the order in which a file applies them: the names of inputs are known after the inputs.
-FIELDS = {
-    "passive": Field(kind=NAME, table=None),
-    "inputs": Field(),
-    "appendages": Field(),
-    "outputs": Field(_outputs, kind=NAME, table=None),
-    "stiffness": Field(
-        _stiffness, _number("a finite number [N m/rad|N/m], or a table [stiffness]"), merged=True
-    ),
-    "damping": Field(
-        _damping,
-        _number("a finite number [N m s/rad|N s/m], or a table [damping]"),
-        word="",
-        merged=True,
-    ),
-    "rest": Field(_rest, _number("a table [rest] of joint positions [rad|m]"), merged=True),
-    "gravity": Field(
-        lambda value, _: three_numbers("gravity", value), _number("three finite numbers [m/s^2]")
-    ),
-    "orbit": Field(
-        lambda value, _: checked_orbit(value),
-        _number("an altitude [m] as a finite number, or a table [orbit]"),
-        word="body",
-    ),
-    "limits": Field(
-        lambda value, scope: given_limits(scope.inputs, scope.joints, value), merged=True
-    ),
-    "weights": Field(_weights, parts=True, word="rule"),
-    "point": Field(partial(_state, "point"), parts=True),
-    "target": Field(partial(_state, "target"), parts=True),
-    "start": Field(partial(_state, "start"), parts=True),
+FIELDS: dict[str, Callable[[Any, Scope], object]] = {
+    **dict.fromkeys(("passive", "inputs", "appendages"), lambda value, _: value),
+    "outputs": _outputs,
+    "stiffness": _stiffness,
+    "damping": _damping,
+    "rest": _rest,
+    "gravity": lambda value, _: three_numbers("gravity", value),
+    "orbit": lambda value, _: checked_orbit(value),
+    "limits": lambda value, scope: given_limits(scope.inputs, scope.joints, value),
+    "weights": _weights,
+    "point": partial(_state, "point"),
+    "target": partial(_state, "target"),
+    "start": partial(_state, "start"),
 }
+
+# Fields by joint or name: the entries of a call are added to those of a robot file.
+MERGED = ("stiffness", "damping", "rest", "limits")

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, dimension, number, positive, refuse_masked, truth
+from fflin.base.validation import Array, dimension, number, positive, truth
 
 Vector3: TypeAlias = Sequence[float]
 
@@ -31,20 +31,20 @@ class Input:
     min: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
+        for name in ("frame", "joint", "name"):
+            value = getattr(self, name, None)
+            if value is not None and not (value and isinstance(value, str)):
+                raise InputError(f"{self.KEY} {name} is {value!r}, expected a name")
         for name in ("max", "min"):
             value, what = getattr(self, name), f"{self.KEY} {name}"
             if value is not None:
                 several = len(self.ENTRIES) > 1 and dimension(what, value)
                 self._set(name, three_numbers(what, value) if several else number(what, value))
         for least, largest in self.ranges:
-            if largest <= 0.0:
+            if not least <= largest or largest <= 0.0:
                 raise InputError(
-                    f"{self.KEY} max is {largest:g}, expected more than 0; leave it out if there "
-                    "is no limit"
-                )
-            if least > largest:
-                raise InputError(
-                    f"{self.KEY} min is {least:g}, expected at most its max of {largest:g}"
+                    f"{self.KEY} min is {least:g} and max is {largest:g}, expected a max of more "
+                    "than 0 and a min of at most max; leave out what is not limited"
                 )
 
     def _set(self, name: str, value: Any) -> None:
@@ -190,14 +190,11 @@ class Thruster(WrenchInput):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ranges[0][0] < 0.0:
+        pulses = truth("thruster on_off", self.on_off)
+        if self.ranges[0][0] < 0.0 or (pulses and (self.max is None or self.min)):
             raise InputError(
-                f"thruster min is {self.min}, expected 0 or more: a thruster never pulls"
-            )
-        if truth("thruster on_off", self.on_off) and (self.max is None or self.min):
-            raise InputError(
-                "thruster on_off is set, but max is missing or min is not 0; give max, the force "
-                "of a pulse, and leave min out"
+                f"thruster min is {self.min} and max is {self.max}, expected a min of 0 or more, "
+                "and with on_off a max, the force of a pulse, and no min"
             )
         if (impulse := self.least_impulse) is not None:
             self._set("least_impulse", positive("thruster least_impulse", impulse, "N s"))
@@ -274,22 +271,17 @@ class ReactionWheel(WrenchInput):
         self._set("axis", unit_vector("wheel axis", self.axis, "the direction it turns about"))
         self._set("momentum", number("wheel momentum", self.momentum))
         if self.max_speed is not None:
-            speed = positive("wheel max_speed", self.max_speed, "rad/s")
-            self._set("max_speed", speed)
-            if self.inertia is None:
-                raise InputError(
-                    f"wheel max_speed is {speed:g} rad/s, but the wheel has no inertia and so no "
-                    "speed in the state; give its inertia too"
-                )
+            self._set("max_speed", positive("wheel max_speed", self.max_speed, "rad/s"))
+        given = self.max_speed if self.inertia is None else self.momentum
+        if given:
+            raise InputError(
+                f"wheel has inertia {self.inertia}, momentum {self.momentum:g} and max_speed "
+                f"{self.max_speed}; give either an inertia, whose speed is a state, or a momentum"
+            )
         if self.inertia is None:
             return
         hint = "; leave it out to model the wheel by its momentum alone"
         inertia = positive("wheel inertia", self.inertia, "kg m^2", hint)
-        if self.momentum:
-            raise InputError(
-                "wheel momentum is given together with an inertia, which makes its speed a state; "
-                "leave momentum out and give the speed in the velocity v of the point"
-            )
         self._set("inertia", inertia)
 
     @property
@@ -303,25 +295,19 @@ KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, 
 
 def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
     """Return three finite floats, or raise `InputError` with the given value."""
-    refuse_masked(what, value)
     try:
-        x, y, z = (float(entry) for entry in value)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{what} is {value!r}, expected three numbers") from None
-    if not math.isfinite(x + y + z):
-        raise InputError(f"{what} is {value!r}, expected finite numbers")
+        x, y, z = (number(what, entry) for entry in value)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is {value!r}, expected three finite numbers") from None
     return x, y, z
 
 
 def unit_vector(what: str, value: Vector3, hint: str) -> tuple[float, float, float]:
     """Return three numbers scaled to length 1, or raise `InputError` if they are zero."""
     x, y, z = three_numbers(what, value)
-    largest = max(abs(x), abs(y), abs(z))
-    if largest == 0.0:
-        raise InputError(f"{what} is zero; give {hint}")
-    # Scaled first: squares of very large or small numbers are none.
-    x, y, z = x / largest, y / largest, z / largest
     length = math.hypot(x, y, z)
+    if length == 0.0:
+        raise InputError(f"{what} is zero; give {hint}")
     return x / length, y / length, z / length
 
 

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
-from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
+from fflin.base.validation import NORM_TOLERANCE, Array, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
@@ -187,30 +187,21 @@ class Coordinates:
 
     def checked_configuration(self, q: Array) -> Array:
         """Return a valid configuration q (nq,), corrected within 1e-6, or raise `InputError`."""
-        if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
-            q = self._sized("q", q, self.nq, _CONFIGURATION)
+        q = self._sized("q", q, self.nq, _CONFIGURATION)
         entries = q.tolist()
-        if not math.isfinite(sum(entries)):
-            vector("q", q, self.nq, _CONFIGURATION)  # says which entry it is
         x, y, z, w = entries[3:7]
-        worst = abs(x * x + y * y + z * z + w * w - 1.0)
-        if worst > NORM_TOLERANCE:
-            raise InputError(
-                f"the base quaternion q[3:7] has length {np.linalg.norm(q[3:7]):.9g}, expected 1; "
-                "normalise it (x, y, z, w)"
-            )
-        for index in self.unbounded:
-            c, s = entries[index], entries[index + 1]
-            excess = abs(c * c + s * s - 1.0)
-            if excess > worst:
-                worst = excess
-                if excess > NORM_TOLERANCE:
-                    raise InputError(
-                        f"(cos, sin) of continuous joint '{self.unbounded[index]}', "
-                        f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1; "
-                        "normalise it"
-                    )
-        if worst > ROUND_OFF:
+        squares = {3: x * x + y * y + z * z + w * w}
+        squares |= {i: entries[i] ** 2 + entries[i + 1] ** 2 for i in self.unbounded}
+        index = max(squares, key=lambda i: abs(squares[i] - 1.0))
+        error = abs(squares[index] - 1.0)
+        if error > NORM_TOLERANCE:
+            what = "the base quaternion (x, y, z, w) q[3:7]"
+            if index != 3:
+                name = self.unbounded[index]
+                what = f"(cos, sin) of continuous joint '{name}', q[{index}:{index + 2}],"
+            length = math.sqrt(squares[index])
+            raise InputError(f"{what} has length {length:.9g}, expected 1; normalise it")
+        if error > ROUND_OFF:
             q = pin.normalize(self.model, q)
         return self._followed(q) if self.followers else q
 
@@ -255,40 +246,50 @@ class Coordinates:
         # Tells in a microsecond that nothing at all was changed.
         if self.model != made and (change := change_in(self.model, made)):
             raise ModelError(
-                f"the model of '{self.name}' was changed after the robot was made: {change}; make "
-                "a new robot from it with fflin.from_model(model)"
+                f"the {change} in the model of '{self.name}' were changed after the robot was "
+                "made; make a new robot from it with fflin.from_model(model)"
             )
 
     def create_data(self) -> pin.Data:
         """Return a new pin.Data for this robot, or raise `ModelError` if it exceeds 1 GiB."""
-        self.require_room()
+        require_room(self.model, self.name)
         return self.model.createData()
 
-    def require_room(self) -> None:
-        """Raise `ModelError` if a pin.Data of this robot would exceed 1 GiB."""
-        size = _DATA_BYTES_PER_NV3 * self.nv**3
-        if size > _DATA_LIMIT:
-            raise ModelError(
-                f"'{self.name}' has {self.n} joints, for which Pinocchio's Data takes about "
-                f"{size / 2**30:.1f} GiB, more than the limit of 1 GiB; lock unimportant joints"
-            )
+
+def require_room(model: pin.Model, name: str) -> None:
+    """Raise `ModelError` if a pin.Data of a model would exceed 1 GiB."""
+    size = _DATA_BYTES_PER_NV3 * int(model.nv) ** 3
+    if size > _DATA_LIMIT:
+        raise ModelError(
+            f"'{name}' has {model.njoints - 2} joints, for which Pinocchio's Data takes about "
+            f"{size / 2**30:.1f} GiB, more than the limit of 1 GiB; lock unimportant joints"
+        )
 
 
 def change_in(model: pin.Model, made: pin.Model) -> str:
     """Name a changed part of the model on which A, B and C depend; not limits or new frames."""
-    for what, key in {"its joints": "names", "the parents of its joints": "parents"}.items():
-        if getattr(model, key).tolist() != getattr(made, key).tolist():
-            return what
-    if model.gravity != made.gravity:
-        return "its gravity"
-    of_joints = {"axis": "joints", "placement": "jointPlacements", "inertia": "inertias"}
-    for what, key in of_joints.items():
-        pairs = zip(made.names, getattr(model, key), getattr(made, key), strict=True)
-        for name in (name for name, now, before in pairs if now != before):
-            return f"the {what} of joint '{name}'"
-    if not np.array_equal(model.armature, made.armature):
-        return "its armature"
-    for frame, before in zip(model.frames, made.frames, strict=False):
-        if frame != before:
-            return f"frame '{before.name}'"
-    return "its frames" if model.nframes < made.nframes else ""
+    parts = {
+        "joints": lambda x: (list(x.names), list(x.parents), list(x.joints)),
+        "placements": lambda x: list(x.jointPlacements),
+        "inertias": lambda x: (list(x.inertias), x.armature.tolist()),
+        "gravity": lambda x: x.gravity.vector.tolist(),
+        "frames": lambda x: list(x.frames)[: made.nframes],
+    }
+    return next((name for name, of in parts.items() if of(model) != of(made)), "")
+
+
+def joint_of(model: pin.Model, index: int) -> Joint:
+    """Return a joint, or refuse one that has not one degree of freedom."""
+    joint, name = model.joints[index], model.names[index]
+    kind = joint.shortname()
+    if kind == "JointModelMimic":
+        raise ModelError(
+            f"joint '{name}' is a JointModelMimic, for which Pinocchio has no derivatives; load "
+            "the URDF with fflin.load, or build the model with mimic=False"
+        )
+    if joint.nv != 1 or joint.nq not in (1, 2):
+        raise ModelError(
+            f"joint '{name}' is a {kind.removeprefix('JointModel')} of {joint.nv} "
+            f"degrees of freedom, expected 1; lock it with lock=['{name}']"
+        )
+    return Joint(name, joint.idx_q, joint.idx_v, joint.nq == 2, kind.startswith("JointModelP"))

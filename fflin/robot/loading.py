@@ -1,6 +1,5 @@
 """Robots loaded from a file, or made from a Pinocchio model that was built by other means."""
 
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,25 +9,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, InputError, ModelError
-from fflin.base.validation import instance
-from fflin.base.writing import as_path, remember
-from fflin.robot.catalog import RobotFile, find_mesh, find_robot
-from fflin.robot.fields import FIELDS
-from fflin.robot.joints import ROOT, Follower
-from fflin.robot.mass_properties import LinkMass
-from fflin.robot.model_checks import (
-    check_model,
-    check_order,
-    check_root,
-    idle_coordinates,
-    joint_of,
-    massless_note,
-)
+from fflin.base.errors import FflinWarning, ModelError
+from fflin.base.validation import instance, is_rotation
+from fflin.robot.catalog import RobotFile, find_robot, folders
+from fflin.robot.fields import MERGED
+from fflin.robot.joints import ROOT, Follower, joint_of, require_room
+from fflin.robot.mass_properties import LinkMass, given_body, massless_note
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.links import is_impossible
 from fflin.robot.urdf.reader import Advice, read_urdf
-from fflin.robot.welding import Lock, locked_model
+from fflin.robot.welding import Lock, locked_model, requested, welded
 
 
 def load(
@@ -91,15 +82,19 @@ def load(
     """
     found = find_robot(robot)
     if found.path.suffix.lower() != ".toml":
-        loaded, advice = _load(found, [lock], _folders(package_dirs))
+        loaded, advice = _load(found, lock, folders(package_dirs))
     else:
         from fflin.robot.robot_files import RobotToml
 
         file = RobotToml(found.path, found.name)
-        folders = (*_folders(package_dirs), *file.package_dirs)
+        later = {} if lock is None else requested(lock)
+        first = {name: later.pop(name, value) for name, value in file.lock.items()}
         with file.located_locks():
-            loaded, advice = _load(file.found, [file.lock or None, lock], folders)
+            dirs = (*folders(package_dirs), *file.package_dirs)
+            loaded, advice = _load(file.found, first or None, dirs)
         loaded = file.applied(loaded)
+        if later:
+            loaded = welded(loaded, later)
     loaded = with_fields(loaded, fields)
     gone = {name.rpartition("=")[0] for name in loaded.locked}
     notes = [*loaded.notes]
@@ -110,7 +105,7 @@ def load(
             notes.append(text)
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
-    if idle_coordinates(loaded):
+    if loaded.idle_coordinates:
         # No warning: whatever needs the inverse of M refuses with this.
         notes.append(massless_note(loaded))
     return replace(loaded, notes=tuple(notes))
@@ -125,21 +120,19 @@ def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
     changed = robot.replace(**fields)
     over: dict[str, Any] = {
         name: {**getattr(robot, name), **getattr(changed, name)}
-        for name, field in FIELDS.items()
-        if field.merged and name in fields and getattr(robot, name)
+        for name in MERGED
+        if name in fields and getattr(robot, name)
     }
     return replace(changed, **over)
 
 
 def _load(
-    found: RobotFile, locks: Sequence[Lock | None], package_dirs: tuple[Path, ...]
+    found: RobotFile, lock: Lock | None, package_dirs: tuple[Path, ...]
 ) -> tuple[Robot, tuple[Advice, ...]]:
     """Return the robot of a URDF, and the warnings that its fields may still remove."""
-    description = read_urdf(found.path, found.prune)
-    loaded = _robot(description.model, found.name, locks, description.mimics)
-    folders = (*package_dirs, *found.package_dirs)
-    # Meshes are read when the robot is drawn, and no output may take their place before.
-    remember(*filter(None, (find_mesh(uri, found.path, folders) for uri in description.meshes)))
+    description = read_urdf(found.path)
+    loaded = _robot(description.model, found.name, lock, description.mimics)
+    dirs = (*package_dirs, *found.package_dirs)
     damping = {name: description.damping.get(name, 0.0) for name in loaded.joint_names}
     # That of mimic joints counts with that of their leaders: the power is the same.
     for joint, leader, multiplier, _ in loaded.followers:
@@ -149,7 +142,7 @@ def _load(
         urdf=found.path,
         urdf_sha256=description.sha256,
         notes=description.notes,
-        package_dirs=folders,
+        package_dirs=dirs,
         urdf_damping=damping,
         links={name: LinkMass.of(link) for name, link in description.links.items()},
         file_joints=description.joints,
@@ -200,26 +193,19 @@ def from_model(
     copy = model.copy()
     copy.gravity.setZero()
     name = name or model.name or "model"
-    check_model(copy, name)
-    robot = _robot(copy, name, [lock], {})
+    _check_model(copy, name)
+    robot = _robot(copy, name, lock, {})
     own = {joint.name: float(robot.model.damping[joint.idx_v]) for joint in robot.joints}
     robot = replace(robot, urdf_damping=own)
     return robot.replace(**fields) if fields else robot
 
 
-def _folders(package_dirs: Any) -> tuple[Path, ...]:
-    if isinstance(package_dirs, str | os.PathLike) or not isinstance(package_dirs, Sequence):
-        raise InputError(f"package_dirs is {package_dirs!r}, expected a list of folders")
-    return tuple(as_path(folder) for folder in package_dirs)
-
-
-def _robot(
-    model: pin.Model, name: str, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
-) -> Robot:
-    check_root(model, name)
+def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:
+    _check_root(model, name)
+    require_room(model, name)
     locked: tuple[str, ...] = ()
-    if any(lock is not None for lock in locks):
-        model, mimics, locked = locked_model(model, locks, mimics)
+    if lock is not None:
+        model, mimics, locked = locked_model(model, lock, mimics)
     all_joints = [joint_of(model, index) for index in range(ROOT + 1, model.njoints)]
     by_name = {joint.name: joint for joint in all_joints}
     joints = tuple(joint for joint in all_joints if joint.name not in mimics)
@@ -228,9 +214,65 @@ def _robot(
         for joint, mimic in mimics.items()
     )
     robot = Robot(model, name, None, "", joints, followers, locked=locked)
-    robot.require_room()
-    check_order(model, name)
+    _check_order(model, name)
     return robot
+
+
+def _check_root(model: pin.Model, name: str) -> None:
+    """Refuse a model that is not one tree on one free-flyer."""
+    root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
+    if root != "JointModelFreeFlyer":
+        raise ModelError(
+            f"'{name}': the root joint is {root}, expected JointModelFreeFlyer; build the model "
+            "with pin.JointModelFreeFlyer() as its root joint"
+        )
+    fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
+    if fixed:
+        raise ModelError(
+            f"'{name}': joint '{fixed[0]}' is attached to the world, not the free-flyer; connect "
+            "every moving link to the one base"
+        )
+
+
+def _check_order(model: pin.Model, name: str) -> None:
+    """Refuse joints that are not in depth-first order."""
+    above: list[int] = []
+    for joint, parent in enumerate(model.parents.tolist()):
+        while above and above[-1] != parent:
+            above.pop()
+        if joint and not above:
+            raise ModelError(
+                f"'{name}': the joints are not in depth-first order, which makes Pinocchio's CRBA "
+                "wrong; add all joints of one branch before the joints of the next"
+            )
+        above.append(joint)
+
+
+def _check_model(model: pin.Model, name: str) -> None:
+    """Refuse a model whose numbers no robot has, by the joint that has them."""
+    for index in range(ROOT, model.njoints):
+        body, joint, parent = model.inertias[index], model.joints[index], model.parents[index]
+        armature = model.armature[joint.idx_v : joint.idx_v + joint.nv]
+        moments = np.linalg.eigvalsh(np.nan_to_num(body.inertia)).tolist()
+        shown = ", ".join(f"{moment:.3g}" for moment in moments)
+        finite = np.isfinite([body.mass, *body.lever, *body.inertia.ravel(), *armature]).all()
+        faults = {
+            f"the parent {parent}, expected a joint before {index}": parent >= index,
+            "a placement that is not finite, or whose matrix R is not a rotation": not (
+                is_rotation(model.jointPlacements[index].rotation)
+                and np.isfinite(model.jointPlacements[index].translation).all()
+            ),
+            "a mass, centre of mass, inertia or armature that is not finite": not finite,
+            f"a link with a mass of {body.mass:g} kg, expected 0 or more": body.mass < 0.0,
+            f"a link with principal moments of inertia of {shown} kg m^2, expected 0 or more": (
+                is_impossible(body.mass, moments)
+            ),
+            f"an armature of {armature.tolist()}, expected 0 or more": (armature < 0.0).any(),
+        }
+        for fault in (fault for fault, found in faults.items() if found):
+            raise ModelError(
+                f"'{name}': joint '{model.names[index]}' has {fault}; correct it in the model"
+            )
 
 
 def body_alone(inertia: pin.Inertia, name: str) -> Robot:
@@ -242,13 +284,6 @@ def body_alone(inertia: pin.Inertia, name: str) -> Robot:
     return from_model(model, name=name)
 
 
-def inertia_of(value: Any) -> pin.Inertia:
+def inertia_of(value: pin.Inertia) -> pin.Inertia:
     """Return the inertia of a body that has mass, or raise `InputError`."""
-    second = 0.5 * np.trace(value.inertia) * np.eye(3) - value.inertia
-    least, size = np.linalg.eigvalsh(second)[0], np.trace(value.inertia)
-    if not value.mass > 0.0 or least < -1e-9 * size:
-        raise InputError(
-            f"payload of {value.mass:g} kg has an inertia that is not physically realisable; give "
-            "a mass above 0, and principal moments none of which exceeds the sum of the other two"
-        )
-    return value
+    return given_body("payload", value, value)

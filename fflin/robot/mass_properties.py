@@ -1,4 +1,4 @@
-r"""Mass of each link as in the URDF, and changes to physically realisable bodies.
+r"""Mass of each link as in the URDF, changes of bodies, and motions that move no mass.
 
 A body has mass m, centre of mass c and inertia I about c. With the identity matrix E, the second
 moments of its mass distribution are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The body is
@@ -10,23 +10,34 @@ Automation Letters 3(1), 2018).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, listed, require_known
+from fflin.base.errors import InputError, SingularInertiaError, listed, require_known
 from fflin.base.names import by_name
-from fflin.base.validation import Array, as_double, number, positive, vector, whole
+from fflin.base.rotation import skew
+from fflin.base.validation import Array, number, positive, shaped, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.urdf.links import TRIANGLE_SLACK, Link, is_impossible
+
+if TYPE_CHECKING:
+    from fflin.robot.robot import Robot
 
 _KEYS = ("mass", "com", "inertia")
 _SYMMETRIC = 1e-9
 # Relative errors of a sum of bodies, and of a second moment, from rounding.
 _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
+
+# Singular values below this share of the largest are zero: rounding leaves 1e-15 of it, and the
+# least that is meant, of links 1e7 m apart, is 1e-7 of it.
+_ZERO = 1e-12
+
+# A coordinate is named where its share in a motion is larger than this.
+_INVOLVED = 0.1
 
 
 def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
@@ -38,25 +49,23 @@ def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
         if frame.type == pin.FrameType.BODY and frame.name not in index_of:
             links.setdefault(frame.parentJoint, []).append(frame.name)
     several = {name: index for index, many in links.items() if many[1:] for name in many}
-    index_of |= several | {many[0]: index for index, many in links.items()}
-    names, done, new = list(index_of), dict[int, Any](), dict[int, pin.Inertia]()
+    index_of |= {many[0]: index for index, many in links.items() if not many[1:]}
+    names, done, new = [*index_of, *several], dict[int, Any](), dict[int, pin.Inertia]()
     for place, value in by_name("body", given, names).items():
-        name, index = names[place], index_of[names[place]]
+        name = names[place]
+        index = {**several, **index_of}[name]
         body = "base" if index == ROOT else model.names[index]
-        if name in several:
+        if name in several or done.setdefault(index, value) is not value:
             raise InputError(
-                f"'{name}' is one of several links of the body '{body}': "
-                f"{listed(links[index])}; give the properties of the whole body '{body}'"
+                f"'{name}' is part of the body '{body}' with the links "
+                f"{listed(links.get(index, [name]))}; give the properties of the whole body "
+                f"'{body}' once"
             )
-        if done.setdefault(index, value) is not value:
-            raise InputError(
-                f"the body '{body}' is given twice, once under the name '{name}'; give it once"
-            )
-        new[index] = _given(name, value, model.inertias[index])
+        new[index] = given_body(name, value, model.inertias[index])
     return new
 
 
-def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
+def given_body(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
     """Return a body that is given in part or as a whole."""
     of = f"of '{name}'"
     if isinstance(value, pin.Inertia):
@@ -71,23 +80,17 @@ def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
     com = vector(f"com {of}", value.get("com", old.lever), 3, "a point in the body's frame")
     if "inertia" not in value:
         return pin.Inertia(mass, com, old.inertia * (mass / old.mass if old.mass else 1.0))
-    inertia = as_double(f"inertia {of}", value["inertia"])
-    if inertia.shape != (3, 3) or not np.isfinite(inertia).all():
-        raise InputError(
-            f"inertia {of} has shape {inertia.shape}, expected (3, 3) finite numbers [kg m^2] "
-            "about the centre of mass"
-        )
-    if np.abs(inertia - inertia.T).max() > _SYMMETRIC * np.abs(inertia).max():
-        raise InputError(f"inertia {of} is not symmetric; give a symmetric matrix (3, 3)")
+    hint = " [kg m^2] about the centre of mass"
+    inertia = shaped(f"inertia {of}", value["inertia"], (3, 3), hint)
+    symmetric = np.abs(inertia - inertia.T).max() <= _SYMMETRIC * np.abs(inertia).max()
     inertia = 0.5 * (inertia + inertia.T)
-    least, middle, largest = np.linalg.eigvalsh(inertia).tolist()
-    moments = f"inertia {of} has principal moments {least:.3g}, {middle:.3g}, {largest:.3g} kg m^2"
-    if is_impossible(mass, (least, middle, largest)):
-        raise InputError(f"{moments}; expected values of 0 or more")
-    if largest - middle - least > TRIANGLE_SLACK * largest:
+    least, middle, largest = moments = np.linalg.eigvalsh(inertia).tolist()
+    unequal = largest - middle - least > TRIANGLE_SLACK * largest
+    if not symmetric or is_impossible(mass, moments) or unequal:
         raise InputError(
-            f"{moments}, which is not physically realisable; none may exceed the sum of the "
-            "other two"
+            f"inertia {of} has principal moments {least:.3g}, {middle:.3g}, {largest:.3g} kg m^2 "
+            "and is not physically realisable; expected a symmetric matrix with moments of 0 or "
+            "more, none of which exceeds the sum of the other two"
         )
     return pin.Inertia(mass, com, inertia)
 
@@ -242,3 +245,73 @@ def _squares(com: Array) -> Array:
     """Return the inertias (N, 3, 3) of unit masses at points (N, 3)."""
     squares: Array = (com * com).sum(axis=1)[:, None, None] * np.eye(3)
     return squares - com[:, :, None] * com[:, None]
+
+
+def idle_coordinates(robot: Robot) -> tuple[str, ...]:
+    """Return the coordinates that can move together without moving mass; usually none."""
+    # The energy vanishes only if the velocity of every mass, every turn that has inertia and every
+    # rate that has an armature do: a question of geometry, decided without the masses, whose
+    # rounding could hide it.
+    bodies = robot.model.inertias.tolist()[ROOT:]
+    moments = [np.linalg.eigh(body.inertia) for body in bodies]
+    if all(
+        body.mass > 0.0 and values[0] > _NO_MOMENT * values[2]
+        for body, (values, _) in zip(bodies, moments, strict=True)
+    ):
+        return ()
+    # v = columns nu: joints that mimic others follow them.
+    columns = np.eye(robot.nv)
+    for joint, leader, multiplier, _ in robot.followers:
+        columns[joint.idx_v, leader.idx_v] = multiplier
+    columns = columns[:, [*range(6), *(joint.idx_v for joint in robot.joints)]]
+    names = np.array(coordinate_names(robot))
+    rng = np.random.default_rng(0)
+    idle: tuple[str, ...] = ()
+    # An M that is singular at two random configurations is singular at all.
+    for _ in range(2):
+        velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
+        q = pin.integrate(robot.model, robot.neutral(), velocity)
+        moved = _moved(robot, q, moments) @ columns
+        moved /= np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
+        _, sizes, modes = np.linalg.svd(np.linalg.qr(moved, mode="r"))
+        rank = int(np.count_nonzero(sizes > _ZERO * sizes.max(initial=0.0)))
+        involved = np.linalg.norm(modes[rank:], axis=0) > _INVOLVED
+        idle = tuple(dict.fromkeys(names[involved].tolist()))
+        if not idle:
+            break
+    return idle
+
+
+def coordinate_names(robot: Robot) -> list[str]:
+    """Return the names (6 + n) of the coordinates of velocity, in state order, for a message."""
+    return ["the base"] * 6 + [f"joint '{name}'" for name in robot.joint_names]
+
+
+def massless_note(robot: Robot) -> str:
+    """Return the message about coordinates that can move without moving mass."""
+    idle = listed(robot.idle_coordinates)
+    return (
+        f"the mass matrix of '{robot.name}' is singular at every configuration: {idle} can move "
+        "without moving mass; give the links of these joints an inertia, or lock the joints"
+    )
+
+
+def require_inertia(robot: Robot) -> None:
+    """Refuse an M that is singular at every configuration, which rounding of factors may hide."""
+    if robot.idle_coordinates:
+        raise SingularInertiaError(massless_note(robot))
+
+
+def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:
+    """Return rows (k, nv) that give, from v, every velocity that has inertia."""
+    model, data = robot.model, robot.create_data()
+    pin.computeJointJacobians(model, data, q)
+    rows = [np.eye(model.nv)[model.armature > 0.0]]
+    for index, (values, axes) in enumerate(moments, start=ROOT):
+        body = model.inertias[index]
+        J = pin.getJointJacobian(model, data, index, pin.ReferenceFrame.LOCAL)
+        if body.mass > 0.0:
+            rows.append(J[:3] - skew(body.lever) @ J[3:])
+        turning = values > _NO_MOMENT * values[2]
+        rows.append(axes[:, turning].T @ J[3:])
+    return np.vstack(rows)

@@ -16,8 +16,7 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import with_appendages, with_inputs
-from fflin.robot.equipment.mounting import difference
-from fflin.robot.equipment.wheels import stored_momentum
+from fflin.robot.equipment.mounting import difference, stored_momentum
 from fflin.robot.fields import Range, Scope, checked_fields, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
@@ -25,6 +24,7 @@ from fflin.robot.mass_properties import (
     LinkMass,
     Piece,
     given_bodies,
+    idle_coordinates,
     pieces_of,
     random_bodies,
 )
@@ -222,8 +222,7 @@ class Robot(Coordinates):
             If a field, a joint, a frame of an input or output, or a name in `limits` does not
             exist.
         ModelError
-            If dry friction is given, which is not differentiable at rest, or the robot's model
-            was changed after the robot was made.
+            If the robot's model was changed after the robot was made.
         """
         self.require_unchanged()
         robot = self
@@ -366,6 +365,11 @@ class Robot(Coordinates):
         return (*of_inputs, *(name for item in self.outputs for name in item.frames))
 
     @cached_property
+    def idle_coordinates(self) -> tuple[str, ...]:
+        """Coordinates that can move together without moving mass; usually none."""
+        return idle_coordinates(self)
+
+    @cached_property
     def wheels(self) -> dict[str, float]:
         """{name: inertia [kg m^2]} of the wheels among the joints."""
         wheels = named_wheels(self.inputs)
@@ -415,7 +419,7 @@ class Robot(Coordinates):
                 "wheel an inertia, or its momentum"
             )
         if any(locked.rpartition("=")[0] == name for locked in self.locked):
-            raise InputError(f"joint '{name}' is locked; lock it at another value instead")
+            raise InputError(f"joint '{name}' is locked; unlock it, or leave it out here")
         raise unknown("joint", name, self.joint_names)
 
     @cached_property
@@ -431,7 +435,7 @@ class Robot(Coordinates):
     def _without_motors(self, passive: Any) -> Robot:
         """Return the robot without the torques of joints that have no motor."""
         bare = self._bare
-        joints = checked_passive(passive, bare.joint, bare.joint_names, self.locked)
+        joints = checked_passive(passive, bare.joint, bare.joint_names)
         inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
         if not inputs:
             raise InputError(

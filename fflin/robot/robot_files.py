@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import reprlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING, fields, replace
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
-from fflin.base.names import stands_for_any
-from fflin.base.toml_file import NAME, NUMBER, NUMBERS, TRUTH, VECTOR, Kind, TomlFile, flat
-from fflin.robot.catalog import find_inputs, find_robot
+from fflin.base.toml_file import TomlFile, flat
+from fflin.robot.catalog import find_inputs, find_robot, folders
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
-from fflin.robot.fields import FIELDS, Field
-from fflin.robot.inputs import KINDS, Input, Vector3
-from fflin.robot.outputs import parse_output
+from fflin.robot.fields import FIELDS
+from fflin.robot.inputs import KINDS, Input
+from fflin.robot.welding import requested
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
@@ -25,22 +22,17 @@ if TYPE_CHECKING:
 # Fields that a file gives as arrays of tables.
 _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
+# Tables of named parts, some of which are tables.
+_OF_PARTS = ("weights", "point", "target", "start")
+
 # The keys of a robot file; a file without `urdf` holds inputs alone. The guide has their meaning.
-KEYS = {
-    "urdf": Field(kind=NAME, table=None),
-    "package_dirs": Field(kind=NAME, table=None),
-    "lock": Field(kind=NAME),
-    **{table: Field() for tables in _TABLES.values() for table in tables},
-    **{name: field for name, field in FIELDS.items() if name not in _TABLES},
-}
+KEYS = (
+    *("urdf", "package_dirs", "lock"),
+    *(table for tables in _TABLES.values() for table in tables),
+    *(name for name in FIELDS if name not in _TABLES),
+)
 
 _TYPES = {kind.KEY: kind for kind in KINDS}
-# The kind of value for each annotation of an input's parameters.
-_KINDS: dict[Any, Kind] = {
-    **dict.fromkeys((str, str | None), NAME),
-    **dict.fromkeys((float, float | None), NUMBER),
-    **{bool: TRUTH, Vector3: VECTOR, float | Vector3 | None: NUMBERS},
-}
 
 
 class RobotToml:
@@ -51,38 +43,31 @@ class RobotToml:
         check_keys(document)
         if "urdf" not in document.record:
             raise InputError(
-                f'{path}: the file contains only inputs; add urdf = "my.urdf" above the inputs, or '
-                "pass the file with --inputs or fflin.load_inputs"
+                f'{path}: the key `urdf` is missing; add urdf = "my.urdf", or pass a file that '
+                "contains only inputs with --inputs or fflin.load_inputs"
             )
-        tables = {key for keys in _TABLES.values() for key in keys}
-        given = {key: self._checked(key) for key in document.record if key not in tables}
-        lock, folders = given.pop("lock", {}), given.pop("package_dirs", [])
-        # {joint or pattern: value, or None at neutral}.
-        self.lock: dict[str, float | None] = lock if isinstance(lock, dict) else dict.fromkeys(lock)
-        self.package_dirs = tuple(path.parent / folder for folder in folders)
         with document.located("urdf"):
             # The URDF, under the name of the TOML file.
-            self.found = find_robot(given.pop("urdf"), path.parent)._replace(name=name)
+            self.found = find_robot(document.record["urdf"], path.parent)._replace(name=name)
             if self.found.path.suffix.lower() == ".toml":
                 raise InputError(f"urdf is {self.found.path}, expected a URDF or a robot's name")
-        with document.located("outputs"):
-            if words := given.get("outputs"):
-                given["outputs"] = [output for word in words for output in parse_output(word)]
+        with document.located("package_dirs"):
+            self.package_dirs = folders(document.record.get("package_dirs", ()), path.parent)
+        with document.located("lock"):
+            self.lock = requested(_flat("lock", document.record.get("lock", ())))
+        self._fields = {key: _flat(key, x) for key, x in document.record.items() if key in FIELDS}
         if "input" in document.record:
-            given["inputs"] = read_inputs(document)
+            self._fields["inputs"] = read_inputs(document)
         if appendages := read_appendages(document):
-            given["appendages"] = appendages
-        self._fields = {key: given[key] for key in FIELDS if key in given}
+            self._fields["appendages"] = appendages
 
     def applied(self, robot: Robot) -> Robot:
-        """Return the robot with the file's fields, except those of joints that a caller locks."""
-        locked = [each.rpartition("=")[0] for each in robot.locked]
-        gone = [name for name in locked if not any(stands_for_any(x, [name]) for x in self.lock)]
-        for key, value in self._fields.items():
-            names = [name for name in _TABLES.get(key, (key,)) if name in self._document.record]
-            with self._document.located(names[0]):
-                self._check_unlocked(value)
-                robot = robot.replace(**{key: _without(gone, robot.joint_names, value)})
+        """Return the robot with the file's fields."""
+        for key in FIELDS:
+            if key in self._fields:
+                tables = _TABLES.get(key, (key,))
+                with self._document.located(next(x for x in tables if x in self._document.record)):
+                    robot = robot.replace(**{key: self._fields[key]})
         return robot
 
     @contextmanager
@@ -96,65 +81,14 @@ class RobotToml:
             with self._document.located("lock"):
                 raise
 
-    def _check_unlocked(self, value: Any) -> None:
-        names = value.get("joints", value) if isinstance(value, Mapping) else value
-        for name in names if isinstance(names, list | dict) else ():
-            if name in self.lock:
-                line = self._document.line("lock")
-                raise InputError(
-                    f"joint '{name}' is also locked in line {line}; remove the joint in one of the "
-                    "two places"
-                )
 
-    def _checked(self, name: str) -> Any:
-        """Return the value of a key, with flat tables: names in them may have dots."""
-        key, value = KEYS[name], self._document.record[name]
-        kind = key.kind
-        if isinstance(value, dict):
-            kind = key.table or kind
-            parts = value if key.parts else {"": value}
-            parts = {part: flat(x) if isinstance(x, dict) else x for part, x in parts.items()}
-            value = parts if key.parts else parts[""]
-        word = [name, key.word] if key.word else [name]
-        for *place, leaf in _leaves(value, name) if key.table else _entries(value, name):
-            if key.word is None or place != word or not isinstance(leaf, str):
-                self._document.require(kind, leaf, *place)
-        listed = isinstance(value, str) and kind is NAME and name != "urdf"
-        return [value] if listed else value
-
-
-def _entries(value: Any, *place: str) -> Iterator[tuple[Any, ...]]:
-    """Yield (*place, value) of a value, or of the entries of a list."""
-    yield from ((*place, entry) for entry in (value if isinstance(value, list) else [value]))
-
-
-def _leaves(value: Any, *place: str) -> Iterator[tuple[Any, ...]]:
-    """Yield (*place, value) of all values in nested tables, and of the entries of lists."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield from _leaves(inner, *place, key)
-    else:
-        yield from _entries(value, *place)
-
-
-def _without(gone: list[str], left: tuple[str, ...], value: Any) -> Any:
-    """Return a field of a robot without entries for removed joints."""
-    if isinstance(value, dict) and gone:
-        kept = {key: x for key, x in value.items() if _kept(key, gone, left)}
-        return {key: _without(gone, left, x) for key, x in kept.items()}
-    if isinstance(value, list | tuple) and gone:
-        return [x for x in value if _kept(getattr(x, "joint", x), gone, left)]
-    return value
-
-
-def _kept(key: Any, gone: list[str], left: tuple[str, ...]) -> bool:
-    if not isinstance(key, str):
-        return True
-    of_gone, of_left = (
-        [f"{group}.{joint}" for group in ("q_m", "qdot_m", "tau_m") for joint in joints]
-        for joints in (gone, left)
-    )
-    return stands_for_any(key, of_left) or not stands_for_any(key, of_gone)
+def _flat(key: str, value: Any) -> Any:
+    """Return the value of a key with flat tables: names in them may have dots."""
+    if not isinstance(value, dict):
+        return value
+    if key in _OF_PARTS:
+        return {part: flat(x) if isinstance(x, dict) else x for part, x in value.items()}
+    return flat(value)
 
 
 def load_inputs(path: str | Path) -> tuple[Input, ...]:
@@ -196,8 +130,8 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     UnknownNameError
         If there is no such type or key; the message names file and line.
     InputError
-        If the file is not TOML, a key is missing, a value is wrong or an input is given twice;
-        the message names file and line.
+        If the file is not TOML, a key is missing or a value is wrong; the message names file and
+        line.
 
     Examples
     --------
@@ -227,38 +161,24 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
 
 def check_keys(document: TomlFile) -> None:
     """Raise `UnknownNameError` if a file of inputs or a robot file has an unknown key."""
-    whole = "urdf" in document.record
-    known, hint = (tuple(KEYS), "") if whole else (("input",), "; write [[input]]")
     for key in document.record:
-        if key not in known:
-            if not whole and key in KEYS:
-                missing = 'the key `urdf` of a robot file is missing; add urdf = "my.urdf"'
-                raise InputError(f"{document.path}: {missing}")
-            problem = unknown("key of a robot file" if whole else "table", key, known)
-            raise document.error(UnknownNameError(f"{problem}{hint}"), key)
+        if key not in KEYS:
+            raise document.error(unknown("key of a robot file", key, KEYS), key)
 
 
 def read_inputs(document: TomlFile) -> tuple[Input, ...]:
     """Return the inputs of a file, as `load_inputs` does."""
-    tables = _tables(document, "input")
-    if not tables:
+    inputs: list[Input] = []
+    for index, table in enumerate(_tables(document, "input")):
+        kind, values = str(table.get("type", "")), {**table}
+        if kind not in _TYPES:
+            problem = f"input {index + 1}: no valid 'type': {unknown('type', kind, _TYPES)}"
+            raise document.error(UnknownNameError(problem), "input", index, "type")
+        del values["type"]
+        inputs.append(_built(document, ("input", index), _TYPES[kind], values))
+    if not inputs:
         message = "the file contains no inputs; add a table [[input]] with its type"
         raise InputError(f"{document.path}: {message}")
-    inputs: list[Input] = []
-    seen: dict[Input | str | None, int] = {}
-    for index, table in enumerate(tables):
-        item = _input(document, index, table)
-        what = item.name if hasattr(item, "name") else replace(item, min=None, max=None)
-        if what is not None and what in seen:
-            shown = f"the name '{what}'" if isinstance(what, str) else what
-            first = document.line("input", seen[what])
-            message = (
-                f"input {index + 1}: {shown} is already given in line {first}; remove one of the "
-                "two"
-            )
-            raise document.error(message, "input", index, "name")
-        seen[what] = index
-        inputs.append(item)
     return tuple(inputs)
 
 
@@ -272,20 +192,11 @@ def read_appendages(document: TomlFile) -> list[Appendage]:
         # Keys that only files of Nastran, or cylinders, have.
         alone = set(signature(special).parameters) - set(signature(make).parameters)
         for index, table in enumerate(_tables(document, key)):
-            build: Any = special if alone & set(table) else make
-            of, place = f"{key} {index + 1}: ", (key, index)
-            hidden = {"inertia"} if build is special else {"inertia", "rigid"}
-            required = {
-                name: parameter.default is parameter.empty
-                for name, parameter in signature(build).parameters.items()
-                if name not in hidden
-            }
-            values = dict(table)
+            values = {**table}
             for name in {"op4", "asm"} & set(values):
-                document.require(NAME, values[name], *place, name, of=f"{of}{name}")
-                values[name] = document.path.parent / values[name]
-            also = (*required, *sorted(alone))
-            found.append(_built(document, place, f"key of {key}", build, values, required, also))
+                values[name] = document.path.parent / str(values[name])
+            build = special if alone & set(values) else make
+            found.append(_built(document, (key, index), build, values))
     return found
 
 
@@ -297,56 +208,22 @@ def _tables(document: TomlFile, key: str) -> list[dict[str, Any]]:
     return tables
 
 
-def _built(
-    document: TomlFile,
-    place: tuple[str, int],
-    what: str,
-    build: Any,
-    values: dict[str, Any],
-    required: Mapping[str, bool],
-    known: Iterable[str],
-) -> Any:
-    """Build the object of a table, with file and line in front of errors.
-
-    `required` says of each key whether it must be given; `known` are the keys that a message lists.
-    """
-    of = f"{place[0]} {place[1] + 1}: "
+def _built(document: TomlFile, place: tuple[str, int], build: Any, values: dict[str, Any]) -> Any:
+    """Build the object of a table, with file and line in front of errors."""
+    of, parameters = f"{place[0]} {place[1] + 1}: ", dict(signature(build).parameters)
+    if isinstance(name := values.get("name"), str):
+        of = of.replace(":", f" ('{name}'):")
+    if build is FlexibleAppendage:  # which has more parameters from files of Nastran
+        del parameters["inertia"], parameters["rigid"]
     for name in values:
-        if name not in required:
-            raise document.error(unknown(what, name, dict.fromkeys(known)), *place, name)
-    for name, needed in required.items():
-        if needed and name not in values:
+        if name not in parameters:
+            problem = f"{of}{unknown(f'key of {place[0]}', name, parameters)}"
+            raise document.error(UnknownNameError(problem), *place, name)
+    for name, parameter in parameters.items():
+        if parameter.default is parameter.empty and name not in values:
             raise document.error(f"{of}the key '{name}' is missing; add this key", *place)
     try:
         return build(**values)
     except FflinError as error:
         with document.located(*place):
             raise type(error)(f"{of}{error}") from None
-
-
-def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
-    kind, of, place = table.get("type"), f"input {index + 1}: ", ("input", index)
-    if kind is None:
-        near = [key for key in table if key.lower() == "type"]
-        hint = f", but there is a key '{near[0]}'" if near else ""
-        message = f"{of}the key 'type' is missing{hint}; set 'type' to one of {', '.join(_TYPES)}"
-        raise document.error(message, *place)
-    if not isinstance(kind, str) or kind not in _TYPES:
-        shown = kind if isinstance(kind, str) else reprlib.repr(kind)
-        raise document.error(unknown("type of input", shown, _TYPES), *place, "type")
-    by_keyword_last = sorted(fields(_TYPES[kind]), key=lambda field: field.kw_only is True)
-    required = {field.name: field.default is MISSING for field in by_keyword_last}
-    values = {key: value for key, value in table.items() if key != "type"}
-    for field in by_keyword_last:
-        if field.name in values:
-            expected = _KINDS[field.type]
-            if expected is NUMBERS and len(_TYPES[kind].ENTRIES) == 1:
-                expected = NUMBER
-            document.require(
-                expected, values[field.name], *place, field.name, of=f"{of}{field.name}"
-            )
-    known = ("type", *required)
-    built: Input = _built(
-        document, place, f"key of a {kind}", _TYPES[kind], values, required, known
-    )
-    return built

@@ -12,29 +12,30 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
-from fflin.base.names import joints_by_name
+from fflin.base.names import joints_by_name, stands_for_any
 from fflin.base.validation import Array, number
 from fflin.robot.equipment.assembly import with_inputs
 from fflin.robot.equipment.mounting import Mounted, carry_over, with_mounted
 from fflin.robot.inputs import ReactionWheel, named_inputs
-from fflin.robot.joints import ROOT, Follower, Joint, find_frame
+from fflin.robot.joints import ROOT, Follower, Joint, find_frame, joint_of
 from fflin.robot.mass_properties import LinkMass
-from fflin.robot.model_checks import joint_of
 from fflin.robot.outputs import JointOutput
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
 
-_GROUPS = ("", "q_m.", "qdot_m.", "tau_m.", "wheel.")
+_GROUPS = ("q_m", "qdot_m", "tau_m", "wheel")
 
 Lock = Mapping[str, float | None] | Iterable[str]
 
 
-def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
+def welded(robot: Robot, lock: Lock) -> Robot:
     """Return a robot with joints welded at values, and wheels welded to their carriers."""
-    bare, gone = robot._bare, {*values}
+    bare, asked = robot._bare, requested(lock)
+    wheels = {name for name in asked if name in robot.wheels}
+    at = {name: value for name, value in asked.items() if name not in wheels}
     mimics = {f.joint.name: Mimic(f.leader.name, *f[2:]) for f in bare.followers}
-    at = {name: x for name, x in values.items() if name not in robot.wheels}
-    model, left, locked = locked_model(bare.model, [at], mimics)
+    model, left, locked = locked_model(bare.model, at, mimics)
+    gone = wheels | {each.rpartition("=")[0] for each in locked}
     inputs = [
         replace(item, name=names[0]) if isinstance(item, ReactionWheel) else item
         for item, names in named_inputs(robot.inputs)
@@ -42,7 +43,8 @@ def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
     ]
     if not inputs:
         raise InputError(
-            f"without {', '.join(values)} the robot has no input; a model needs at least one input"
+            f"without {', '.join(sorted(gone))} the robot has no input; a model needs at least "
+            "one input"
         )
     outputs = [
         replace(each, joints=tuple(x for x in each.joints if x not in gone))
@@ -51,7 +53,8 @@ def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
         for each in robot.outputs
     ]
     per_joint = ("urdf_damping", "limits", "weights")
-    fields: dict[str, Any] = {name: _without(getattr(robot, name), gone) for name in per_joint}
+    kept = [name for name in robot.joint_names if name not in gone]
+    fields = {name: _without(getattr(robot, name), gone, kept) for name in per_joint}
     whole = replace(
         robot,
         **{"model": model, "locked": (*robot.locked, *locked), "_unequipped": None},
@@ -68,16 +71,22 @@ def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
     return with_inputs(whole, inputs)
 
 
-def _without(of: Any, gone: set[str]) -> Any:
-    """Return a mapping and its nested mappings without the keys NAME and GROUP.NAME."""
+def _without(of: Any, gone: Iterable[str], left: Iterable[str]) -> Any:
+    """Return a mapping and its nested mappings without keys that name removed joints alone."""
     if not isinstance(of, Mapping):
         return of
-    named = {f"{group}{name}" for name in gone for group in _GROUPS}
-    return {name: _without(value, gone) for name, value in of.items() if name not in named}
+    removed, others = (
+        [f"{group}.{name}" for group in _GROUPS for name in names] for names in (gone, left)
+    )
+    return {
+        key: _without(value, gone, left)
+        for key, value in of.items()
+        if stands_for_any(key, others) or not stands_for_any(key, removed)
+    }
 
 
 def locked_model(
-    model: pin.Model, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
+    model: pin.Model, lock: Lock, mimics: Mapping[str, Mimic]
 ) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
     """Weld joints and their mimic joints; return model, other mimic joints and welded joints."""
     movable = list(model.names)[ROOT + 1 :]
@@ -86,10 +95,7 @@ def locked_model(
         require_known("joint to lock", [name], movable)
         return name
 
-    given: dict[str, float | None] = {}
-    for lock in locks:
-        if lock is not None:
-            given |= joints_by_name("joint to lock", _asked(lock), movable, found)
+    given = joints_by_name("joint to lock", requested(lock), movable, found)
     values = {n: None if x is None else number(f"lock '{n}'", x) for n, x in given.items()}
     for name, mimic in mimics.items():
         leader_value = values.get(mimic.leader, 0.0) or 0.0
@@ -111,7 +117,7 @@ def locked_model(
     return _reduced(model, indices, q), left, tuple(locked)
 
 
-def _asked(lock: Any) -> dict[str, float | None]:
+def requested(lock: Any) -> dict[str, float | None]:
     """Return the locks of a caller as {joint or pattern: value, or None at neutral}."""
     try:
         names = [lock] if isinstance(lock, str) else list(lock)

@@ -15,8 +15,8 @@ from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, instance
 from fflin.base.writing import as_path, check_ending
-from fflin.dynamics.state import attitude_errors, moving_errors
-from fflin.linear.trajectory_files import labels, write_table
+from fflin.dynamics.coordinates import attitude_errors, moving_errors
+from fflin.linear.files import labels, write_table
 from fflin.robot.orbit import CircularOrbit
 from fflin.simulation.report import Passed, Saturated, limited, motion_report, passed, saturated
 
@@ -317,7 +317,7 @@ def plot_motion(
         Motion to draw. If the motion has a prediction, solid lines show the nonlinear robot and
         dashed lines the linear model. The panel below each group of states shows the difference.
         Along a trajectory, pale lines show the reference, and the panel below each group shows
-        the error, with dashed lines for the linear model. A dotted line marks the time at which
+        the error. A dotted line marks the time at which
         the reference comes to rest.
     path : str or Path, optional
         File to save to: .png, .pdf or .svg.

@@ -10,18 +10,17 @@ import pinocchio as pin
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
 from fflin.control.channel import channel_of
-from fflin.control.linear_controller import LinearController, measured_at
-from fflin.control.policies import Allocation, Gridded, StateFeedback
+from fflin.control.linear_controller import LinearController
+from fflin.control.policies import Allocation, Gridded, StateFeedback, measured_at
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
-from fflin.kernel import allocation, conservation, forward, loop, policies
+from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.arguments import empty
 from fflin.kernel.tree import Tree, batch_tree, layout_of, loads_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.limits import limits_of
-from fflin.simulation.conservation import MomentumReference, conserved_by
 from fflin.simulation.plan import Plan
-from fflin.simulation.plant import Plant, triads
+from fflin.simulation.plant import MomentumReference, Plant, conserved_by, triads
 from fflin.simulation.run import stop_conditions
 
 SLOTS = 128  # samples whose noise is there at a time, and steps of a campaign
@@ -46,18 +45,17 @@ def packed(plan: Plan, plant: Plant) -> loop.Arguments:
             nodes=np.minimum(np.array(method.nodes) * h, plan.last_node * h),
             weights=np.array(method.weights) * h,
             moments=h * (np.array(method.moments) * h),
-            tangent=method.tangent,
         ),
         law=_law(plan, plant, mechanics),
         # What would act after the end needs no place to wait in.
         channel=channel_of(
             plan.limits, plan.initial, plan.times.sample, min(plan.times.delay, plan.times.steps)
         )._replace(delay=[float(plan.times.delay)]),
-        reference=conservation.MomentumReference(
+        reference=forward.MomentumReference(
             start=np.concatenate((start.momentum, start.center(0.0), plan.q[:3])),
             weight=conserved.mass * np.array(state.robot.gravity),
             per_mass=[1.0 / conserved.mass],
-            sums=np.zeros(conservation.SUMS),
+            sums=np.zeros(forward.SUMS),
         ),
         project=plan.project,
         pushed=not plant.isolated(driven=plan.law is not None),
@@ -72,7 +70,6 @@ def packed(plan: Plan, plant: Plant) -> loop.Arguments:
         stages=loop.Stages(
             rates=np.zeros(speed.shape[1] * size),
             along=np.zeros(size),
-            total=np.zeros(size),
             first=plan.q,
             second=plan.q,
             u=plan.initial,

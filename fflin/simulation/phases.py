@@ -11,8 +11,9 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.impact import Impact, joint_called
-from fflin.dynamics.state import StateMap, state_history
+from fflin.dynamics.state import StateMap
 from fflin.robot.robot import ROOT, Robot
 
 # Phases meet where no rate and no displacement differs by more.

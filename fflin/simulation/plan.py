@@ -14,19 +14,17 @@ from fflin.base.names import group_of
 from fflin.base.validation import Array, instance, truth, vector
 from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
 from fflin.control.linear_controller import growing
-from fflin.control.plants import notes_of
 from fflin.control.policies import axes_of, bound, fed_back, feedback_of
 from fflin.control.tracking import (
     Reference,
-    TrajectoryFeedback,
     followed,
     reference_of,
     tracking_of,
 )
 from fflin.dynamics import points
-from fflin.dynamics.inertia import rotor_names
+from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import Integrator, integrator
-from fflin.dynamics.names import ORBITAL, refuse_orbit
+from fflin.dynamics.rnea import rotor_names
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
@@ -97,18 +95,12 @@ class Plan:
     reference: Reference | None  # the motion that is followed, where there is one
     steered: tuple[str, ...]  # the states that are known to be fed back
     notes: Callable[[], tuple[str, ...]]  # returns the remarks for the report, which take a moment
-    predictor: Predictor | TrajectoryFeedback | None  # of the linear motion under the same law
+    predictor: Predictor | None  # of the linear motion under the same law
 
     @property
     def last_node(self) -> float:
         """Time of the last stage, relative to the step; below 1 if inputs jump at knots."""
         return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
-
-    @property
-    def repeatable(self) -> bool:
-        """Whether the plan calls no user functions, which may have an internal state."""
-        bound_anew = self.policy is None or hasattr(self.policy, "bind")
-        return bound_anew and not self.events and self.callback is None
 
     def channel(self) -> Channel | None:
         """Return the channel of the law's commands to the inputs, without pending commands."""
@@ -228,7 +220,7 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
         target=goal,
         reference=follows,
         steered=fed_back(policy),
-        notes=lambda: (*growing(policy), *notes_of(policy, robot), *times.notes),
+        notes=lambda: (*growing(policy), *times.notes),
         predictor=foresees,
     )
     return plan, plant

@@ -1,25 +1,35 @@
-"""Accelerations of a simulated robot under its inputs and external forces."""
+"""A simulated robot: its accelerations under inputs and forces, and its conserved quantities.
+
+Without external forces the momentum about a fixed point is constant, and the centre of mass moves
+along r_c(t) = r_c(0) + p t / m. In orbit the Jacobi integral (14.3) is conserved instead.
+"""
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
+from scipy.linalg.lapack import dposv
 
 from fflin.base.errors import InputError
+from fflin.base.rotation import skew
 from fflin.base.validation import Array, as_double
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.integrators import Integrator
+from fflin.dynamics.orbital import OrbitField
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults, apply_faults
-from fflin.robot.model_checks import require_inertia
+from fflin.robot.joints import ROOT
+from fflin.robot.mass_properties import require_inertia
+from fflin.robot.robot import Robot
 
 # Returns of (t, q, v) a generalised force (nv,) in Pinocchio's order: on the base linear, then
 # angular, in base axes; then on the joints.
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
-_aba = pin.aba
+_aba, _crba, _placement = pin.aba, pin.crba, pin.XYZQUATToSE3
 # Velocity from which on a disturbance need not be finite: the motion is not.
 _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
@@ -119,3 +129,189 @@ class Plant:
                 f"({self.robot.nv},) finite numbers: a generalised force in Pinocchio's order"
             )
         return force
+
+
+class Histories(NamedTuple):
+    """Energy (N,), momentum (N, 6) about the centre of mass (N, 3), and the sizes it may have."""
+
+    energy: Array
+    momentum: Array
+    center: Array
+    sizes: Array  # (N, 2), the largest linear momentum and that about the point, see (11.5)
+
+
+class Conserved:
+    """Energy, and momentum: linear, then angular about a fixed point, in world axes."""
+
+    # The point, near the base of `start`, stands in for the world's origin throughout, for digits
+    # would be lost far away from it.
+
+    def __init__(self, robot: Robot, start: Array) -> None:
+        self._robot, self.mass = robot, robot.mass
+        self._model = robot.model
+        self._data = data = robot.create_data()
+        self._M = data.M[:6]  # CRBA writes into it
+        self._M_bb = self._M[:, :6]
+        self._start = np.concatenate((start[:3], np.zeros(4)))
+        self._x, self._y, self._z = start[:3].tolist()  # sums of arrays take longer
+        self._root = robot.model.jointPlacements[ROOT]
+        self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
+        self._free = self._root.isIdentity(0.0)
+        self._stored = robot.stored_momentum
+
+    def about_point(self, history: Histories) -> Array:
+        """Return the momentum (N, 6) about the point."""
+        p, about_center = np.split(history.momentum, 2, axis=1)
+        return np.hstack((p, about_center + np.cross(history.center, p)))
+
+    def wrench(self, q: Array, push: Array) -> Array:
+        """Return the wrench (6,) about the point, in world axes, of a plant's push and gravity."""
+        total: Array = self._base(q).toDualActionMatrix().dot(push)
+        if self._weight is not None:
+            near = q.copy()
+            near[:7] -= self._start
+            com = pin.centerOfMass(self._model, self._data, near, False)
+            total[:3] += self._weight
+            total[3:] += skew(com).dot(self._weight)
+        return total
+
+    def impose(self, q: Array, v: Array, momentum: Array, center: Array) -> None:
+        """Shift the base of `q` and set its velocity in `v` in place, to conserve both."""
+        # r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m); the velocity is corrected by
+        # what the momentum lacks, so that rounding is of the second order. M is in base axes, and
+        # a shift leaves it as it is.
+        _crba(self._model, self._data, q)
+        if self._stored:
+            pin.forwardKinematics(self._model, self._data, q)
+            momentum = momentum.copy()
+            momentum[3:] -= self._of_wheels()
+        base = _placement(q[:7])
+        if not self._free:
+            base = self._root * base
+        base.translation = center
+        # M_bb has -m [c]x beside m 1.
+        place = base.act(self._M[(1, 2, 0), (5, 3, 4)] / -self.mass)
+        base.translation = place
+        x, y, z = (place if self._free else self._root.actInv(place)).tolist()
+        q[0], q[1], q[2] = x + self._x, y + self._y, z + self._z
+        lack: Array = momentum.dot(base.toActionMatrix()) - self._M.dot(v)
+        v_b = v[:6]
+        v_b += dposv(self._M_bb, lack, 0, 0, 1)[1]
+
+    def histories(self, q: Array, v: Array) -> Histories:
+        """Return the conserved quantities at each row of q (N, nq) and v (N, nv)."""
+        model, data = self._model, self._data
+        rows, q = len(q), q.copy()
+        q[:, :7] -= self._start
+        energy, center = np.empty(rows), np.empty((rows, 3))
+        momentum, polar = np.empty((rows, 6)), np.empty(rows)
+        for i, (q_i, v_i) in enumerate(zip(q, v, strict=True)):
+            energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
+            pin.ccrba(model, data, q_i, v_i)
+            # Not CCRBA's own sum, which is taken about the origin and rounds more.
+            momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
+            center[i] = data.com[0]
+            polar[i] = 0.5 * np.trace(data.Ig.inertia) + self.mass * center[i].dot(center[i])
+            if self._stored:
+                momentum[i, 3:] += self._of_wheels()
+        sizes = np.sqrt(2.0 * energy[:, None] * np.column_stack((np.full(rows, self.mass), polar)))
+        if self._weight is not None:
+            energy -= (center + self._root.rotation @ self._start[:3]) @ self._weight
+        stiffness, _, rest = self._robot.springs
+        if stiffness.any():
+            positions = [[joint.value(q_i) for joint in self._robot.joints] for q_i in q]
+            energy += 0.5 * (np.array(positions) - rest) ** 2 @ stiffness
+        return Histories(energy, momentum, center, sizes)
+
+    def momentum_drift(self, history: Histories, expected: Array) -> Array:
+        """Return how far the momentum is off, relative to the largest there may be: (11.5)."""
+        scale = history.sizes.max(axis=0)
+        scale[1] += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
+        missing = self.about_point(history) - expected
+        sizes = np.linalg.norm(missing.reshape(-1, 2, 3), axis=2)
+        relative = np.divide(sizes, scale, out=np.zeros_like(sizes), where=scale > 0.0)
+        largest: Array = relative.max(axis=1)
+        return largest
+
+    def _of_wheels(self) -> Array:
+        """Return the stored momentum (3,) where the links were put last."""
+        total: Array = np.zeros(3)
+        for joint, stored in self._stored:
+            total += self._data.oMi[joint].rotation @ stored
+        return total
+
+    def _base(self, q: Array) -> pin.SE3:
+        """Return the placement of the base relative to the point."""
+        placement = _placement(q[:7] - self._start)
+        return placement if self._free else self._root * placement
+
+
+class MomentumReference:
+    """Momentum and centre of mass from the external impulse, step by step (11.2)."""
+
+    momentum: Array  # (6,) about the point
+    wrenches: tuple[Array, ...]  # (6,) of the stages of a step, about the point, to be written
+
+    def __init__(
+        self, conserved: Conserved, method: type[Integrator], h: float, q: Array, v: Array
+    ) -> None:
+        history = conserved.histories(q[None], v[None])
+        per_mass = 1.0 / conserved.mass
+        self.momentum = conserved.about_point(history)[0]
+        self._momentum, self._start = self.momentum, history.center[0]
+        # The line that is followed while nothing pushes: place and velocity.
+        self._line = np.column_stack((self._start, self.momentum[:3] * per_mass))
+        self._time = np.ones(2)
+        # The impulse, and the way that it makes besides that of the initial velocity, above the
+        # wrenches of a step. Where nothing pushes they stay zero, so that no rounding adds up.
+        self._stack = np.zeros((2 + len(method.weights), 6))
+        self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
+        weights, moments = h * np.array(method.weights), h * h * np.array(method.moments)
+        self._after = np.array([[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]])
+
+    def center(self, t: float) -> Array:
+        """Return the centre of mass (3,) relative to the point."""
+        self._time[1] = t
+        place: Array = self._line.dot(self._time)
+        return place
+
+    def advance(self) -> None:
+        """Go on by a step with the wrenches that have been written."""
+        self._sums[:] = impulse, way = self._after.dot(self._stack)
+        self.momentum = self._momentum + impulse
+        self._line[:, 0] = self._start + way[:3]
+
+
+class Jacobi(Conserved):
+    """Energy relative to the frame, and the work done on it in place of the impulse."""
+
+    def __init__(self, robot: Robot, start: Array, field: OrbitField) -> None:
+        super().__init__(robot, start)
+        self._field, self._scale = field, 0.0
+
+    def about_point(self, history: Histories) -> Array:
+        """Return zeros (N, 6), to which the work is added in the first place."""
+        return np.zeros_like(history.momentum)
+
+    def wrench(self, q: Array, push: Array) -> Array:
+        """Return the power (1,) and zeros (5,) of a plant's push."""
+        return push
+
+    def histories(self, q: Array, v: Array) -> Histories:
+        """Return energies at each row, with the gravity gradient and the rotating frame."""
+        found, potential = super().histories(q, v), np.empty(len(q))
+        for i, q_i in enumerate(q):
+            pin.forwardKinematics(self._model, self._data, q_i)
+            potential[i] = self._field.potential(self._data)
+        self._scale = float((np.abs(found.energy) + np.abs(potential)).max())
+        return found._replace(energy=found.energy + potential)
+
+    def momentum_drift(self, history: Histories, expected: Array) -> Array:
+        """Return how far the integral is from its first value and the work since, relative."""
+        missing = np.abs(history.energy - history.energy[0] - expected[:, 0])
+        return missing / (self._scale or 1.0)
+
+
+def conserved_by(robot: Robot, start: Array, field: OrbitField | None) -> Conserved:
+    """Return the conserved quantities of a robot's motion from a configuration (nq,)."""
+    return Conserved(robot, start) if field is None else Jacobi(robot, start, field)

@@ -14,7 +14,7 @@ from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing
 from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array
-from fflin.dynamics.state import moving_errors
+from fflin.dynamics.coordinates import moving_errors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -145,7 +145,7 @@ def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None
         _drifts(figure.add_subplot(spots[len(panels)]), motion)
         for axes in figure.axes:
             axes.margins(x=0.0)
-        figure.suptitle(_title(motion, rest), fontsize=11)
+        figure.suptitle(_title(motion), fontsize=11)
     return figure
 
 
@@ -162,9 +162,7 @@ def _selected(motion: Any, show: Any) -> tuple[dict[str, list[Curve]], dict[str,
     panels: dict[str, list[Curve]] = {}
     for curve in curves(motion, wheels):
         if curve.key in keys and curve.group in _GROUPS:
-            # With a reference, the prediction is drawn among the errors.
-            linear = None if motion.tracked else curve.linear
-            states.setdefault(curve.group, []).append(curve._replace(linear=linear))
+            states.setdefault(curve.group, []).append(curve)
         elif curve.key in keys:
             panels.setdefault(_panel_of(curve, wheels), []).append(curve)
     for title in _WHEELS.values():  # come last
@@ -198,14 +196,12 @@ def _draw_panels(
         _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
 
 
-def _title(motion: Any, rest: float | None) -> str:
+def _title(motion: Any) -> str:
     parts = [f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"]
     if motion.linear is not None:
         parts.append("solid: nonlinear, dashed: linear")
     for name, start in zip(motion.phases[1:], motion.starts[1:], strict=True):
         parts.append(f"{name} at {start:g} s")
-    if rest is not None:
-        parts.append(f"reference at rest from {rest:.4g} s")
     return "; ".join(parts) + (f"\n{motion.stopped}" if motion.stopped else "")
 
 
@@ -224,11 +220,10 @@ def _errors(motion: Any) -> tuple[str, dict[str, Curve]]:
     rows, what = [], "error"
     if motion.tracked:
         units = ("deg",) * 3 + units[3:]
-        for x in (motion.x,) if linear is None else (motion.x, linear):
-            e = moving_errors(motion.frame, x, motion.target)
-            sines = np.minimum(1.0, np.linalg.norm(e[:, :3], axis=1, keepdims=True))
-            e[:, :3] *= np.degrees(2.0 / np.sinc(np.arcsin(sines) / np.pi))
-            rows.append(e.T)
+        e = moving_errors(motion.frame, motion.x, motion.target)
+        sines = np.minimum(1.0, np.linalg.norm(e[:, :3], axis=1, keepdims=True))
+        e[:, :3] *= np.degrees(2.0 / np.sinc(np.arcsin(sines) / np.pi))
+        rows = [e.T]
     elif linear is not None:
         what, rows = "difference", [(motion.x - linear).T]
     none = np.zeros(0)
@@ -245,9 +240,8 @@ def _draw(
     **look: Any,
 ) -> None:
     """Draw curves over their pale references, predictions dashed on top, and limits."""
-    near = None
     if found[0].group == "q_b":
-        found, near = _with_gaps(found)
+        found = _with_gaps(found)
     full = title and found[0].group not in _GROUPS and title not in _WHEELS.values()
     for own, curve in zip(cycle(len(found)), found, strict=True):
         color = (colors or {}).get(curve.short, own)
@@ -257,9 +251,6 @@ def _draw(
         axes.plot(t, curve.values, color=color, label=label, **look)
         if curve.linear is not None:
             axes.plot(t, curve.linear, color=color, **_DASHED)
-        if curve.reference is not None:
-            band = curve.reference, curve.values
-            axes.fill_between(t, *band, where=near, color=color, alpha=0.25, lw=0.0)
     levels = sorted({level for curve in found for level in curve.near})
     for level in levels:
         label = "limit" if level == levels[-1] else "_limit"
@@ -268,20 +259,15 @@ def _draw(
     axes.set(title=title, xlabel="t [s]", ylabel=units and f"[{units}]")
 
 
-def _with_gaps(found: Sequence[Curve]) -> tuple[list[Curve], Array | None]:
-    """Return attitudes with gaps at 180 degrees, and where a band joins them to the reference.
-
-    At 180 degrees the vector part of a unit quaternion changes its sign.
-    """
-    fields = ("values", "linear", "reference")
-    given = [name for name in fields if getattr(found[0], name) is not None]
-    rows = {name: np.array([getattr(each, name) for each in found]) for name in given}
-    near = (rows["values"] * rows["reference"]).sum(axis=0) >= 0.0 if "reference" in rows else None
-    for each in rows.values():
-        jumps = (each[:, 1:] * each[:, :-1]).sum(axis=0) < -0.5
-        each[:, 1:][:, jumps] = np.nan
-    broken = [{name: rows[name][i] for name in given} for i in range(len(found))]
-    return [each._replace(**row) for each, row in zip(found, broken, strict=True)], near
+def _with_gaps(found: Sequence[Curve]) -> list[Curve]:
+    """Return attitudes with gaps at 180 degrees, where the quaternion changes its sign."""
+    broken = list(found)
+    for field in ("values", "linear", "reference"):
+        if getattr(found[0], field) is not None:
+            rows = np.array([getattr(each, field) for each in found])
+            rows[:, 1:][:, (rows[:, 1:] * rows[:, :-1]).sum(axis=0) < -0.5] = np.nan
+            broken = [c._replace(**{field: row}) for c, row in zip(broken, rows, strict=True)]
+    return broken
 
 
 def _named(axes: Axes) -> dict[str, Line2D]:

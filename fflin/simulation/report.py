@@ -172,7 +172,8 @@ class ErrorHistory(NamedTuple):
         """Return its row of the table."""
         values = (self.size[0], self.size.max(), self.size[-1])
         cells = ["." if value < _NOTHING else f"{value:.3g}" for value in values]
-        when = "not yet" if self.late else f"{t[self.settled]:.3g}"
+        not_yet = "not yet" if self.steered else "not controlled"
+        when = not_yet if self.late else f"{t[self.settled]:.3g}"
         if self.size.max() <= THERE:
             when = "."
         return [self.title, self.unit, *cells, when]
@@ -304,7 +305,7 @@ def courses(motion: Any) -> list[ErrorHistory]:
     found = [ErrorHistory("attitude", "deg", motion.attitude_error, attitude)]
     for of, at in columns.items():
         fed_back = any(motion.state_names[i] in steered for i in at)
-        fed_back &= of[0] != "position" or pushed(motion)
+        fed_back &= of[0] not in ("position", "v_b") or pushed(motion)
         found.append(ErrorHistory(*of, sizes[:, at].max(axis=1), fed_back))
     return found
 
@@ -330,6 +331,9 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
     elif moved:
         when = motion.t[max(kind.settled for kind in moved)]
         said = f"settled after {when:.3g}\u00a0s to within {100.0 * SETTLED:g}\u00a0%"
+        if late := [kind.last for kind in kinds if kind.late and kind.steered]:
+            what = "positions" if judged[0].title in _PLACES else "rates"
+            said = f"{what} {said}; not yet: {_and(late)}"
     else:
         said = "settled: at the target throughout the run"
     aside = {k.title: k.last for k in places if k.late and not k.steered}

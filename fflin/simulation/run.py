@@ -12,9 +12,8 @@ from fflin.base.validation import Array
 from fflin.control.channel import Channel
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.kernel.loop import StopConditions, goes_on
-from fflin.simulation.conservation import Conserved, MomentumReference
 from fflin.simulation.plan import Plan
-from fflin.simulation.plant import Plant
+from fflin.simulation.plant import Conserved, MomentumReference, Plant
 from fflin.simulation.times import LARGEST_TURN
 
 # Take one step from (t, q, v) under u as it begins; return q and v at its end.
@@ -152,7 +151,7 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
         dt, turn = plan.times.dt, float(np.abs(v[plan.turning]).max()) * plan.times.dt
         detail = f": a joint or the base rotates by {turn:.2g} rad per step"
         known = LARGEST_TURN <= turn <= _LARGEST_SAID
-        return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}"
+        return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}; give a smaller dt"
 
     return ending
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,14 +10,14 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.control.policies import Policy, StateFeedback
-from fflin.dynamics.state import Frame, state_history
+from fflin.dynamics.coordinates import state_history
+from fflin.dynamics.state import Frame
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
-from fflin.simulation.compiled import carried_out, engine_of
-from fflin.simulation.conservation import conserved_by
+from fflin.simulation.lanes import carried_out, engine_of
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions, planned
-from fflin.simulation.plant import Disturbance, Plant
+from fflin.simulation.plant import Conserved, Disturbance, Plant, conserved_by
 from fflin.simulation.prediction import predict
 from fflin.simulation.run import Recording
 
@@ -26,11 +25,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fflin.control.gain_schedule import GainSchedule
-
-# A step that was chosen here is divided by this if the motion diverges, up to so many times, while
-# the runs that diverged took less than so many times the steps of the first one, and while the next
-# one takes no more than so many steps.
-_FINER, _MOST_FINER, _MOST_SPENT, _MOST_STEPS = 4, 3, 4, 10_000_000
 
 
 def simulate(
@@ -91,12 +85,9 @@ def simulate(
         Simulated time [s]; by default the duration of the followed trajectory.
     dt : float, optional
         Step [s]; by default 0.01, or less if the loop's fastest pole or the samples require a
-        shorter step. If the default step diverges, the simulation is repeated with a quarter of
-        it, up to three times, and `Motion.notes` report this. A simulation with an event, a
-        callback, a disturbance or a custom Python policy is not repeated, because such a function
-        may have an internal state. For continuous policies without delay, the step is adjusted to
-        divide the duration.
-    method : {"cf4", "rkmk4", "semi_implicit_euler"}
+        shorter step. For continuous policies without delay, the step is adjusted to divide the
+        duration.
+    method : {"cf4", "semi_implicit_euler"}
     project : bool
         Whether the projection after each step restores momentum and centre of mass.
     sample : float, optional
@@ -126,9 +117,9 @@ def simulate(
         Function callback(t, q, v, u), called at every recorded row.
     linear : LinearModel or bool, optional
         Model that predicts the motion under the same control law; by default the policy's own
-        model, False for no prediction. A motion can be predicted for a StateFeedback, a feedback
-        along a trajectory, an OutputFeedback or LinearController (without its noise), or no policy.
-        For a sampled law, every recorded row must fall on a sample.
+        model, False for no prediction. A motion can be predicted for a StateFeedback, an
+        OutputFeedback or LinearController (without its noise), or no policy.
+        A sampled model that was read from a file predicts nothing.
     target : LinearModel or array_like (nx,), optional
         Target state from which errors are measured, or a model whose operating point is the
         target. By default the operating point of the policy's own model, or the followed
@@ -208,41 +199,20 @@ def simulate(
         progress=progress,
     )
     plan, plant = planned(robot, policy, options)
-    # A function of the caller's may remember what it was called with.
-    again = dt is None and plan.repeatable and disturbance is None
-    most, spent, coarse = _MOST_SPENT * plan.times.steps, 0, list[str]()
     try:
-        while True:
-            conserved = conserved_by(plant.robot, plan.q, plant.field)
-            run = carried_out(plan, plant, conserved, engine_of(engine, plan, plant))
-            spent += run.steps
-            last = len(coarse) == _MOST_FINER or spent > most
-            last = last or _FINER * plan.times.steps > _MOST_STEPS
-            if not again or last or not run.stopped.startswith("diverged"):
-                break
-            coarse.append(f"{plan.times.dt:g}")
-            finer, every = plan.times.dt / _FINER, plan.times.every * _FINER
-            plan, plant = planned(robot, policy, replace(options, dt=finer, every=every))
-        motion = motion_of(plan, plant, run.engine, run)
+        conserved = conserved_by(plant.robot, plan.q, plant.field)
+        run = carried_out(plan, plant, conserved, engine_of(engine, plan, plant))
+        return motion_of(plan, plant, conserved, run)
     except MemoryError:
         raise InputError(
             f"{plan.times.rows} rows of '{robot.name}' exceed the available memory; take a larger "
             "dt or `every`"
         ) from None
-    if not coarse:
-        return motion
-    note = f"the simulation diverges in steps of {', '.join(coarse)} s"
-    if not motion.stopped:
-        note += f" and was repeated in steps of {plan.times.dt:g} s; check its accuracy with a "
-        note += "smaller dt (--step)"
-    return replace(motion, notes=(*motion.notes, note))
 
 
-def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = None) -> Motion:
-    """Return the motion of a plan, or of a given run of the plan."""
+def motion_of(plan: Plan, plant: Plant, conserved: Conserved, run: Recording) -> Motion:
+    """Return the motion of a run of a plan."""
     state, robot = plant.state, plant.robot
-    conserved = conserved_by(robot, plan.q, plant.field)
-    run = run or carried_out(plan, plant, conserved, engine)
     if plant.field and not run.stopped:
         plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
     x = state_history(state, run.q, run.v, plan.near, run.t)
@@ -255,7 +225,7 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         **{name: getattr(run, name) for name in ("t", "q", "v", "u", "stopped", "engine")},
         x=x,
         target=target,
-        prediction=predict(plan, x, run.steps, target),
+        prediction=predict(plan, x, run.steps),
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
         momentum_drift=conserved.momentum_drift(history, run.momentum),

@@ -11,8 +11,8 @@ from fflin.base.validation import Array, number, whole
 from fflin.control.linear_controller import LinearController, closed_loop
 from fflin.control.policies import StateFeedback, decider, fed_back
 from fflin.control.tracking import TrajectoryFeedback, largest_rate, tracking_of
+from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.state import StateMap
-from fflin.linear.sampling import held_exponential
 from fflin.robot.robot import Robot
 
 # Of a run whose duration is not given [s], and between looks at the linear loop.
@@ -22,7 +22,6 @@ _STEP = 0.01  # [s]
 _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
 _MANY_STEPS, _ENDLESS = 50_000, 10_000_000  # half a minute, and some hours that nobody asked for
 _MANY_ROWS, _FEW_ROWS = 100_000, 10_000  # that nobody reads, and that a page or a plot shows
-_ALIKE = 1e-3  # parts in a mode, relative, of which the first is named
 _FOREVER = 1e100  # [s]; the square of its inverse is still a number
 
 
@@ -35,7 +34,6 @@ class Times(NamedTuple):
     sample: int  # between samples of the law; 0 where it is asked at every stage of every step
     delay: int  # from a sample to its effect
     fastest: float  # magnitude of the loop's poles [1/s]; 0 where it is not known
-    mode: str  # the state that moves most at that pole, where it asks for a small step
     thinned: bool  # whether `every` was chosen here
 
     @property
@@ -72,25 +70,15 @@ class Times(NamedTuple):
                 f"{asked if forced else ''} are "
                 f"{self.steps:.3g} steps and {self.rows:.3g} rows, which is too many; use a larger "
                 "dt or `every`"
-                f"{self._moving if forced else ''}"
             )
         if forced and self.steps > _MANY_STEPS:
             warnings.warn(
                 f"the simulation takes long: the loop's fastest pole at {self.fastest:.3g} 1/s "
                 f"requires {self.steps:,} steps of {self.dt:.3g} s; give dt=, sample= or a slower "
-                "gain"
-                f"{self._moving}",
+                "gain",
                 FflinWarning,
                 stacklevel=3,
             )
-
-    @property
-    def _moving(self) -> str:
-        return (
-            f"; {self.mode} is the largest state in the eigenvector of this pole"
-            if self.mode
-            else ""
-        )
 
 
 def times_of(
@@ -109,7 +97,7 @@ def times_of(
         by = decider(policy)
         made = by if hasattr(by, "dt") else getattr(policy, "lin", None)
         sample = getattr(follows.schedule if follows else made, "dt", None) or None
-    fastest, mode = (0.0, "") if sample else _fastest_pole(policy, follows)
+    fastest = 0.0 if sample else _fastest_pole(policy, follows)
     if duration is None and follows is None:
         raise InputError("the duration is missing; give duration= in s")
     duration = _positive("duration", follows.duration if follows and duration is None else duration)
@@ -143,7 +131,7 @@ def times_of(
     thinned = every is None and steps > _MANY_ROWS
     if every is None:
         every = _thinning(steps, samples) if thinned else 1
-    return Times(dt, steps, every, samples, late, fastest, mode, thinned)
+    return Times(dt, steps, every, samples, late, fastest, thinned)
 
 
 def _thinning(steps: int, sample: int) -> int:
@@ -154,22 +142,14 @@ def _thinning(steps: int, sample: int) -> int:
     return next(part for part in range(least, sample + 1) if sample % part == 0)
 
 
-def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> tuple[float, str]:
-    """Return the largest magnitude [1/s] of a continuous loop's poles, and the state that moves."""
+def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> float:
+    """Return the largest magnitude [1/s] of a continuous loop's poles; 0 if it is not known."""
     if follows is not None:
-        return largest_rate(follows.schedule), ""
+        return largest_rate(follows.schedule)
     closed = closed_loop(policy)
     if closed is None or closed[1]:
-        return 0.0, ""
-    loop, _, names = closed
-    fastest = float(np.abs(np.linalg.eigvals(loop)).max())
-    if fastest * _STEP <= 1.0:
-        return fastest, ""
-    from scipy.linalg import eig
-
-    poles, left, right = eig(loop, left=True, right=True)
-    parts = np.abs(left * right)[:, np.abs(poles).argmax()]
-    return fastest, names[int(np.argmax(parts > (1.0 - _ALIKE) * parts.max()))]
+        return 0.0
+    return float(np.abs(np.linalg.eigvals(closed[0])).max())
 
 
 def _whole(dt: float, **times: float) -> list[int]:

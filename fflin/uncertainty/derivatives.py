@@ -18,17 +18,15 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.chart import Standing
-from fflin.dynamics.inertia import Inertia
-from fflin.dynamics.names import LINEAR, PIN_ANGULAR
+from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, Standing
+from fflin.dynamics.integrators import held_derivatives, held_exponential
 from fflin.dynamics.orbital import GravityGradient, field_of
-from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
+from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
 from fflin.dynamics.state import StateMap
-from fflin.linear.certificate import aba_route
 from fflin.linear.linearization import Prepared, own_reference, prepare
 from fflin.linear.model import LinearModel
-from fflin.linear.sampling import held_derivatives, held_exponential
 from fflin.linear.state_equations import assemble, output_equations
+from fflin.linear.verification import aba_route
 from fflin.robot.joints import ROOT
 from fflin.robot.outputs import CenterOfMass, Momentum
 from fflin.robot.robot import Robot

@@ -10,7 +10,7 @@ import pinocchio as pin
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.robot.equipment.wheels import turned_to
+from fflin.robot.equipment.mounting import turned_to
 from fflin.robot.inputs import Thruster, named_wheels
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot

@@ -18,7 +18,7 @@ import umsgpack
 
 from fflin.base.tables import counted
 from fflin.base.validation import Array
-from fflin.dynamics.names import frame_of
+from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.orbital import field_of
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot

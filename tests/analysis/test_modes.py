@@ -243,7 +243,7 @@ def test_null_space_thrust_on_moving_links_is_seen_to_be_unstable(capsys):
     robot = arm.replace(inputs=[tip, elbow, *arm.inputs])
     q = fflin.configuration(robot, {"joint_2": 0.6, "joint_4": -0.8, "joint_5": 0.5})
     thrust = np.array([12.0, 5.0])
-    linearizer = fflin.Linearizer(robot, engine="python")
+    linearizer = fflin.Linearizer(robot)
     B = linearizer(q).M @ linearizer(q).B[6 + robot.n :]
     u = np.concatenate((thrust, -B[:, :2] @ thrust))
     lin = linearizer(q, None, u)

@@ -213,17 +213,14 @@ def test_joints_that_are_rotors_stay_joints():
 @pytest.mark.parametrize("name, J", [("servicer_7dof", 0.4), ("cubesat", 1e-5), ("ets_vii", 0.5)])
 @pytest.mark.parametrize("speed", [1.0, 4000.0])
 @pytest.mark.parametrize("net", [True, False])
-@pytest.mark.parametrize("engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)])
-def test_what_rounding_leaves_of_a_spin_is_no_spring_in_either_engine(engine, name, J, speed, net):
+def test_what_rounding_leaves_of_a_spin_is_no_spring(name, J, speed, net):
     """Balanced wheels and others: the reduction keeps as many states as at rest."""
-    if engine == "compiled":
-        pytest.importorskip("numba")
     bare = fflin.load(name)
     axes = [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]  # whose sum is zero
     ship = bare.replace(inputs=[*motors(bare), *wheels(axes, J)])
     rng = np.random.default_rng(3)
     speeds = {f"wheel_{k + 1}": speed * (1.0 + k * net) for k in range(4)}
-    linearizer = fflin.Linearizer(ship, engine=engine)
+    linearizer = fflin.Linearizer(ship)
     for _ in range(3):
         q = fflin.configuration(ship, {joint: rng.normal() for joint in bare.joint_names})
         still, spun = (linearizer(q, v) for v in (None, fflin.velocity(ship, speeds)))

@@ -10,7 +10,7 @@ import fflin
 from fflin.campaign.pointing import turned
 from fflin.campaign.report import worst_runs
 from fflin.campaign.runs import ARRAYS, CampaignJob
-from fflin.robot.equipment.wheels import turned_to
+from fflin.robot.equipment.mounting import turned_to
 from tests.support import policies
 from tests.support.campaigns import both
 from tests.support.robots import BUNDLED, free_body
@@ -26,7 +26,10 @@ DRAWN = {
     policies.followed: {"q_b": 0.05},
     policies.followed_outputs: {"q_b": 0.05, "*.noise": (1e-4, 1e-3), "*.sensor": 1e-3},
     policies.between_gains: {"q_m.*": 0.2},
-    policies.shared: {"q_b": 0.05, "jet_*.misalignment": 0.1, "delay": 0.05},
+    policies.shared: {
+        **{"q_b": 0.05, "jet_*.misalignment": 0.1, "delay": 0.05},
+        **{"q_b.sensor": 0.01, "omega_b.noise": 1e-3},
+    },
 }
 
 
@@ -39,7 +42,7 @@ def test_lanes_fly_every_policy(robots, name, make):
     robot, policy, options = make(policies.plain(robots[name]))
     options = {key: value for key, value in options.items() if key not in ("linear", "x0")}
     sample = {"sample": 0.1} if make is policies.state else {}
-    case = {"dt": 0.02, "duration": 1.0, "method": "rkmk4"} | options | sample
+    case = {"dt": 0.02, "duration": 1.0, "method": "cf4"} | options | sample
     drawn = DRAWN[make] | {"base.mass": 0.1}
     tolerance = 1e-8 if make is policies.shared else 1e-10
     both(robot, policy, drawn, tolerance=tolerance, **case)
@@ -109,6 +112,27 @@ def turned_by_noise(engine, size=0.05, **more):
     policy = fflin.StateFeedback(fflin.linearize(robot), K)
     options = {"duration": 40.0, "dt": 0.1, "sample": 0.2, "engine": engine, "runs": 20}
     return fflin.monte_carlo(robot, policy, {"omega_b.x.noise": size}, **(options | more))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_sensor_errors_act_on_the_policy_that_an_allocation_realises(engine):
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    robot = free_body((2.0, 3.0, 4.0)).replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.acceleration_lqr(lin, 0.04, 0.2, 1.0).K)
+    given = {"q_b.x.sensor": (0.02, 0.03), "omega_b.noise": 1e-3}
+    run = {"runs": 3, "duration": 60.0, "dt": 0.1, "sample": 0.2, "engine": engine}
+    ends = [
+        fflin.monte_carlo(robot, each, given, **run)
+        for each in (policy, fflin.Allocation(policy, robot))
+    ]
+    # The attitude that is read as zero is minus the error of the sensor.
+    offset = ends[0].values("drawn q_b.x.sensor")
+    np.testing.assert_allclose(ends[0].values("q_b.x"), -offset, atol=4e-3)
+    np.testing.assert_allclose(ends[1].x, ends[0].x, rtol=0, atol=1e-9)
+    replayed = ends[1].replay(1)
+    assert np.array_equal(replayed.q[-1], ends[1].q[1]) and len(replayed.target)
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -17,8 +17,9 @@ from scipy import stats
 from scipy.linalg import expm
 
 import fflin
-from fflin.campaign.report import worst_runs
+from fflin.campaign.report import influences, worst_runs
 from fflin.campaign.runs import ARRAYS, CampaignJob
+from fflin.campaign.statistics import KINDS
 from fflin.simulation.report import courses
 from tests.support.campaigns import both
 from tests.support.measured import FELT, POSITIONS, designed
@@ -433,6 +434,8 @@ def test_its_tables_have_every_figure_with_its_unit(tmp_path):
     campaign = fflin.monte_carlo(robot, policy, given, **options)
     for ending in ("csv", "mat"):
         campaign.save(tmp_path / f"runs.{ending}")
+    with pytest.raises(fflin.FileError, match="expected one of"):
+        fflin.Campaign.load(tmp_path / "runs.csv")
     names, *rows = csv.reader((tmp_path / "runs.csv").read_text().splitlines())
     saved = scipy.io.loadmat(tmp_path / "runs.mat", simplify_cells=True)
     assert saved["columns"].tolist() == names
@@ -478,9 +481,6 @@ def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
         assert errors[: len(rows), 1] == pytest.approx(sizes, abs=1e-12)
         assert np.array_equal(inputs[: len(rows)], motion.u[rows])
         assert np.isposinf(errors[len(rows) :]).all() and not inputs[len(rows) :].any()
-        [way] = campaign.courses([run], 10)
-        assert np.array_equal(way[:-1], motion.q[::20][: len(way) - 1])
-        assert np.array_equal(way[-1], campaign.q[run])
 
 
 @pytest.mark.compiled
@@ -489,6 +489,9 @@ def test_goals_are_told_and_say_what_the_worst_is(robots):
     goals = ["position < 1 mm and settle < 5 s", "attitude > 0 deg"]
     case = {"runs": 30, "duration": 6.0, "dt": 0.02, "goals": goals, "confidence": 0.9}
     campaign = fflin.monte_carlo(robot, feedback(robot), START, until="attitude < 2 deg", **case)
+    of = ["position", "settle", "attitude", "worst attitude", "worst position"]
+    assert [*influences(campaign)] == of
+    assert "rank correlations with position: " in str(campaign)
     assert campaign.goals == (*goals, "attitude < 2 deg") and campaign.about == "position"
     assert campaign.worst(1) == [int(campaign.values("position").argmax())]
     share = campaign.fraction("attitude < 2 deg", confidence=0.9)
@@ -516,11 +519,17 @@ def test_the_time_to_settle_is_that_of_the_motions_table(robots):
     )
     for run in range(3):
         motion = campaign.replay(run)
-        for course in courses(motion):
-            if course.title in ("attitude", "position", "joints"):
-                when = np.inf if course.late else motion.t[course.settled]
-                found = campaign.values(f"settle {course.title}")[run]
-                assert found == pytest.approx(when, rel=1e-12), course.title
+        made = {course.title: course for course in courses(motion)}
+        # A motion and a campaign call the kinds of error by the same names.
+        assert [*made] == [*KINDS]
+        for title, course in made.items():
+            when = np.inf if course.late else motion.t[course.settled]
+            found = campaign.values(f"settle {title}")[run]
+            assert found == pytest.approx(when, rel=1e-12), title
+    for former, name in (("turning", "omega_b"), ("moving", "v_b"), ("rates", "joint rates")):
+        for of in ("", "worst ", "settle "):
+            assert np.array_equal(campaign.values(of + former), campaign.values(of + name))
+        assert campaign.met(f"worst {former} < 1").all()
     assert np.isfinite(campaign.values("settle")).any()
 
 

@@ -9,8 +9,8 @@ import pytest
 import fflin
 from fflin.campaign.runs import CampaignJob
 from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, kinds_of, marks_of, outcome_of
-from fflin.dynamics.state import attitude_errors, moving_errors, states_of, unwound
-from fflin.kernel.statistics import note
+from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
+from fflin.kernel.loop import take
 from fflin.kernel.tree import LANES
 from fflin.simulation.report import DWELL, SETTLED, THERE
 from fflin.simulation.run import Recording
@@ -96,7 +96,7 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
         marks = as_lists(marks_of(job.plan, state, target, job.steps, path))
         rows = np.hstack((q, nu, u, np.zeros((STEPS, 9))))
         for first, last in itertools.pairwise((0, 1, 33, STEPS)):
-            note(marks, rows[first:last].ravel().tolist(), first, last - first)
+            take(marks, rows[first:last].ravel().tolist(), first, last - first)
         expected = defined(job, target, q, nu, u, 0.0)
         settled = (np.array(marks.outside) + 1.0) * 0.01
         settled[settled > 0.01 * (1.0 - DWELL) * STEPS] = np.inf

@@ -24,7 +24,7 @@ from fflin.batch.run import executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.settling import Loop, settling_runs
 from fflin.campaign.validity import _LEVELS, _crossing, _slope
-from fflin.simulation.conservation import Conserved
+from fflin.simulation.plant import Conserved
 from fflin.simulation.run import go
 from tests.support.commands import refused, run
 from tests.support.messages import any_wording, says

@@ -45,7 +45,7 @@ def interrupted(command, instant, folder):
                 own = line[max(0, line.find("fflin: ")) :]
                 if own.strip() and not own.startswith("import time:"):
                     said.append(own)
-                seen = 0 if line.endswith(" fflin.commands.interruption\n") else seen + 1
+                seen = 0 if line.endswith(" fflin.commands\n") else seen + 1
                 if seen == instant:
                     with suppress(ProcessLookupError):
                         os.killpg(process.pid, signal.SIGINT)
@@ -82,7 +82,7 @@ def test_it_ends_every_command_at_every_instant(name, instant, tmp_path):
 
 LOSING = """
 import os, signal, sys, weakref
-from fflin.commands.interruption import leave, listen
+from fflin.__main__ import leave, listen
 
 class Thing:
     pass
@@ -131,7 +131,7 @@ def test_it_is_not_lost_in_callbacks_and_imports(where, tmp_path):
 
 @pytest.mark.process
 def test_where_it_is_ignored_it_stays_so():
-    program = "import signal; from fflin.commands.interruption import listen; listen()\n"
+    program = "import signal; from fflin.__main__ import listen; listen()\n"
     program += "raise SystemExit(signal.getsignal(signal.SIGINT) is not signal.SIG_IGN)"
     done = finished(
         [sys.executable, "-c", program],

@@ -76,7 +76,6 @@ def test_the_former_names_of_the_time_steps_still_work(tmp_path, capsys):
                 *words,
                 "-o",
                 "m.npz",
-                "--force",
                 cwd=tmp_path,
             )[0]
             == 0

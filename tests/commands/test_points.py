@@ -109,7 +109,7 @@ def test_a_gain_holds_the_base_at_the_target(sat):
     assert motion.attitude_error[0] == pytest.approx(10.0)
     x = dict(zip(motion.state_names, motion.x[0] - motion.target, strict=True))
     assert abs(x["r_b.z"]) < 1e-12 and x["q_m.joint_2"] == 0.0
-    world = ("--reference", "world", "-o", "gain.npz", "--force")
+    world = ("--reference", "world", "-o", "gain.npz")
     assert run("lqr", "sat.toml", *world, cwd=sat)[0] == 0
     assert simulated(sat, "--gain", "gain.npz").attitude_error[0] == pytest.approx(10.0)
     options = ("--gain", "gain.npz", "--target-rpy", 0, 0, 1)

@@ -85,32 +85,10 @@ def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
         assert motion.attitude_error[0] == pytest.approx(20.0)
         assert motion.attitude_error[-1] < 0.1
         settled.append(motion.t[motion.attitude_error > 0.4].max())
-        assert says(done.stderr, "pull", "100.0 %") if option else not done.stderr
+        assert says(done.stderr, "pull", "cut at zero") if option else not done.stderr
     # Half of what the thrusters were to give was cut; the wheels gave their part.
     assert settled[1] < 0.85 * settled[0]
     assert "--allocate" in refused("simulate", "ets_vii", "--allocate")
-
-
-@pytest.mark.process
-def test_the_share_of_cut_thrust_is_that_of_the_motion(tmp_path):
-    done = finished(
-        [
-            *(sys.executable, "-m", "fflin", "simulate", "servicer_7dof"),
-            *("--inputs", "servicer_7dof", "--position", "-0.3", "0", "0", "--damping", "5"),
-            *("--stiffness", "panel_left=100", "--stiffness", "panel_right=100"),
-            *("--duration", "10", "-o", "m.npz", "--no-allocate"),
-        ],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-    )
-    assert done.returncode == 0
-    motion = fflin.Motion.load(tmp_path / "m.npz")
-    back = [i for i, name in enumerate(motion.input_names) if name.startswith("back_")]
-    share = 100.0 * (motion.u[:-1, back] == 0.0).any(axis=1).mean()
-    assert 5.0 < share < 95.0 and abs(share - 50.0) > 2.0  # forward first, then braking
-    told = float(re.search(r"([\d.]+) % of the run", done.stderr)[1])
-    assert told == pytest.approx(share, abs=0.1)
 
 
 def test_the_linear_model_is_shown_between_samples_and_inputs_stay_with_their_units(tmp_path):
@@ -180,7 +158,6 @@ def test_a_run_that_is_interrupted_takes_no_earlier_files_place(tmp_path, interr
     path, page, new = tmp_path / "m.npz", tmp_path / "m.html", tmp_path / "m.png"
     path.write_text("earlier")
     command = ["simulate", "cubesat", "--duration", "1", "-o", str(path), "--plot", str(new)]
-    command.append("--force")  # replaces what is no motion, but only by a run that ended
     with pytest.raises(KeyboardInterrupt) as caught:
         cli.main(command)
     assert says(str(caught.value), "t = 0.5 s", str(path))
@@ -216,7 +193,7 @@ def test_a_free_robot_keeps_its_energy():
 
 def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
     err = refused("simulate", "ets_vii", "--inputs", "joints", "--duration", 1)
-    assert "base attitude" in err
+    assert "angular momentum" in err
     assert "--reduce" in err
     code, out, _ = run(
         *("simulate", "ets_vii", "--inputs", "joints", "--reduce", "--joint", "joint_1=0.3"),

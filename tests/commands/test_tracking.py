@@ -173,7 +173,7 @@ def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
         (("--offset", "yaw=1", "--offset", "q_b.x=0.1"), "q_b"),
         (("--offset", "q_b=0.8"), "1.39"),
         (("--offset", "jaw=1"), "'jaw'"),
-        (("--schedule", "other.npz"), "other.npz"),
+        (("--schedule", "other.npz"), "--trajectory"),
         (("--schedule", "other.npz", "--q", "q_b=1"), "--schedule"),
         (("--allocate",), "thrusters"),
     ],

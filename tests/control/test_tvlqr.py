@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 import fflin
 from fflin.control.optimal.differential_riccati import Coefficients, Passage, passage, solve_back
-from fflin.linear.sampling import GAUSS
+from fflin.dynamics.integrators import GAUSS
 from tests.support.messages import says
 from tests.support.motions import motion
 
@@ -74,7 +74,7 @@ def test_double_integrators_have_the_closed_form():
         # Within the 1e-7 that interpolation is held to.
         assert schedule.cost_to_go(t) == pytest.approx(expected, abs=3e-7 * np.abs(expected).max())
         K = np.linalg.solve(R, lin.B.T @ expected)
-        assert schedule(t) == pytest.approx(K, abs=1e-6 * np.abs(K).max())
+        assert schedule.gain(t) == pytest.approx(K, abs=1e-6 * np.abs(K).max())
     assert schedule.P[0] == pytest.approx(
         np.linalg.inv(
             (np.eye(12) - 5 * lin.A) @ np.linalg.inv(Qf) @ (np.eye(12) - 5 * lin.A).T
@@ -201,7 +201,7 @@ def test_held_inputs_have_the_cost_that_is_promised_and_no_other_is_less(tumblin
     Q, R = weights(traj)
     schedule = fflin.tvlqr(traj, Q, R, 3.0, sample=0.1)
     assert (schedule.dt, len(schedule.t), schedule.residual < 1e-12) == (0.1, 21, True)
-    linearizer = fflin.Linearizer(robot, moving=True, engine="python")
+    linearizer = fflin.Linearizer(robot, moving=True)
     e = np.random.default_rng(0).normal(size=len(Q))
 
     def cost(gain):
@@ -354,7 +354,7 @@ def test_models_between_knots_are_computed_in_batches(moving, monkeypatch, sampl
         monkeypatch.setattr(fflin.Linearizer, name, counted)
     Q, R = weights(moving)
     fflin.tvlqr(moving, Q, R, 1.0, sample=sample)
-    assert 2 <= len(calls) < 20
+    assert 2 <= len(calls) < len(moving.t)
 
 
 def test_asking_for_a_gain_solves_nothing(moving, monkeypatch):

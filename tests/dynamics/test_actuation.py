@@ -275,7 +275,7 @@ def test_bad_fields_are_told():
         "'urdf'": {"damping": "yes"},
         "gravity": {"gravity": 9.81},
         "rest position": {"rest": 1.0},
-        "differentiable": {"friction": "urdf"},
+        "'friction'": {"friction": "urdf"},
         "'stifness'": {"stifness": 1},
     }
     for words, fields in cases.items():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fflin.base.rotation import rotation_matrix, skew
-from fflin.dynamics.chart import Chart, Standing
+from fflin.dynamics.coordinates import Chart, Standing
 
 SHAPES = [(), (4,)]
 

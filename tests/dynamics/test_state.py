@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.dynamics.chart import Chart
+from fflin.dynamics.coordinates import Chart
 from tests.support.robots import BUNDLED, FRAMES, random_point, random_pose, random_tree
 
 

@@ -153,7 +153,7 @@ def test_processes_compile_one_at_a_time_and_a_killed_one_leaves_no_lock(tmp_pat
 def test_one_set_of_machine_code_serves_every_robot_policy_and_option(robots, name):
     """Motions and campaigns under every policy, with limits, wheels, pulses, samples and faults."""
     advance = kernel_code.kernel("loop", "advance")
-    take = kernel_code.kernel("statistics", "take")
+    take = kernel_code.kernel("loop", "take")
 
     for make in POLICIES:
         if make is between_gains and not robots[name].n:

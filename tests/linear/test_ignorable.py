@@ -1,7 +1,5 @@
 """Relative equilibria: what may move while the linear model stays as it is."""
 
-import json
-
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -208,36 +206,6 @@ def test_files_keep_what_is_ignorable(ending, moving, tmp_path):
             assert (loaded.drift == lin.drift).all()
         else:
             assert loaded.drift is None
-
-
-def test_files_from_before_are_read(tmp_path):
-    """Nothing is ignorable in them."""
-    robot = wheeled()
-    lin = fflin.linearize(robot, None, fflin.velocity(robot, {"wheel": 5.0}))
-    for ending in (".json", ".npz", ".mat", ".csv"):
-        lin.save(tmp_path / f"m{ending}")
-    record = json.loads((tmp_path / "m.json").read_text())
-    del record["ignorable"], record["drift"], record["sha256"]
-    (tmp_path / "m.json").write_text(json.dumps(record))
-    with np.load(tmp_path / "m.npz") as file:
-        arrays = {
-            key: file[key] for key in file.files if key not in ("ignorable", "drift", "sha256")
-        }
-    np.savez(tmp_path / "m.npz", **arrays)
-    from scipy.io import loadmat, savemat
-
-    mat = loadmat(tmp_path / "m.mat")
-    kept = {k: x for k, x in mat.items() if k not in ("ignorable", "drift") and k[0] != "_"}
-    savemat(tmp_path / "m.mat", kept)
-    for table, key in (("info", "ignorable"), ("point", "drift")):
-        path = tmp_path / f"m.{table}.csv"
-        lines = path.read_text().splitlines(keepends=True)
-        kept_lines = (line for line in lines if not line.startswith((key, "sha256")))
-        path.write_text("".join(kept_lines))
-    for ending in (".json", ".npz", ".mat", ".csv"):
-        loaded = fflin.LinearModel.load(tmp_path / f"m{ending}")
-        assert loaded.ignorable == () and loaded.drift is None and not loaded.verified
-        assert not loaded.is_equilibrium() and (loaded.A == lin.A).all()
 
 
 @pytest.mark.parametrize("reverse", [False, True])

@@ -158,7 +158,7 @@ def held_motion(robot, **options):
 
 def transition(along, start, end):
     """What the variational equation makes of the error and of a held du, by DOP853."""
-    linearizer = fflin.Linearizer(along.robot, moving=True, engine="python")
+    linearizer = fflin.Linearizer(along.robot, moving=True)
     nx, nu = along.B.shape[1:]
     y = np.eye(nx, nx + nu).ravel()
     inner = along.t[(along.t > start + 1e-9) & (along.t < end - 1e-9)]

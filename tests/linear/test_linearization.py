@@ -215,7 +215,7 @@ def test_linear_model_predicts_the_nonlinear_one_to_second_order():
 def test_prepared_linearizer_gives_the_same_and_keeps_earlier_results():
     robot = fflin.load("ets_vii")
     rng = np.random.default_rng(11)
-    linearizer = fflin.Linearizer(robot, engine="python")
+    linearizer = fflin.Linearizer(robot)
     q1, v1, u1 = random_point(robot, rng)
     first, moving = linearizer(q1), linearizer(q1, v1, u1)
     kept = [array.copy() for array in (first.B, first.M, moving.A, moving.B)]
@@ -235,9 +235,7 @@ def test_input_alone_is_not_dropped():
 
 def test_linearizer_is_shared_copied_and_pickled():
     robot = fflin.load("dual_arm")
-    linearizer = fflin.Linearizer(
-        robot, frame="world", reference=pin.SE3.Identity(), engine="python"
-    )
+    linearizer = fflin.Linearizer(robot, frame="world", reference=pin.SE3.Identity())
     rng = np.random.default_rng(15)
     points = [random_point(robot, rng) for _ in range(40)]
     expected = [linearizer(*point) for point in points]

@@ -203,7 +203,6 @@ def test_an_equilibrium_holds_against_the_gradient():
     [
         (lambda robot: fflin.linearize(robot, frame="local"), "lvlh or hill"),
         (lambda robot: fflin.linearize(robot, moving=True), "moving=True"),
-        (lambda robot: fflin.Linearizer(robot, engine="compiled"), "orbit"),
         (lambda robot: fflin.linearize(fflin.load("cubesat"), frame="lvlh"), "orbit=..."),
         (lambda robot: fflin.linearize(robot.replace(outputs=[fflin.Momentum()])), "output"),
         (

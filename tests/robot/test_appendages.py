@@ -317,13 +317,13 @@ def test_wheels_and_modes_keep_each_other():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"frequency": [0.5, -0.1]}, "frequency of mode 2 of flexible appendage 'base' is -0.1"),
+        ({"frequency": [0.5, -0.1]}, "mode 2 of flexible appendage 'base' has -0.1 Hz"),
         ({"frequency": [0.5, 0.0]}, "mode 2"),
-        ({"damping": [0.1, 1.5]}, "damping of mode 2"),
+        ({"damping": [0.1, 1.5]}, "mode 2"),
         ({"damping": [0.1, 0.1, 0.1]}, "shape"),
         ({"translation": np.zeros((2, 3))}, "expected \\(3, 2\\)"),
-        ({"rotation": [[0, 0], [0, math.nan], [0, 0]]}, "rotation of mode 2"),
-        ({"frequency": [[0.5, 0.1]]}, "expected k numbers"),
+        ({"rotation": [[0, 0], [0, math.nan], [0, 0]]}, "rotation of"),
+        ({"frequency": [[0.5, 0.1]]}, "expected k frequencies"),
         ({"frame": 3}, "expected a name"),
         ({"name": ""}, "expected a name"),
     ],
@@ -347,7 +347,7 @@ def test_wrong_numbers_are_refused_by_the_mode(change, message):
         ({"frequency": None, "length": 0.5, "damping": 0.1}, "to which the ratio refers"),
         ({"axis": (0, 0, 0)}, "axis of slosh 'base' is zero"),
         ({"damping": 2.0}, "ratio from 0 to 1"),
-        ({"position": (0, 0)}, "three numbers"),
+        ({"position": (0, 0)}, "three finite numbers"),
     ],
 )
 def test_wrong_liquids_are_refused(change, message):
@@ -360,10 +360,10 @@ def test_what_the_link_cannot_have_is_refused():
     robot = hub_with_rod(1.0, 0.1, 1.0, 1.0)
     heavy = fflin.FlexibleAppendage("root_joint", [1.0, 2.0], [[0, 0], [0, 0], [0.5, 1.5]],
                                     np.zeros((3, 2)), name="array")  # fmt: skip
-    with pytest.raises(InputError, match="'array_mode_2' has more participation"):
+    with pytest.raises(InputError, match="'array' has more participation"):
         robot.replace(appendages=[heavy])
     liquid = fflin.Slosh("root_joint", 2.5, (0, 0, 0), frequency=0.1)
-    with pytest.raises(InputError, match="'root_joint_slosh_x'"):
+    with pytest.raises(InputError, match="'root_joint_slosh' has more"):
         robot.replace(appendages=[liquid])
     light = fflin.FlexibleAppendage("nowhere", 1.0, np.zeros((3, 1)), np.zeros((3, 1)))
     with pytest.raises(fflin.UnknownNameError, match="nowhere"):
@@ -409,7 +409,7 @@ def test_slosh_and_modes_must_leave_mass_to_a_body():
 @pytest.mark.parametrize("size", [1e160, 1e200, 1e300])
 def test_huge_participation_is_refused_by_the_mode(size):
     huge = fflin.FlexibleAppendage("root_joint", 1.0, [[size], [0.0], [0.0]], np.zeros((3, 1)))
-    with np.errstate(over="ignore"), pytest.raises(InputError, match="'root_joint_mode_1'"):
+    with np.errstate(over="ignore"), pytest.raises(InputError, match="'root_joint' has more"):
         hub_with_rod(9.0, 1.0, 1.0, 1.0).replace(appendages=[huge])
 
 

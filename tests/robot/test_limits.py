@@ -218,10 +218,6 @@ max_speed = 600
             ":4: .*min",
         ),
         ("type = 'joint_torque'\njoint = 'a'\nlimit = 1", ":4: .*'l"),
-        (
-            "type = 'base_force'\nmax = 1\n[[input]]\ntype = 'base_force'",
-            "line 1",
-        ),
     ],
 )
 def test_wrong_limits_in_toml_files_are_told_with_their_line(tmp_path, text, said):

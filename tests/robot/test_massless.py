@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.robot.model_checks import idle_coordinates
+from fflin.robot.mass_properties import idle_coordinates
 from tests.support.messages import says
 from tests.support.robots import random_tree
 

@@ -190,14 +190,15 @@ CASES = {
     "": "sat.toml: urdf",
     "passive = ['a']": "sat.toml: `urdf`",
     URDF + '"a\\u001b[31m\\u0007" = 1': r"sat.toml 'a\x1b[31m\x07'",
-    URDF + '[stiffness]\n"a\\u001b" = "x"': r"sat.toml stiffness.a\x1b",
+    URDF + '[stiffness]\n"a\\u001b" = "x"': r"sat.toml 'a\x1b'",
     URDF + "pasive = ['panel_left']": ":2: 'pasive'",
     URDF + "tides = 1\n": ":2: 'tides'",
     URDF + "orbit = 'low'\n": ":2: 'low'",
     URDF + "[orbit]\nheight = 1.0\n": "sat.toml 'height'",
     URDF + "[[inputs]]\ntype = 'base_force'": ":2: 'inputs'",
     URDF + INPUT + "'base_forces'": ":3: 'base_forces'",
-    "urdf = 3": ":1: urdf",
+    "urdf = 3": ":1: robot",
+    URDF + (INPUT + "'base_force'\n") * 2: ":2: 'F_b.x'",
     "#\nurdf = 'nosuch'": ":2: 'nosuch'",
     "#\nurdf = 'no/such.urdf'": "sat.toml no/such.urdf'",
     "urdf = 'sat.toml'": "sat.toml URDF",
@@ -220,7 +221,7 @@ CASES = {
     URDF + "[stiffness]\npanel_left = '1'": ":3: '1'",
     URDF + "[stiffness]\n#\npanel = 1": ":4: 'panel'",
     URDF + "[stiffness]\n'hinge_*' = 1": ":3: 'hinge_*'",
-    URDF + "[damping]\njoint_1 = inf": ":3: damping.joint_1",
+    URDF + "[damping]\njoint_1 = inf": ":3: 'joint_1'",
     URDF + "damping = 'all'": ":2: 'all'",
     URDF + "rest = 1": ":2: position",
     URDF + "lock = ['joint_1']\n[rest]\njoint_1 = 1": ":4: 'joint_1'",
@@ -234,7 +235,7 @@ CASES = {
     URDF + "[start]\nrpz = [0, 0, 1]": ":3: 'rpz'",
     URDF + "[start.joints]\njoint_1 = 1\njoint_9 = 0": ":4: 'joint_9'",
     URDF + "[start.velocity]\nomega_b.w = 1": ":3: 'omega_b.w'",
-    URDF + "[stiffness]\na.b.c.d = 'x'": ":3: stiffness.a.b.c.d",
+    URDF + "[stiffness]\na.b.c.d = 'x'": ":3: 'a.b.c.d'",
 }
 
 
@@ -331,12 +332,11 @@ def test_every_bundled_robot_in_a_file_is_itself(written, name):
     assert fflin.linearize(robot).A.tobytes() == fflin.linearize(plain).A.tobytes()
 
 
-# Values whose structure is that of no key, and integers that no error could write.
+# Values whose structure is that of no key.
 STRANGE = (
     *("[[1, 2, 3]]", "[[]]", "[1, [2], 3]", "[['joint_1']]", "[{a = 'x'}]", "[{a = 1}]"),
     *("{a = [[1]]}", "{joint_1 = {a = {}}}", "true", "1979-05-27", "inf", "['\\u0000', []]"),
     *("{q = {q_b = [[1]]}}", "{rpy = [[1], 2, 3]}", "{altitude = 5e5, body = ['earth']}"),
-    *(f"{before}0x{'f' * 5000}{after}" for before, after in (("", ""), ("[", "]"), ("{a=", "}"))),
 )
 
 
@@ -347,8 +347,6 @@ def test_a_value_of_a_strange_structure_is_one_line(key, value, written):
     with pytest.raises(fflin.FflinError, match=r"sat\.toml:") as caught:
         fflin.load(written(f"{head}{key} = {value}\n"))
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
-    if "0x" in value:
-        assert key in str(caught.value) and "too many digits" in str(caught.value)
 
 
 def test_the_draft_and_the_guide_have_every_key():

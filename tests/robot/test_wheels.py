@@ -452,7 +452,7 @@ def test_bad_wheels_are_told_in_a_line():
         ),
         "'bas'": (lambda: robot.replace(inputs=[ReactionWheel((0, 0, 1), "bas", inertia=0.1)])),
         "'too'": (lambda: fflin.linearize(robot.replace(inputs=[ReactionWheel((0, 0, 1), "too")]))),
-        "wheel 'joint_3'": lambda: robot.replace(
+        "'joint_3' has the name": lambda: robot.replace(
             inputs=[ReactionWheel((0, 0, 1), inertia=0.1, name="joint_3")]
         ),
         "wheel_2": lambda: robot.replace(inputs=[ReactionWheel((0, 0, 1), name="wheel_2"), none]),

@@ -41,7 +41,7 @@ def test_both_loops_agree(robots, name, make):
         pytest.skip("there are no joints to lay a grid over")
     robot, policy, options = make(plain(robots[name]))
     x0 = displaced(fflin.linearize(robot), degrees=20.0)
-    method = ("cf4", "rkmk4", "semi_implicit_euler")[BUNDLED.index(name) % 3]
+    method = ("cf4", "semi_implicit_euler")[BUNDLED.index(name) % 2]
     options = {"x0": x0, "duration": 10.0, "dt": 0.02, "linear": False, "method": method} | options
     motion, sizes = apart(robot, policy, **options)
     # Thrusts that do the same are told apart by rows of 1e-7: rounding is 1e7 times as large.

@@ -65,15 +65,14 @@ def test_where_nothing_can_be_foreseen_the_reason_is_said():
     robot, lin, gain = regulated("planar_detumble")
     feedback = fflin.StateFeedback(lin, gain.K)
     batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [0.0, 1.0]}))
-    policies = {
-        "an Allocation is not linear": fflin.Allocation(feedback, robot),
-        "a ScheduledFeedback is not known to be linear": fflin.ScheduledFeedback(
-            lin, fflin.lqr_batch(batch, 1.0, 1.0)
-        ),
-        "a function is not known to be linear": feedback.bind(robot),
-    }
-    for why, policy in policies.items():
+    policies = (
+        fflin.Allocation(feedback, robot),
+        fflin.ScheduledFeedback(lin, fflin.lqr_batch(batch, 1.0, 1.0)),
+        feedback.bind(robot),
+    )
+    for policy in policies:
         for linear in (lin, True):
+            why = f"cannot predict a motion under {type(policy).__name__}"
             with pytest.raises(fflin.InputError, match=why) as caught:
                 fflin.simulate(robot, policy, duration=0.1, linear=linear)
             assert "\n" not in str(caught.value)

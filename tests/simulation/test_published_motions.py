@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.linear.nonlinear import Nonlinear
+from fflin.linear.verification import Nonlinear
 
 
 def flown(robot, q, v, u, duration):

@@ -60,6 +60,21 @@ def test_what_stays_away_says_by_how_much():
     assert says(first(replace(motion, x=x)), "not settled", "0.02 rad")
 
 
+def test_the_headline_names_the_rates_that_the_table_calls_unsettled():
+    motion = course(lambda t: np.exp(-t / 2.0))
+    x = motion.x.copy()
+    at = motion.state_names.index("omega_b.x")
+    x[:, at] = 1e-3
+    headline = " ".join(motion_report(replace(motion, x=x)).split("ets_vii:")[0].split())
+    assert headline.startswith("positions settled after 7.83")
+    assert says(headline, "not yet: omega_b 0.001 rad/s") and "joint rates" not in headline
+    assert cells(replace(motion, x=x), "omega_b")[-2:] == ["not", "yet"]
+    # A rate that is not fed back never settles, and its row says so.
+    loose = replace(motion, x=x, steered=("q_b.x", "q_m.joint_1"))
+    assert first(loose).startswith("settled")
+    assert cells(loose, "omega_b")[-2:] == ["not", "controlled"]
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-17, 1e-12])
 def test_what_never_left_its_target_but_for_rounding_has_settled(size):
     motion = course(lambda t: 0.0 * t)
@@ -130,7 +145,8 @@ def test_where_no_input_pushes_the_base_its_position_is_not_judged():
     motion = pushed_by(fflin.BaseTorque())
     said = " ".join(motion_report(motion).split("cubesat:")[0].split())
     assert said.startswith("settled") and says(said, "position")
-    assert motion_report(motion).count("not controlled") == 1
+    # In the headline, and in the rows of position and v_b.
+    assert motion_report(motion).count("not controlled") == 3
     pushing = pushed_by(fflin.BaseTorque(), fflin.BaseForce())
     assert first(pushing).startswith("not settled")
     jet = fflin.Thruster("base", (0, 0, 0), (1, 0, 0), "jet")

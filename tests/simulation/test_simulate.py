@@ -1,5 +1,6 @@
 """Motions on the manifold: closed forms, orders, conservation laws, and what must be refused."""
 
+import itertools
 import math
 
 import numpy as np
@@ -41,9 +42,7 @@ def test_torque_free_axisymmetric_body_turns_as_the_closed_form_says(project, ac
         assert np.linalg.norm(apart) < accuracy
 
 
-@pytest.mark.parametrize(
-    ("method", "order"), [("cf4", 4.0), ("rkmk4", 4.0), ("semi_implicit_euler", 1.0)]
-)
+@pytest.mark.parametrize(("method", "order"), [("cf4", 4.0), ("semi_implicit_euler", 1.0)])
 @pytest.mark.parametrize("project", [True, False])
 def test_order_of_the_methods(method, order, project):
     robot = fflin.load("canadarm2")
@@ -65,7 +64,7 @@ def test_order_of_the_methods(method, order, project):
     assert slopes[-1] == pytest.approx(order, abs=0.1)
 
 
-def test_methods_of_order_four_agree_under_a_feedback_and_a_disturbance():
+def test_the_order_is_four_under_a_feedback_and_a_disturbance_too():
     robot, lin, gain = regulated("ets_vii")
 
     def push(t, q, v):
@@ -78,14 +77,14 @@ def test_methods_of_order_four_agree_under_a_feedback_and_a_disturbance():
             robot,
             fflin.StateFeedback(lin, gain.K),
             x0=displaced(lin),
-            duration=1.0,
-            dt=0.005,
-            method=method,
+            duration=1.2,
+            dt=dt,
             disturbance=push,
         ).x[-1]
-        for method in ("cf4", "rkmk4")
+        for dt in (0.08, 0.04, 0.02)
     ]
-    np.testing.assert_allclose(*ends, atol=1e-8)
+    first, second = (np.linalg.norm(a - b) for a, b in itertools.pairwise(ends))
+    assert first / second == pytest.approx(16.0, rel=0.2)
 
 
 @pytest.mark.parametrize("name", BUNDLED)
@@ -142,7 +141,7 @@ def test_momentum_follows_the_impulse_of_wrenches_thrusters_wheels_and_gravity(f
             lambda t, q, v: u * np.cos(t),
             q0=q0,
             v0=v0,
-            duration=1.0,
+            duration=1.2,
             dt=dt,
             frame=frame,
             reference=pin.SE3(pin.exp3(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2.0, 3.0])),
@@ -264,6 +263,9 @@ def test_allocation_gives_the_wrench_with_thrusts_that_push():
     motion = fflin.simulate(robot, policy, x0=x0, duration=60.0, dt=0.05, sample=0.1)
     assert (motion.u >= 0.0).all()
     assert np.abs(motion.x[-1]).max() < 2e-3
+    (note,) = motion.notes
+    assert note == "allocation: the commanded tau_b, F_b are realised by thrust"
+    assert note in str(motion)
     # Attitude and position are those relative to the model's reference, wherever it starts.
     turned = fflin.configuration(robot, {}, pin.SE3(pin.rpy.rpyToMatrix(0.2, 0, 0), np.zeros(3)))
     motion = fflin.simulate(robot, policy, q0=turned, duration=60.0, dt=0.05, sample=0.1)

@@ -51,7 +51,7 @@ def test_a_thinned_run_is_the_run_at_some_of_its_rows(monkeypatch):
     assert len(short.t) == 101 and not short.notes
 
 
-def test_the_pole_that_makes_a_run_slow_is_named():
+def test_the_pole_that_makes_a_run_slow_is_told():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
     K = fflin.lqr(lin).K.copy()
@@ -68,15 +68,10 @@ def test_the_pole_that_makes_a_run_slow_is_named():
         motion = fflin.simulate(robot, policy, duration=120.0, events=[at_once])
     fastest = np.abs(np.linalg.eigvals(lin.A - lin.B @ K)).max()
     (line,) = [str(each.message) for each in said]
-    assert says(
-        line, f"{fastest:.3g} 1/s", "0.000977 s", "122,880", "dt=", "sample=", "qdot_m.joint_5"
-    )
+    assert says(line, f"{fastest:.3g} 1/s", "0.000977 s", "122,880", "dt=", "sample=")
     assert motion.notes == (
         "one of 13 steps is recorded; every=1 (--every 1) records all 122,880 steps",
     )
-    # A loop without such a pole is not analysed further.
-    calm = times.times_of(fflin.StateFeedback(lin, fflin.lqr(lin).K), 1.0, None, None, None, 0.0)
-    assert calm.mode == "" and calm.fastest > 0.0
 
 
 @pytest.mark.parametrize(

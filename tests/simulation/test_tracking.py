@@ -7,7 +7,7 @@ import pytest
 import fflin
 from benchmarks.cases.trajectory import beside as beside_knots
 from benchmarks.cases.trajectory import flown
-from fflin.dynamics.state import moved_by, moving_error, moving_errors
+from fflin.dynamics.coordinates import moved_by, moving_error, moving_errors
 from tests.support.marks import exhaustive
 from tests.support.messages import says
 from tests.support.motions import beside, swung
@@ -75,29 +75,6 @@ def test_without_a_start_it_begins_on_its_trajectory(case):
     assert np.abs(run.error).max() < 1e-5
 
 
-def test_what_is_foreseen_along_a_trajectory_is_off_by_the_square_of_the_error(case):
-    robot, schedule, traj = case
-    off = []
-    for size in (2e-2, 1e-2, 5e-3):
-        q0, v0 = beside(robot, traj, size)
-        run = fflin.simulate(robot, schedule, q0=q0, v0=v0, linear=True)
-        assert run.linear is not None
-        np.testing.assert_allclose(run.linear[0], run.x[0], atol=1e-14)
-        off.append(np.abs(run.linear - run.x).max())
-    np.testing.assert_allclose(np.log2([off[0] / off[1], off[1] / off[2]]), 2.0, atol=0.25)
-
-
-@pytest.mark.parametrize("options", [{"sample": 0.2}, {"limits": 0.12}, {"delay": 0.05}])
-def test_what_is_foreseen_is_sampled_late_and_limited_as_the_run_is(case, options):
-    robot, schedule, traj = case
-    q0, v0 = beside(robot, traj, 1e-3)
-    run = fflin.simulate(robot, schedule, q0=q0, v0=v0, **options)
-    plain = fflin.simulate(robot, schedule, q0=q0, v0=v0)
-    apart = np.abs(run.linear - run.x).max()
-    assert apart < 1e-4
-    assert apart < 0.05 * np.abs(plain.x - run.x).max()
-
-
 @pytest.mark.exhaustive
 def test_after_the_end_the_last_configuration_is_held_at_rest():
     robot = fflin.load("planar_detumble")
@@ -108,10 +85,7 @@ def test_after_the_end_the_last_configuration_is_held_at_rest():
     after = run.t > traj.t[-1] + 1e-9
     held = fflin.StateMap(robot, frame="local").to_state(traj.q[-1], np.zeros(robot.nv))
     np.testing.assert_allclose(run.target[after], np.tile(held, (after.sum(), 1)), atol=1e-14)
-    # The error jumps to that from rest, in the prediction as in the run.
-    assert np.abs(run.linear - run.x).max() < 0.1 * np.abs(traj.v[-1]).max()
     assert np.abs(run.error[-1]).max() < 1e-4
-    assert np.abs(run.linear[-1] - run.x[-1]).max() < 1e-4
 
 
 @pytest.mark.exhaustive
@@ -128,16 +102,6 @@ def test_a_sampled_schedule_is_asked_at_its_samples():
     q, v, u = traj.point(run.t[50])
     e = moving_error(state, q, v, run.q[50], run.v[50])
     np.testing.assert_allclose(run.u[50], u - schedule.gain(run.t[50]) @ e, atol=1e-12)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("sample", [None, 0.2])
-def test_what_a_trajectory_holds_is_foreseen_to_end_at_its_knots(sample):
-    robot = fflin.load("ets_vii")
-    traj = swung(robot, sample=0.2).trajectory()
-    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), sample=sample)
-    run = fflin.simulate(robot, schedule, dt=0.02)
-    assert np.abs(run.linear - run.x).max() < 1e-6
 
 
 @pytest.mark.exhaustive
@@ -180,13 +144,11 @@ def test_limits_that_the_trajectory_itself_breaks_are_told(case):
     ("options", "said"),
     [
         ({"frame": "hybrid"}, "'hybrid'"),
-        ({"linear": "lin"}, "trajectory"),
+        ({"linear": True}, "TrajectoryFeedback"),
     ],
 )
 def test_what_does_not_go_along_a_trajectory_is_refused(case, options, said):
     robot, schedule, _ = case
-    if "linear" in options:
-        options = {"linear": fflin.linearize(robot)}
     with pytest.raises(fflin.InputError, match=said):
         fflin.simulate(robot, schedule, **options)
 
@@ -300,7 +262,6 @@ def test_at_the_very_end_held_inputs_are_those_of_rest(engine, how):
     at = np.searchsorted(flown.t, 1.0 - 1e-9)
     assert np.abs(flown.u[at - 1]).max() > 0.5 * np.abs(brake).max()
     assert np.abs(flown.u[at]).max() < 0.1 * np.abs(brake).max()
-    assert np.abs(flown.linear - flown.x).max() < 1e-4
 
 
 @pytest.mark.parametrize("engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)])
@@ -349,7 +310,6 @@ def test_a_run_of_just_the_trajectorys_length_needs_no_rest(first):
     schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), 1.0, 1.0, 1.0, sample=0.07)
     for dt in (0.07, 0.01):
         run = fflin.simulate(robot, schedule, dt=dt)
-        assert run.linear is not None
         assert np.abs(run.error).max() < 1e-4
 
 

@@ -109,7 +109,7 @@ for attribute in ("damping", "friction"):
     inside = AXIS + f'<dynamics {attribute}="1,5"/>'
     refuse(f"{attribute} with comma", arm(inside=inside), ":4:", attribute, "'hinge'", "'1,5'")
     inside = AXIS + f'<dynamics {attribute}=""/>'
-    warn(f"{attribute} empty", arm(inside=inside), ":4:", attribute, "'hinge'", "as 0")
+    refuse(f"{attribute} empty", arm(inside=inside), ":4:", f"empty '{attribute}'", "'hinge'")
 for attribute, texts in {
     "lower": ("1,5", "", "nan", "inf", "1e999"),
     "upper": ("1,5", "", "nan", "-inf"),
@@ -134,7 +134,7 @@ for title, text, words in (
     ("two entries", "1 2", "has 2 entries"),
     ("four entries", "1 2 3 4", "has 4 entries"),
     ("commas", "1,2,3", "commas"),
-    ("commas and spaces", "1, 2, 3", "commas"),
+    ("commas and spaces", "1, 2, 3", "'1,'"),
     ("nan", "0 nan 0", "'nan'"),
     ("empty", "", "empty"),
     ("words", "left of it", "'left'"),
@@ -151,15 +151,6 @@ warn(
     arm(inside=f'{AXIS}<origin xyz="1e7 0 0"/>'),
     "1.0e+00",
     "metres",
-)
-refuse(
-    "mimic offset of 1e29",
-    arm(
-        more=link("tip")
-        + joint("k", "arm", "tip", "prismatic", AXIS + '<mimic joint="hinge" offset="1e29"/>')
-    ),
-    "offset of joint 'k'",
-    "1e+07 m",
 )
 refuse("com of 1e29", arm(child=inertial(origin='<origin xyz="1e29 0 0"/>')), ":3:", "'arm'", "m;")
 refuse("mass beyond anything", arm(child=inertial("1e40")), "'arm'")
@@ -267,8 +258,8 @@ accept("massless flange", arm(more=link("tool", "") + joint("weld", "arm", "tool
 
 # --- The document --------------------------------------------------------------------------------
 
-refuse("empty", b"", "empty")
-refuse("blank", b" \n\t\n", "empty")
+refuse("empty", b"", "no element")
+refuse("blank", b" \n\t\n", "no element")
 refuse("binary", bytes(range(256)) * 40, "well-formed")
 refuse("zeros", bytes(10_000), "well-formed")
 refuse("an ELF file", b"\x7fELF\x02\x01\x01" + bytes(500), "well-formed")
@@ -281,18 +272,17 @@ refuse(
     "attribute twice", '<robot name="r"><link name="a" name="b"/></robot>', "duplicate attribute"
 )
 refuse("attribute unquoted", "<robot name=r><link name='a'/></robot>", ":1:", "well-formed")
-refuse("two robots", arm() + arm(), ":7:", "root element")
-refuse("text after the robot", arm() + "done", "</robot>")
+refuse("two robots", arm() + arm(), ":7:", "document element")
+refuse("text after the robot", arm() + "done", "document element")
 refuse("robot in robot", robot(link("base"), robot(link("arm"))), ":3:", "<robot>")
 refuse("another root", "<model name='r'><link name='a'/></model>", "<model>", "<robot>")
 refuse("SDF", '<sdf version="1.9"><model name="r"><link name="a"/></model></sdf>', "<sdf>")
 refuse("MJCF", "<mujoco><worldbody/></mujoco>", "<mujoco>")
-refuse("version 2", robot(link("base"), attributes='name="r" version="2.0"'), "'2.0'")
-refuse("entity", '<!DOCTYPE r [<!ENTITY m "1">]>' + arm(child=inertial("&m;")), "<!ENTITY>")
+refuse("entity", '<!DOCTYPE r [<!ENTITY m "1">]>' + arm(child=inertial("&m;")), "entit")
 BOMB = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
-refuse("entity bomb", f'<!DOCTYPE r [<!ENTITY a0 "x">{BOMB}]><robot name="&a11;"/>', "<!ENTITY>")
+refuse("entity bomb", f'<!DOCTYPE r [<!ENTITY a0 "x">{BOMB}]><robot name="&a11;"/>', "entit")
 refuse(
-    "external entity", '<!DOCTYPE r [<!ENTITY x SYSTEM "/etc/passwd">]><robot name="&x;"/>', "ENTI"
+    "external entity", '<!DOCTYPE r [<!ENTITY x SYSTEM "/etc/passwd">]><robot name="&x;"/>', "entit"
 )
 refuse(
     "entity of an external subset",
@@ -300,8 +290,7 @@ refuse(
     "entit",
 )
 refuse("entity of a parameter", "<!DOCTYPE robot [%p;]>" + arm(child=inertial("1&m;")), "entit")
-accept("document type", "<!DOCTYPE robot>" + arm())
-accept("document type elsewhere", '<!DOCTYPE robot SYSTEM "gone.dtd">' + arm(more="<!--&amp;-->"))
+refuse("document type", "<!DOCTYPE robot>" + arm(), "<!DOCTYPE>")
 refuse("undefined entity", arm(child=inertial("&m;")), "undefined entity")
 refuse("unknown encoding", '<?xml version="1.0" encoding="klingon"?>' + arm(), "encoding", "UTF-8")
 refuse(
@@ -311,12 +300,6 @@ refuse(
 )
 refuse("nested 200 deep", robot(link("base"), "<x>" * 200 + "</x>" * 200), "nested")
 refuse("nested 100,000 deep", "<robot>" + "<x>" * 100_000, "nested")
-refuse("a million elements", robot("<x/>" * 1_000_000), "elements")
-refuse(
-    "a million attributes",
-    robot(link("a", "<x " + " ".join(f'a{k}=""' for k in range(1_000_000)) + "/>")),
-    "longer",
-)
 accept("name of a megabyte cut short", robot(link("x" * 100_000)))
 accept("byte order mark", "\ufeff".encode() + arm().encode())
 accept("CRLF", arm().replace("\n", "\r\n").encode())
@@ -345,7 +328,7 @@ refuse("link of empty name", robot(link("base"), link("")), ":3:", "empty 'name'
 refuse("joint without a name", arm().replace('name="hinge"', ""), ":4:", "<joint>", "name")
 refuse("two links of one name", arm(more=link("arm")), ":5:", "'arm'", "line 3")
 refuse("two joints of one name", arm(more=link("b") + joint("hinge", "arm", "b")), "second joint")
-refuse("joint named universe", arm().replace('"hinge"', '"universe"'), "'universe'", "rename")
+refuse("joint named universe", arm().replace('"hinge"', '"universe"'), "differ", "rename")
 refuse(
     "a control character as name",
     robot(link("a&#10;b", INERTIAL.replace('"1"', '"-1"', 1))),
@@ -396,7 +379,7 @@ refuse(
     "'k'",
     "'j'",
 )
-refuse("a link its own parent", arm(more=joint("k", "arm", "arm")), "itself", "'k'")
+refuse("a link its own parent", arm(more=joint("k", "arm", "arm")), "only one parent", "'k'")
 refuse("a detached link", arm(more=link("lost")), ":5:", "2 separate trees", "'lost'")
 refuse(
     "a detached arm",
@@ -427,17 +410,16 @@ refuse("joint in a link", robot(link("base", INERTIAL + joint("j", "base", "arm"
 refuse("Link in capitals", robot(link("base"), link("arm").replace("link", "Link")), "<Link>")
 refuse("Joint in capitals", arm().replace("joint", "Joint"), "<Joint>")
 refuse("a chain of 10,000 links", chain(10_000, "fixed"), "10000", "1000")
-refuse("1,000 joints", chain(999, "continuous"), "998 degrees of freedom", "GiB")
-refuse("20,000 links", robot(*(link(f"l{k}", "") for k in range(20_000))), "20000 links")
-refuse("317 joints", chain(318, "continuous"), "317 degrees of freedom")
+refuse("1,000 joints", chain(999, "continuous"), "998 joints", "GiB")
+refuse("317 joints", chain(318, "continuous"), "317 joints", "GiB")
 accept("a chain of 900 links", chain(900, "fixed"))
-warn(
+refuse(
     "a world that the base floats in",
     robot(link("world", ""), link("a"), link("b"), joint("j", "a", "b")).replace(
         "</robot>", joint("free", "world", "a", "floating", "") + "</robot>"
     ),
-    "'world'",
     "'free'",
+    "lock",
 )
 refuse(
     "a world that two bases float in",
@@ -464,14 +446,11 @@ for kind in ("hinge", "Revolute", "ball", "universal", "revolute2", "screw", "${
 refuse("type spherical", arm(kind="spherical"), "'spherical'", "revolute")
 refuse("type floating", arm(kind="floating"), "'hinge'", "lock")
 refuse("type planar", arm(kind="planar"), "'hinge'", "lock")
-refuse("planar about x", arm(kind="planar", inside='<axis xyz="1 0 0"/>'), ":4:", "planar", "0 0 1")
-refuse("planar without axis", arm(kind="planar", inside=""), ":4:", "planar")
 refuse("axis zero", arm(inside='<axis xyz="0 0 0"/>'), ":4:", "length 0", "'hinge'")
 refuse("axis 1e-200", arm(inside='<axis xyz="0 0 1e-200"/>'), "length 1e-200")
-refuse("axis 1e200", arm(inside='<axis xyz="0 1e200 0"/>'), "length 1e+200")
+refuse("axis 1e20", arm(inside='<axis xyz="0 1e20 0"/>'), "length 1e+20")
 refuse("axis without xyz", arm(inside="<axis/>"), "'xyz'")
 refuse("axis by rpy", arm(inside='<axis rpy="0 0 1"/>'), "no 'xyz'")
-accept("axis with an rpy of zeros", arm(inside='<axis xyz="0 0 1" rpy="0 0.0 -0"/>'))
 warn("axis with an rpy", arm(inside='<axis xyz="0 0 1" rpy="0 0 1"/>'), ":4:", "'rpy'", "<axis>")
 refuse("two axes", arm(inside=AXIS * 2), "second <axis>", "'hinge'")
 refuse("two origins", arm(inside=AXIS + "<origin/>" * 2), "second <origin>")
@@ -496,13 +475,6 @@ warn(
     ":4:",
     "'spring_stiffness'",
 )
-warn(
-    "rotor inertia",
-    arm(inside=AXIS + '<drake:rotor_inertia value="1"/>'),
-    ":4:",
-    "<drake:rotor_inertia>",
-    "'hinge'",
-)
 accept("damping of zero", arm(inside=AXIS + '<dynamics damping="0" friction="0.0"/>'))
 accept("damping of a fixed joint", arm(kind="fixed", inside='<dynamics damping="1"/>'))
 for kind in ("revolute", "prismatic", "continuous", "fixed"):
@@ -523,7 +495,7 @@ accept("empty origin", arm(inside=AXIS + "<origin/>"))
 refuse("mimic of nothing", three("<mimic/>"), ":6:", "'joint'", "'j1'")
 refuse("mimic of an unknown joint", three('<mimic joint="j9"/>'), ":6:", "'j1'", "'j9'")
 refuse("mimic of Drake", three("", '<drake:mimic joint="j1"/>'), ":7:", "'j2'", "<mimic>")
-refuse("mimic of itself", three('<mimic joint="j1"/>'), ":6:", "itself", "'j1'")
+refuse("mimic of itself", three('<mimic joint="j1"/>'), ":6:", "loop", "'j1'")
 refuse("mimics of each other", three('<mimic joint="j2"/>', '<mimic joint="j1"/>'), "loop", "'j2'")
 refuse(
     "mimics in a circle of three",

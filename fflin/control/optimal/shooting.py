@@ -5,7 +5,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
-from fflin.dynamics.names import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
 from fflin.linear.linearization import Linearizer

@@ -18,8 +18,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh, rigid_inertia
-from fflin.robot.equipment.mounting import Mounted, difference, inertia_of
-from fflin.robot.equipment.wheels import turned_to
+from fflin.robot.equipment.mounting import Mounted, difference, inertia_of, turned_to
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.mass_properties import Piece, as_inertia
 
@@ -129,15 +128,11 @@ def _compare_inertia(item: _Modes, bodies: list[pin.Inertia], links: Mapping[str
     scale = np.array([1.0, 1.0, 1.0, *[1.0 / size] * 3])
     apart = np.abs(M - appendage.inertia) * np.outer(scale, scale)
     if apart.max() > _AGREE * max(M[0, 0], of_file.mass):
-        both = [
-            f"{body.mass:.4g} kg at {_point(body.lever)} m with moments of inertia "
-            f"{_point(body.inertia.diagonal())} kg m^2 about it"
-            for body in (of_file, of_link)
-        ]
+        file, urdf = (f"{x.mass:.4g} kg at {_point(x.lever)} m" for x in (of_file, of_link))
         warnings.warn(
-            f"flexible appendage '{appendage.title}': its file has {both[0]}, but {what} has "
-            f"{both[1]}, in the axes of the frame; correct the URDF, or use the inertia of the "
-            "file with rigid=True",
+            f"flexible appendage '{appendage.title}': its file has {file}, but {what} has {urdf} "
+            "in the axes of the frame, or other moments of inertia; correct the URDF, or use the "
+            "inertia of the file with rigid=True",
             FflinWarning,
             stacklevel=6,
         )
@@ -154,21 +149,16 @@ def _point(values: Array) -> str:
 
 def _require_inertia(body: pin.Inertia, of: str, found: Sequence[_Modes]) -> None:
     """Raise `InputError` if M_rr - L L^T of a body has a negative eigenvalue."""
-    names = [name for item in found for name in item.appendage.modes]
     L = np.hstack([item.L for item in found])
     rows = np.array([body.mass]), body.lever[None], body.inertia[None]
-    if _least_eigenvalue(*rows, L)[0] >= -_NEGATIVE:
+    least = float(_least_eigenvalue(*rows, L)[0])
+    if least >= -_NEGATIVE:
         return
-    leasts = [float(_least_eigenvalue(*rows, L[:, : k + 1])[0]) for k in range(len(names))]
-    first = next(k for k, least in enumerate(leasts) if not least >= -_NEGATIVE)
-    t, r = np.split(L[:, first], 2)
-    r = r - np.cross(body.lever, t)
+    titles = ", ".join(f"'{item.appendage.title}'" for item in found)
     raise InputError(
-        f"mode '{names[first]}' has more participation ({np.linalg.norm(t):.3g} kg^0.5, "
-        f"{np.linalg.norm(r):.3g} kg^0.5 m about the centre of mass) than {of} with "
-        f"{body.mass:.4g} kg can have: M_rr - L L^T has the eigenvalue {leasts[first]:.2g}, "
-        "relative to the largest eigenvalue of M_rr; the URDF's inertia must include the appendage "
-        "as if it were rigid"
+        f"{titles} has more participation than {of} with {body.mass:.4g} kg can have: M_rr - L L^T "
+        f"has the eigenvalue {least:.2g}, relative to the largest eigenvalue of M_rr; the URDF's "
+        "inertia must include the appendage as if it were rigid"
     )
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, FrozenArrays, as_double, number, positive
+from fflin.base.validation import Array, FrozenArrays, as_double, number, positive, shaped
 from fflin.robot.equipment.mounting import about_origin, inertia_of
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
@@ -117,34 +117,23 @@ class FlexibleAppendage(Appendage):
     def __post_init__(self) -> None:
         what = f"flexible appendage '{_text('frame', self.frame)}'"
         frequency = np.atleast_1d(as_double(f"frequency of {what}", self.frequency))
-        if frequency.ndim != 1 or not frequency.size:
-            raise InputError(f"frequency of {what} is {self.frequency!r}, expected k numbers [Hz]")
-        modes = len(frequency)
-        damping = as_double(f"damping of {what}", self.damping)
-        if damping.shape not in ((), (modes,)):
+        damping, modes = as_double(f"damping of {what}", self.damping), frequency.size
+        if frequency.ndim != 1 or not modes or damping.shape not in ((), (modes,)):
             raise InputError(
-                f"damping of {what} has shape {damping.shape}, expected one ratio or {modes}"
+                f"frequency and damping of {what} have shapes {frequency.shape} and "
+                f"{damping.shape}, expected k frequencies [Hz], and k damping ratios or one"
             )
         damping = np.broadcast_to(damping, modes).copy()
-        for mode, (f, ratio) in enumerate(zip(frequency, damping, strict=True), start=1):
-            if not 0.0 < f < _FASTEST:
-                raise InputError(
-                    f"frequency of mode {mode} of {what} is {f:g} Hz, expected more than 0 and "
-                    f"less than {_FASTEST:g}"
-                )
-            if not 0.0 <= ratio <= 1.0:
-                raise InputError(
-                    f"damping of mode {mode} of {what} is {ratio:g}, expected a ratio from 0 to 1"
-                )
+        known = (frequency > 0.0) & (frequency < _FASTEST) & (damping >= 0.0) & (damping <= 1.0)
+        for mode in np.flatnonzero(~known)[:1].tolist():
+            raise InputError(
+                f"mode {mode + 1} of {what} has {frequency[mode]:g} Hz and the damping ratio "
+                f"{damping[mode]:g}, expected more than 0 and less than {_FASTEST:g} Hz, and a "
+                "ratio from 0 to 1"
+            )
         for name, unit in (("translation", "kg^0.5"), ("rotation", "kg^0.5 m")):
-            value = as_double(f"{name} of {what}", getattr(self, name))
-            if value.shape != (3, modes):
-                raise InputError(
-                    f"{name} of {what} has shape {value.shape}, expected (3, {modes}): one column "
-                    f"[{unit}] for each of the {modes} frequencies"
-                )
-            if bad := np.flatnonzero(~np.isfinite(value).all(axis=0)).tolist():
-                raise InputError(f"{name} of mode {bad[0] + 1} of {what} is not finite")
+            hint = f": one column [{unit}] for each of the {modes} frequencies"
+            value = shaped(f"{name} of {what}", getattr(self, name), (3, modes), hint)
             object.__setattr__(self, name, value)
         object.__setattr__(self, "frequency", frequency)
         object.__setattr__(self, "damping", damping)
@@ -240,32 +229,6 @@ class FlexibleAppendage(Appendage):
         omega = 2.0 * math.pi * self.frequency
         values = {"stiffness": omega**2, "damping": 2.0 * self.damping * omega}
         return {key: dict(zip(self.modes, x.tolist(), strict=True)) for key, x in values.items()}
-
-    def __str__(self) -> str:
-        from fflin.base.tables import grid
-
-        t, r = self.translation, self.rotation
-        rows = [["mode", "f [Hz]", "damping", *(f"m_{x}" for x in "xyz")]]
-        rows[0] += [f"I_{x}" for x in "xyz"]
-        for k, mode in enumerate(self.modes):
-            sizes = (*t[:, k] ** 2, *r[:, k] ** 2)
-            rows.append([mode, f"{self.frequency[k]:.5g}", f"{self.damping[k]:.3g}"])
-            rows[-1] += [f"{x:.3g}" for x in sizes]
-        sums = (*(t**2).sum(axis=1), *(r**2).sum(axis=1))
-        rows.append(["all modes", "", "", *(f"{x:.3g}" for x in sums)])
-        if self.inertia is not None:
-            of_file = self.inertia.diagonal()
-            rows.append(["rigid", "", "", *(f"{x:.4g}" for x in of_file)])
-            rows.append(["residual", "", "", *(f"{x:.3g}" for x in of_file - sums)])
-        head = f"{self.title}: {len(self.modes)} modes, clamped at frame '{self.frame}'"
-        if self.inertia is not None:
-            body = rigid_inertia(self.inertia)
-            x, y, z = body.lever
-            head += (
-                f"\n{body.mass:.5g} kg, centre of mass ({x:.4g}, {y:.4g}, {z:.4g}) m in the frame"
-            )
-        about = "effective masses m [kg] and moments of inertia I [kg m^2] about the frame"
-        return f"{head}\n{about}\n\n{grid(rows, 'l')}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -475,16 +438,10 @@ def checked_appendages(value: Any) -> tuple[Appendage, ...]:
     """Return flexible appendages and slosh, or raise `InputError`."""
     if isinstance(value, Appendage):
         value = [value]
-    if isinstance(value, str) or not isinstance(value, Sequence):
+    if not isinstance(value, Sequence) or not all(isinstance(item, Appendage) for item in value):
         raise InputError(
-            f"appendages has type {type(value).__name__}, expected a sequence of FlexibleAppendage "
-            "and Slosh"
+            f"appendages is {value!r}, expected a sequence of FlexibleAppendage and Slosh"
         )
-    for item in value:
-        if not isinstance(item, Appendage):
-            raise InputError(
-                f"{item!r} is not an appendage; expected a FlexibleAppendage or a Slosh"
-            )
     return tuple(value)
 
 
@@ -498,10 +455,9 @@ def rigid_inertia(M: Array) -> pin.Inertia:
 
 
 def _text(what: str, value: Any) -> str:
-    if not isinstance(value, str) or not value.strip() or not value.isprintable():
-        raise InputError(f"{what} of an appendage is {value!r}, expected a name")
-    if what == "name" and set(value) & set("*?[]"):
+    printable = isinstance(value, str) and value.strip() and value.isprintable()
+    if not printable or (what == "name" and set(value) & set("*?[]")):
         raise InputError(
-            f"name of an appendage is {value!r}, expected a name without *, ?, [ and ]"
+            f"{what} of an appendage is {value!r}, expected a name, without *, ?, [ and ]"
         )
-    return value
+    return str(value)

@@ -15,8 +15,13 @@ from fflin.robot.equipment.appendages import (
     checked_appendages,
     rigid_inertia,
 )
-from fflin.robot.equipment.mounting import Mounted, difference, inertia_of, with_mounted
-from fflin.robot.equipment.wheels import mounted_wheels
+from fflin.robot.equipment.mounting import (
+    Mounted,
+    difference,
+    inertia_of,
+    mounted_wheels,
+    with_mounted,
+)
 from fflin.robot.fields import checked_inputs, of_joints
 from fflin.robot.joints import find_frame
 from fflin.robot.mass_properties import LinkMass, as_inertia
@@ -36,8 +41,8 @@ def with_appendages(robot: Any, appendages: Any) -> Any:
             joint = find_frame(bare.model, item.frame).joint
             if joint in taken:
                 raise InputError(
-                    f"flexible appendage '{item.title}' is the second appendage with rigid=True on "
-                    "its body; use rigid=True for one appendage of each body"
+                    f"'{item.title}' is the second appendage with rigid=True on its body; use it "
+                    "for one appendage of each body"
                 )
             taken.add(joint)
             bare = _with_rigid(bare, item)
@@ -77,7 +82,7 @@ def _equipped(robot: Any, inputs: Any, appendages: Sequence[Appendage]) -> Any:
     modes, springs = mounted_appendages(model, bodies, appendages, bare.pieces)
     parts = [*wheels, *modes]
     if parts:
-        _require_new_names(model, wheels, modes)
+        _require_new_names(model, parts)
         model = with_mounted(model, bodies, parts)
         for part in parts:
             model.addJointFrame(model.getJointId(part.name))
@@ -113,21 +118,13 @@ def _equipped(robot: Any, inputs: Any, appendages: Sequence[Appendage]) -> Any:
     )
 
 
-def _require_new_names(
-    model: pin.Model, wheels: Sequence[Mounted], modes: Sequence[Mounted]
-) -> None:
+def _require_new_names(model: pin.Model, parts: Sequence[Mounted]) -> None:
     """Raise `InputError` if two joints would have the same name."""
-    for part in wheels:
-        if model.existJointName(part.name) or model.existFrame(part.name):
+    taken = {*model.names, *(frame.name for frame in model.frames.tolist())}
+    for part in parts:
+        if part.name in taken:
             raise InputError(
-                f"wheel '{part.name}' has the name of a joint or frame of the robot; give it "
-                "another name"
-            )
-    taken = {part.name for part in wheels}
-    for part in modes:
-        if model.existJointName(part.name) or model.existFrame(part.name) or part.name in taken:
-            raise InputError(
-                f"mode '{part.name}' has the name of a joint, frame or wheel of the robot, or of "
-                "another appendage; give its appendage another name"
+                f"'{part.name}' has the name of another joint, frame, wheel or mode of the robot; "
+                "give the wheel or the appendage another name"
             )
         taken.add(part.name)

@@ -1,4 +1,4 @@
-"""Bodies on joints of their own, mounted on links whose inertia in the URDF includes them."""
+"""Wheels and other bodies on joints of their own, mounted on links whose inertia includes them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -6,8 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.validation import Array
-from fflin.robot.joints import ROOT, Joint
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, frozen
+from fflin.robot.inputs import Input, ReactionWheel, named_wheels
+from fflin.robot.joints import ROOT, Joint, find_frame
+from fflin.robot.urdf.links import is_impossible
+
+_Z = np.array([0.0, 0.0, 1.0])
 
 # What Pinocchio keeps of each degree of freedom, and of each entry of q, beside the joint itself.
 _OF_VELOCITY = (
@@ -130,3 +135,56 @@ def carry_over(model: pin.Model, new: pin.Model, moved: Mapping[int, int]) -> No
                 size = sizes[index]
                 values[new_at[to] : new_at[to] + size] = old[old_at[index] : old_at[index] + size]
             setattr(new, name, values)
+
+
+def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
+    """Return the joint that carries a wheel, and its axis (3,) in that joint's frame."""
+    joint, placement = find_frame(model, wheel.frame)
+    return joint, placement.rotation @ np.array(wheel.axis)
+
+
+def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[int, Array], ...]:
+    """Return the momentum (3,) [N m s] of wheels without inertia on each joint, in its frame."""
+    stored: dict[int, Array] = {}
+    for _, wheel in named_wheels(inputs):
+        if wheel.momentum:
+            joint, axis = carrier(model, wheel)
+            stored[joint] = stored.get(joint, np.zeros(3)) + wheel.momentum * axis
+    return tuple((joint, frozen(momentum)) for joint, momentum in stored.items())
+
+
+def mounted_wheels(
+    model: pin.Model, bodies: list[pin.Inertia], inputs: Sequence[Input]
+) -> list[Mounted]:
+    """Return the wheels with an inertia, and subtract each wheel from its body."""
+    parts = []
+    for name, wheel in named_wheels(inputs):
+        if not wheel.inertia:
+            continue
+        joint, axis = carrier(model, wheel)
+        spinning = pin.Inertia(0.0, np.zeros(3), float(wheel.inertia) * np.outer(axis, axis))
+        rest = difference(bodies[joint], spinning)
+        moments = np.linalg.eigvalsh(rest.inertia).tolist()
+        about = float(axis @ bodies[joint].inertia @ axis)
+        # Nothing but rounding is left where a wheel's own link carries it.
+        if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
+            of = "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
+            lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
+            raise InputError(
+                f"wheel '{name}' of {wheel.inertia:g} kg m^2 does not have less inertia than the "
+                f"link that carries it: {of} has {about:.3g} kg m^2 about its axis; the URDF's "
+                f"inertia must include the wheels, so correct the URDF or the wheel{lock}"
+            )
+        bodies[joint] = rest
+        placement = pin.SE3(turned_to(axis), np.zeros(3))
+        own = pin.Inertia(0.0, np.zeros(3), float(wheel.inertia) * np.outer(_Z, _Z))
+        turning = Joint(name, 0, 0, unbounded=True, prismatic=False)
+        parts.append(Mounted(turning, joint, placement, pin.JointModelRUBZ(), own))
+    return parts
+
+
+def turned_to(axis: Array) -> Array:
+    """Return a rotation (3, 3) that maps z to an axis, exact for x, y and z."""
+    beside = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
+    beside /= np.linalg.norm(beside)
+    return np.column_stack((beside, np.cross(axis, beside), axis))

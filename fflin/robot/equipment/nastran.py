@@ -48,9 +48,6 @@ def read_superelement(
         if not isinstance(unit, str) or unit not in known:
             raise unknown(f"unit of {what}", str(unit), known)
     files = as_path(op4), as_path(asm)
-    for path in files:
-        if not path.is_file():
-            raise InputError(f"{path}: there is no such file")
     remember(*files)
     boundary, rigid, points = _boundary(files[1])
     M, K = _matrices(files[0], len(boundary))
@@ -110,11 +107,11 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
         ) from None
     keep = kept[0] if kept else np.ones(len(rigid), dtype=bool)
     boundary = np.asarray(boundary, dtype=bool)
-    if not boundary.any() or boundary.all():
-        what = "boundary grids (GRID)" if not boundary.any() else "modes (SPOINT)"
-        raise InputError(f"{path} names no {what}; expected those of a Craig-Bampton superelement")
-    if not np.isfinite(points).all() or not len(points):
-        raise InputError(f"{path} has grids without coordinates")
+    if not boundary.any() or boundary.all() or not np.isfinite(points).all() or not len(points):
+        raise InputError(
+            f"{path} names no boundary grids (GRID) with coordinates, or no modes (SPOINT); "
+            "expected those of a Craig-Bampton superelement"
+        )
     return boundary[keep], np.asarray(rigid)[keep], points
 
 
@@ -138,15 +135,15 @@ def _matrices(path: Path, size: int) -> tuple[Array, Array]:
                 f"{', '.join(by_name) or 'no matrix'}"
             )
         matrix = np.asarray(by_name[name], dtype=float)
-        if matrix.shape != (size, size):
+        if (
+            matrix.shape != (size, size)
+            or not np.isfinite(matrix).all()
+            or np.abs(matrix - matrix.T).max() > _SHARE * np.abs(matrix).max()
+        ):
             raise InputError(
-                f"{what} matrix '{name}' of {path} has shape {matrix.shape}, but the .asm file has "
-                f"{size} degrees of freedom"
+                f"{what} matrix '{name}' of {path} has shape {matrix.shape}; expected a finite, "
+                f"symmetric matrix of the {size} degrees of freedom of the .asm file"
             )
-        if not np.isfinite(matrix).all():
-            raise InputError(f"{what} matrix '{name}' of {path} has entries that are not finite")
-        if np.abs(matrix - matrix.T).max() > _SHARE * np.abs(matrix).max():
-            raise InputError(f"{what} matrix '{name}' of {path} is not symmetric")
         matrices.append(0.5 * (matrix + matrix.T))
     return matrices[0], matrices[1]
 
@@ -176,13 +173,11 @@ def _eigenpairs(path: Path, K: Array, M: Array) -> tuple[Array, Array]:
     try:
         squares, shapes = eigh(K, M)
     except LinAlgError:
-        raise InputError(
-            f"the modal mass matrix of {path} is not positive definite; the file is damaged, or "
-            "its modes are not independent"
-        ) from None
+        squares = np.zeros(1)
     if not squares[0] > 0.0:
         raise InputError(
-            f"mode 1 of {path} has no stiffness; expected modes that are clamped at the boundary"
+            f"the modal mass or stiffness of {path} is not positive definite; expected independent "
+            "modes that are clamped at the boundary"
         )
     return np.asarray(squares), np.asarray(shapes)
 

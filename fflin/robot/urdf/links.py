@@ -8,9 +8,6 @@ import pinocchio as pin
 
 from fflin.robot.urdf.xml import Element, enumerated, named, nearest, quoted
 
-# Beyond it nothing is physical, and products of two such numbers stay far from overflow.
-_ABSURD = 1e30
-
 # From 1e8 m on, in double precision the square of the length swallows that of a metre, and with
 # it what the links weigh about their own joints: ABA then divides zero by zero.
 _FARTHEST = 1e7  # [m]
@@ -68,12 +65,12 @@ def read_link(element: Element) -> Link:
     refuse_near_miss(inertial, of, ("origin", "mass", "inertia"))
     mass_element = inertial.require("mass", f"<inertial> of {of}")
     mass_element.allow_only("value", of=of)
-    mass = bounded(mass_element, "mass", of, mass_element.number("value", f"<mass> of {of}"))
+    mass = mass_element.number("value", f"<mass> of {of}")
     if mass < 0.0:
         raise mass_element.error(f"mass of {of} is {mass:g} kg, expected 0 or more; correct it")
     inertia = inertial.require("inertia", f"<inertial> of {of}")
     inertia.allow_only(*INERTIA, of=of)
-    moments = tuple(bounded_number(inertia, entry, of) for entry in INERTIA)
+    moments = tuple(inertia.number(entry, f"<inertia> of {of}") for entry in INERTIA)
     return Link(name, element, mass, read_pose(inertial, of), moments)
 
 
@@ -88,10 +85,11 @@ def read_pose(element: Element, of: str) -> Pose:
         origin.vector(name, what, 3) if name in origin.attributes else (0.0, 0.0, 0.0)
         for name in ("xyz", "rpy")
     )
-    for entry in xyz:
-        bounded_length(origin, "xyz", of, entry)
-    for entry in rpy:
-        bounded(origin, "rpy", of, entry)
+    if (longest := max(map(abs, xyz))) > _FARTHEST:
+        raise origin.error(
+            f"xyz of {of} has an entry of {longest:g} m, expected at most {_FARTHEST:g} m; correct "
+            "it"
+        )
     if "quat_xyzw" not in origin.attributes:
         return Pose(xyz, rpy)
     if "rpy" in origin.attributes:
@@ -101,30 +99,6 @@ def read_pose(element: Element, of: str) -> Pose:
     if not abs(length - 1.0) <= _QUATERNION_SLACK:
         raise origin.error(f"quat_xyzw of {what} has length {length:g}, expected 1; normalise it")
     return Pose(xyz, rpy, tuple(float(entry / length) for entry in quaternion))
-
-
-def bounded_number(element: Element, name: str, of: str, default: float | None = None) -> float:
-    """Return an attribute that is one number, not absurdly large."""
-    value = element.number(name, f"<{element.tag}> of {of}", default)
-    return bounded(element, name, of, value)
-
-
-def bounded(element: Element, what: str, of: str, value: float) -> float:
-    """Return a number that is not absurdly large."""
-    if abs(value) > _ABSURD:
-        raise element.error(
-            f"{what} of {of} is {value:g}, expected a magnitude of at most {_ABSURD:g}; correct it"
-        )
-    return value
-
-
-def bounded_length(element: Element, what: str, of: str, value: float) -> float:
-    """Return a length [m] that is not too large for inertias about both of its ends."""
-    if abs(value) > _FARTHEST:
-        raise element.error(
-            f"{what} of {of} is {value:g} m, expected at most {_FARTHEST:g} m; correct it"
-        )
-    return value
 
 
 def refuse_near_miss(element: Element, of: str, known: tuple[str, ...]) -> None:

@@ -2,8 +2,7 @@
 
 import hashlib
 import sys
-import threading
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -26,13 +25,6 @@ from fflin.robot.urdf.links import INERTIA, Link, Pose, inertia_notes
 from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
 _SIZE_LIMIT = 64 * 2**20
-
-# Pinocchio's Data takes about 32 nv^3 bytes: 1 GiB for this many degrees of freedom.
-_LARGEST_NV = 322
-
-# Up to this depth the recursion of the parsers fits the smallest stack of a thread in use, 512 kB.
-_SHALLOW = 100
-_STACK = 16 * 2**20
 
 # What the values of attributes cannot hold as it is.
 _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
@@ -65,20 +57,18 @@ class Description(NamedTuple):
     sha256: str  # of the file as it was read, without files that a xacro includes
     mimics: dict[str, Mimic]  # of the joints that follow another, with independent leaders
     damping: dict[str, float]  # {joint: value} where not zero [N m s/rad | N s/m]
-    friction: dict[str, float]  # the same [N m | N]
-    meshes: tuple[str, ...]  # mesh files as it names them; they are not read
     links: dict[str, Link]  # those that weigh something
     joints: tuple[str, ...]  # all, as they stand in it
     notes: tuple[str, ...]  # warnings, one line each
     advice: tuple[Advice, ...] = ()  # those that hold where the robot's fields say no more
 
 
-def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
-    """Read a URDF, or a xacro, as a free-flying robot without the subtrees of `prune`."""
-    return describe(read_document(path), path, prune)
+def read_urdf(path: Path) -> Description:
+    """Read a URDF, or a xacro, as a free-flying robot."""
+    return describe(read_document(path), path)
 
 
-def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Description:
+def describe(document: bytes, path: Path) -> Description:
     """Read a URDF from the bytes of a file; `path` is its name in errors."""
     root = parse(document, str(path))
     notes: list[str] = []
@@ -88,40 +78,43 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     if path.suffix == ".xacro" or first:
         expanded, notes = expand(path, document, first)
         root = parse(expanded, f"{path} as expanded by xacro")
-        if left := first_xacro(root):
-            raise left.error(
-                f"<{left.tag}> still holds xacro after the expansion; define or include the "
-                "missing macro"
-            )
-    urdf = read_description(root, prune)
+    urdf = read_description(root)
     mimics = resolve_mimics(urdf.joints)
-    model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
+    model = _build(urdf, path, counted_leaders(urdf.joints, mimics))
     notes += notes_of(root)
     notes += inertia_notes(urdf.links.values(), model, path.stem)
-
-    named_meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
-    meshes, digest = tuple(dict.fromkeys(named_meshes)), hashlib.sha256(document).hexdigest()
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
     damping = {joint.name: joint.damping for joint in moving if joint.damping}
-    friction = {joint.name: joint.friction for joint in moving if joint.friction}
-    resistances = {"damping": ("damping", damping), "Coulomb friction": ("friction", friction)}
-    advice = [
-        Advice(key, tuple(values), f"{path.stem}: {what} unused: {enumerated(list(values))}")
-        for what, (key, values) in resistances.items()
-        if values
-    ]
-    unlimited: dict[tuple[str, ...], list[str]] = {}
-    for what in ("effort", "velocity"):
-        zero = tuple(joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0)
-        unlimited.setdefault(zero, []).append(what)
-    for zero, of in unlimited.items():
-        if zero:
-            joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
-            text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
-            advice.append(Advice("passive", zero, text))
-    weights = {name: link for name, link in urdf.links.items() if link.mass}
-    of_links, said = (weights, tuple(urdf.joints)), (tuple(notes), tuple(advice))
-    return Description(model, digest, mimics, damping, friction, meshes, *of_links, *said)
+    return Description(
+        model,
+        hashlib.sha256(document).hexdigest(),
+        mimics,
+        damping,
+        links={name: link for name, link in urdf.links.items() if link.mass},
+        joints=tuple(urdf.joints),
+        notes=tuple(notes),
+        advice=tuple(_advice(moving, path.stem)),
+    )
+
+
+def _advice(moving: list[JointElement], origin: str) -> Iterator[Advice]:
+    """Yield warnings of dampers, friction and limits of the file that the model ignores."""
+    damped = tuple(joint.name for joint in moving if joint.damping)
+    rubbing = tuple(joint.name for joint in moving if joint.friction)
+    zero = {
+        what: tuple(joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0)
+        for what in ("effort", "velocity")
+    }
+    if damped:
+        yield Advice("damping", damped, f"{origin}: damping unused: {enumerated(damped)}")
+    if rubbing:
+        text = f"{origin}: Coulomb friction unused: {enumerated(rubbing)}"
+        yield Advice("friction", rubbing, text)
+    for joints in dict.fromkeys(filter(None, zero.values())):
+        of = named("joint", joints) if len(joints) < 3 else f"{len(joints)} joints"
+        limits = ", ".join(what for what, names in zero.items() if names == joints)
+        text = f"{origin}: {limits} 0 of {of}: no limit (or passive)"
+        yield Advice("passive", joints, text)
 
 
 def read_document(path: Path) -> bytes:
@@ -129,28 +122,19 @@ def read_document(path: Path) -> bytes:
     return read_file(path, "URDF", _SIZE_LIMIT)
 
 
-def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> pin.Model:
-    nv = 6 + sum(joint.freedom for joint in urdf.joints.values())
-    if nv > _LARGEST_NV:
-        raise root.error(
-            f"the joints have {nv - 6} degrees of freedom, expected at most {_LARGEST_NV - 6}, "
-            "for which Pinocchio's Data takes 1 GiB; change the type of unimportant joints to fixed"
-        )
+def _build(urdf: Urdf, path: Path, counted: Collection[str]) -> pin.Model:
     root_joint = "root_joint"
     while root_joint in urdf.joints or root_joint in urdf.links:
         root_joint += "_"
     document = write_urdf(urdf, counted)
     try:
-        model = _with_stack(
-            urdf.depth,
-            lambda: pin.buildModelFromXML(document, pin.JointModelFreeFlyer(), root_joint),
-        )
+        model = pin.buildModelFromXML(document, pin.JointModelFreeFlyer(), root_joint)
     except (ValueError, RuntimeError) as error:
         raise UrdfError(
             f"{path}: Pinocchio cannot build the model: {' '.join(str(error).split())[:300]}"
         ) from None
     moving = {joint.name for joint in urdf.joints.values() if joint.freedom}
-    if set(model.names) != {"universe", root_joint, *moving} or model.nv != nv:
+    if set(model.names) != {"universe", root_joint, *moving} or "universe" in moving:
         raise UrdfError(
             f"{path}: the joints that Pinocchio built differ from the joints in the file; rename "
             "joints with unusual names"
@@ -159,21 +143,6 @@ def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> p
     # The name of a file need not be text.
     model.name = urdf.name or path.stem.encode(errors="backslashreplace").decode()
     return model
-
-
-def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
-    """Call a function that recurses along the tree, with a large enough stack."""
-    if depth <= _SHALLOW:
-        return call()
-    from concurrent.futures import ThreadPoolExecutor
-
-    with ThreadPoolExecutor(1) as other:
-        usual = threading.stack_size(_STACK)
-        try:
-            built = other.submit(call)
-        finally:
-            threading.stack_size(usual)
-        return built.result()
 
 
 def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:

@@ -10,18 +10,11 @@ import sys
 def main(path: str, limit: float) -> None:
     """Expand stdin; write to stdout a line of JSON, the files that were read, and the document."""
     import contextlib
-    import ctypes
     import faulthandler
     import json
-    import signal
     from pathlib import Path
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever started it ends it
-    # It ends with who started it, or else in time, whatever it does.
-    if sys.platform == "linux":
-        set_death_signal = 1  # of prctl.h
-        ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
-    faulthandler.dump_traceback_later(limit, exit=True)
+    faulthandler.dump_traceback_later(limit, exit=True)  # even if its parent has ended
     import xacro
     from xacrodoc import XacroDoc, packages
 

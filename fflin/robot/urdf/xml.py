@@ -5,24 +5,26 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from xml.parsers import expat
 
 from fflin.base.errors import UrdfError, listed
 
-# URDFs nest some 10 elements and hold some 10,000; these only keep hostile input off.
+# URDFs nest some 10 elements; deeper ones would exceed the recursion limit.
 _DEPTH_LIMIT = 100
-_ELEMENT_LIMIT = 500_000
-_TAG_LIMIT = 2**20  # bytes
+
+# No physical value is larger, and products of two such numbers do not overflow.
+_LARGEST = 1e30
 
 # Between xzy and xyz, quat and quat_xyzw; unit and value are farther apart.
 _NEAR = 0.6
 
 _SPACE = " \t\r\n"
-_ENTITY = re.compile(rb"&(?!(amp|lt|gt|quot|apos);|#)")
-_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_DECIMAL = re.compile(
+    r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|inf(inity)?)", re.IGNORECASE | re.ASCII
+)
 
 
 @lru_cache(128)  # a file has a few of them many times
@@ -104,39 +106,34 @@ class Element:
         return value
 
     def number(self, name: str, of: str, default: float | None = None) -> float:
-        """Return an attribute that is one finite decimal number."""
+        """Return an attribute that is one decimal number of at most 1e30."""
         if default is not None and name not in self.attributes:
             return default
-        text = self.text(name, of).strip(_SPACE)
-        return self._decimal(text, f"{name} of {of}")
+        return self._decimal(self.text(name, of).strip(_SPACE), f"{name} of {of}")
 
     def vector(self, name: str, of: str, size: int) -> tuple[float, ...]:
         """Return an attribute that is `size` finite decimal numbers."""
         text = self.text(name, of)
         entries = re.split(rf"[{_SPACE}]+", text.strip(_SPACE))
-        if "," in text:
-            raise self.error(
-                f"{name} of {of} is {quoted(text)}; expected {size} numbers separated by spaces, "
-                "no commas"
-            )
         if len(entries) != size:
             raise self.error(
                 f"{name} of {of} is {quoted(text)}, which has {len(entries)} entries; expected "
-                f"{size} numbers separated by spaces"
+                f"{size} numbers separated by spaces, without commas"
             )
         return tuple(self._decimal(entry, f"{name} of {of}") for entry in entries)
 
     def _decimal(self, text: str, what: str) -> float:
         value = decimal(text)
-        if not math.isfinite(value):
+        if not abs(value) <= _LARGEST:
             raise self.error(
-                f"{what} is {quoted(text)}; expected a plain finite number, such as 0.5"
+                f"{what} is {quoted(text)}; expected a finite number, such as 0.5, of at most "
+                f"{_LARGEST:g}"
             )
         return value
 
 
 def decimal(text: str) -> float:
-    """Return a decimal number, infinite if it overflows; NaN for any other text."""
+    """Return a decimal number, which may be infinite; NaN for any other text."""
     return float(text) if _DECIMAL.fullmatch(text) else math.nan
 
 
@@ -145,12 +142,12 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= 60 else f"{text[:57]}...")
 
 
-def enumerated(names: list[str]) -> str:
+def enumerated(names: Iterable[str]) -> str:
     """Show names of a file in a sentence: the first six, and how many more there are."""
     return listed(map(quoted, names))
 
 
-def named(kind: str, names: list[str]) -> str:
+def named(kind: str, names: Sequence[str]) -> str:
     """Show names after their kind: joint 'a', joints 'a', 'b'."""
     return f"{kind}{'s' if len(names) > 1 else ''} {enumerated(names)}"
 
@@ -161,96 +158,46 @@ def notes_of(root: Element) -> list[str]:
     origin = root.origin.rpartition(os.sep)[2]
     return [
         f"{origin}:{lines[0]}: {message}"
-        + (f" (and in {len(lines) - 1} more places)" if len(lines) > 2 else "")
-        + (f" (and in line {lines[1]})" if len(lines) == 2 else "")
+        + (f" (also {len(lines) - 1} more times)" if len(lines) > 1 else "")
         for message, lines in root.notes.items()
     ]
 
 
 def parse(document: bytes, origin: str) -> Element:
     """Return the root of a document in the encoding that it declares, without entities."""
-    if not document.strip():
-        raise UrdfError(f"{origin}: the file is empty; expected a URDF with a <robot>")
-    builder = _Builder(origin)
-    try:
-        builder.parse(document)
-    except expat.ExpatError as error:
-        raise UrdfError(f"{origin}:{error.lineno}: {_explain(error)}") from None
-    except (LookupError, ValueError) as error:
-        if isinstance(error, UrdfError):
-            raise
-        raise UrdfError(
-            f"{origin}: its declared encoding cannot be read ({error}); save it as UTF-8"
-        ) from None
-    return builder.root.children[0]
+    top = Element("", {}, 0, origin)
+    opened, parser = [top], expat.ParserCreate()
 
-
-def _explain(error: expat.ExpatError) -> str:
-    what = expat.errors.messages[error.code]
-    advice = {
-        "junk after document element": "text follows the end of the root element; remove "
-        "everything after </robot>",
-        "unknown encoding": "its declared encoding is unknown; save it as UTF-8",
-    }
-    return advice.get(
-        what, f"not well-formed XML: {what} at column {error.offset + 1}; correct the file there"
-    )
-
-
-class _Builder:
-    def __init__(self, origin: str) -> None:
-        self.root = Element("", {}, 0, origin)
-        self._open = [self.root]
-        self._count = 0
-        self.parser = expat.ParserCreate()
-        self.parser.StartElementHandler = self._start
-        self.parser.EndElementHandler = lambda _: self._open.pop()
-        # A document type may be named; one that is declared elsewhere is not read.
-        self.parser.EntityDeclHandler = self._refuse_entities
-        self.parser.NotStandaloneHandler = self._meet_unread_declarations
-        self._unread = False
-
-    def parse(self, document: bytes) -> None:
-        # In pieces, for expat's time for one tag grows faster than its length.
-        parser, step = self.parser, _TAG_LIMIT // 4
-        for begin in range(0, len(document), step):
-            parser.Parse(document[begin : begin + step], False)
-            if begin - parser.CurrentByteIndex > _TAG_LIMIT:
-                raise UrdfError(
-                    f"{self.root.origin}:{parser.CurrentLineNumber}: a tag or comment is longer "
-                    f"than {_TAG_LIMIT} bytes; shorten it"
-                )
-        parser.Parse(b"", True)
-        # Where declarations are not read, expat drops entities that it does not know from
-        # attributes in silence. Without its zeros, UTF-16 is ASCII where it matters.
-        if self._unread and _ENTITY.search(document.replace(b"\0", b"")):
-            raise UrdfError(
-                f"{self.root.origin}: the file uses an entity that it does not declare; replace "
-                "the entity by its text"
-            )
-
-    def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        element = Element(
-            tag, attributes, self.parser.CurrentLineNumber, self.root.origin, [], self.root.notes
-        )
-        self._count += 1
-        if self._count > _ELEMENT_LIMIT:
-            raise element.error(
-                f"the file has more than {_ELEMENT_LIMIT} elements; reduce it to the robot"
-            )
-        if len(self._open) > _DEPTH_LIMIT:
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        element = Element(tag, attributes, parser.CurrentLineNumber, origin, [], top.notes)
+        if len(opened) > _DEPTH_LIMIT:
             raise element.error(
                 f"elements are nested more than {_DEPTH_LIMIT} deep; check for a missing end tag"
             )
-        self._open[-1].children.append(element)
-        self._open.append(element)
+        opened[-1].children.append(element)
+        opened.append(element)
 
-    def _meet_unread_declarations(self) -> int:
-        self._unread = True
-        return 1
-
-    def _refuse_entities(self, *_: object) -> None:
+    def refuse_document_type(*_: object) -> None:
+        # It may declare entities, which can be read from elsewhere or be of any length.
         raise UrdfError(
-            f"{self.root.origin}:{self.parser.CurrentLineNumber}: entities (<!ENTITY>) are not "
-            "supported; remove the declaration and replace each entity by its text"
+            f"{origin}:{parser.CurrentLineNumber}: document types (<!DOCTYPE>) and entities are "
+            "not supported; remove the declaration and replace each entity by its text"
         )
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda _: opened.pop()
+    parser.StartDoctypeDeclHandler = refuse_document_type
+    try:
+        parser.Parse(document, True)
+    except expat.ExpatError as error:
+        raise UrdfError(
+            f"{origin}:{error.lineno}: not well-formed XML: {expat.errors.messages[error.code]} at "
+            f"column {error.offset + 1}; correct the file there"
+        ) from None
+    except UrdfError:
+        raise
+    except (LookupError, ValueError) as error:
+        raise UrdfError(
+            f"{origin}: its declared encoding cannot be read ({error}); save it as UTF-8"
+        ) from None
+    return top.children[0]

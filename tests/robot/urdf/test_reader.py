@@ -2,11 +2,6 @@
 
 import hashlib
 import math
-import os
-import select
-import subprocess
-import sys
-import threading
 import warnings
 from pathlib import Path
 
@@ -20,7 +15,6 @@ from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.reader import describe, read_urdf
 from fflin.robot.urdf.xml import parse
 from tests.support.messages import says
-from tests.support.patience import finishing
 from tests.support.reader_corpus import (
     AXIS,
     INERTIA,
@@ -123,14 +117,6 @@ def test_without_a_limit_there_is_none(kind):
     assert model.effortLimit[6] > 1e300 and model.velocityLimit[6] > 1e300
 
 
-def test_a_massless_root_with_one_floating_joint_is_the_world():
-    ends = (joint("free", "world", "a", "floating", '<origin xyz="1 0 0"/>'), joint("j", "a", "b"))
-    found = read(robot(link("world", ""), link("a"), link("b"), *ends))
-    assert list(found.model.names) == ["universe", "root_joint", "j"]
-    np.testing.assert_array_equal(found.model.inertias[1].lever, 0.0)
-    assert not found.model.existFrame("world")
-
-
 def test_half_a_limit_is_kept():
     model = read(arm(inside=AXIS + '<limit lower="-2" upper="3" effort="4"/>')).model
     assert (model.lowerPositionLimit[7], model.upperPositionLimit[7]) == (-2.0, 3.0)
@@ -225,21 +211,9 @@ def test_turns_of_a_continuous_leader_count(tmp_path, kind, multiplier, counted)
     np.testing.assert_allclose(q, fflin.configuration(loaded, {"j": 3.5}), atol=1e-12)
 
 
-def test_a_pruned_mimic_is_gone_and_a_pruned_leader_is_missed():
-    document = three("", "", '<mimic joint="j1"/>').encode()
-    assert describe(document, Path("r.urdf"), ["j3"]).mimics == {}
-    document = robot(
-        *map(link, "abc"),
-        joint("j", "a", "b", inside=AXIS + '<mimic joint="k"/>'),
-        joint("k", "a", "c"),
-    )
-    with pytest.raises(fflin.UrdfError, match=r"'j'.*'k'"):
-        describe(document.encode(), Path("r.urdf"), ["k"])
-
-
 def test_damping_and_friction_are_recorded_and_noted():
     found = read(arm(inside=AXIS + '<dynamics damping="0.25" friction="0.5"/>'))
-    assert (found.damping, found.friction) == ({"hinge": 0.25}, {"hinge": 0.5})
+    assert found.damping == {"hinge": 0.25}
     texts = [each.note for each in found.advice]
     assert ["damping" in text for text in texts] == [True, False]
     assert all("'hinge'" in text for text in texts)
@@ -338,32 +312,6 @@ def test_a_xacro_without_end_is_one_line(endless, monkeypatch):
 
 
 @pytest.mark.process
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere it ends in time")
-def test_a_xacro_ends_with_who_expands_it(tmp_path):
-    pytest.importorskip("xacrodoc")
-    path = tmp_path / "r.xacro"
-    # It says that it has begun, and never ends.
-    path.write_text(
-        arm(
-            child='<xacro:include filename="fifo"/>',
-            attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"',
-        )
-    )
-    os.mkfifo(tmp_path / "fifo")
-    with (
-        subprocess.Popen([sys.executable, "-m", "fflin", "info", path]) as process,
-        finishing(process),
-        # Opened for writing once xacro opens it for reading, and broken as xacro ends.
-        (tmp_path / "fifo").open("wb", buffering=0) as fifo,
-    ):
-        process.kill()
-        process.wait()
-        poll = select.poll()
-        poll.register(fifo, select.POLLERR)
-        assert poll.poll(55_000)
-
-
-@pytest.mark.process
 def test_xacro_includes_from_its_own_folder(tmp_path):
     pytest.importorskip("xacrodoc")
     namespace = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
@@ -381,14 +329,6 @@ def test_lines_of_elements():
     assert [(e.tag, e.line) for e in root.iterate()] == [("a", 3), ("c", 5), ("d", 5)]
 
 
-def test_the_stack_size_of_threads_is_left_as_it_was():
-    before = threading.stack_size()
-    links = [link(f"l{k}") for k in range(200)]
-    joints = [joint(f"j{k}", f"l{k}", f"l{k + 1}", "fixed") for k in range(199)]
-    assert read(robot(*links, *joints)).model.inertias[1].mass == 200.0
-    assert threading.stack_size() == before
-
-
 def test_wrong_and_infinite_limits_are_none():
     for limit in ('lower="-inf" upper="inf" effort="inf"', 'lower="" upper="-" effort="-1"'):
         model = read(arm(inside=f"{AXIS}<limit {limit}/>")).model
@@ -399,7 +339,7 @@ def test_wrong_and_infinite_limits_are_none():
 def test_a_note_is_told_once_for_all_its_lines():
     document = robot(*(link(name) for name in "abc"), joint("j", "a", "b"), joint("k", "a", "c"))
     (note,) = read(document.replace('<mass value="1"', '<mass unit="kg" value="1"')).notes
-    assert says(note, "robot.urdf:2: ", "'unit'", "<mass>", "2 more")
+    assert says(note, "robot.urdf:2: ", "'unit'", "<mass>", "2 more times")
 
 
 def test_limit_given_is_the_limit():

@@ -1,0 +1,319 @@
+"""Coordinates of the state: names, units, axes, the attitude chart, and errors of states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import compress
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, cast, get_args
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.rotation import (
+    conjugate,
+    product,
+    quaternion_product,
+    rotation_matrices,
+    rotation_matrix,
+    skew,
+)
+from fflin.base.validation import Array
+from fflin.robot.inputs import BaseForce, BaseTorque
+from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from fflin.dynamics.state import StateMap
+
+Frame = Literal["hybrid", "local", "world", "lvlh", "hill"]
+
+# The frames of a circular orbit, which are the world of a robot that has one.
+ORBITAL: tuple[Frame, ...] = ("lvlh", "hill")
+
+# Which base velocities (omega_b, v_b), and wrenches (tau_b, F_b) with them, stand in the axes
+# of the reference instead of the base's.
+IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
+    "hybrid": (False, True),
+    "local": (False, False),
+    "world": (True, True),
+    **dict.fromkeys(ORBITAL, (False, True)),
+}
+
+# Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order,
+ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
+# and in Pinocchio's v and spatial vectors.
+PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
+
+
+def unknown_frame(frame: object) -> InputError:
+    """Build the error for an unknown velocity frame."""
+    return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
+
+
+def frame_of(robot: Robot, frame: object) -> Frame:
+    """Return the requested frame, or a robot's default frame, checked against its orbit."""
+    if frame is None:
+        return ORBITAL[0] if robot.orbit else "hybrid"
+    if not isinstance(frame, str) or frame not in get_args(Frame):
+        raise unknown_frame(frame)
+    if (frame in ORBITAL) != bool(robot.orbit):
+        suits = " or ".join(ORBITAL) if robot.orbit else "hybrid, local or world"
+        raise InputError(
+            f"frame is '{frame}', but '{robot.name}' is in {'an' if robot.orbit else 'no'} orbit; "
+            f"use {suits}{'' if robot.orbit else ', or give the robot an orbit (orbit=, --orbit)'}"
+        )
+    return cast("Frame", frame)
+
+
+def refuse_orbit(robot: Any, what: str) -> None:
+    """Raise `InputError` if a robot is in orbit, which `what` does not support."""
+    if getattr(robot, "orbit", None):
+        raise InputError(
+            f"{what} are defined only without an orbit, but '{robot.name}' is in orbit; remove the "
+            "orbit with robot.replace(orbit=None)"
+        )
+
+
+class Groups(NamedTuple):
+    """Slices of the six groups of the state."""
+
+    q_b: slice
+    r_b: slice
+    q_m: slice
+    omega_b: slice
+    v_b: slice
+    qdot_m: slice
+
+
+def state_units(robot: Robot) -> dict[str, str]:
+    """Return {name: unit} of the 12 + 2n states."""
+    units = dict.fromkeys(("q_b.x", "q_b.y", "q_b.z"), "1")
+    units |= dict.fromkeys(("r_b.x", "r_b.y", "r_b.z"), "m")
+    for joint in robot.joints:
+        units[f"q_m.{joint.name}"] = joint.unit
+    units |= dict.fromkeys(("omega_b.x", "omega_b.y", "omega_b.z"), "rad/s")
+    units |= dict.fromkeys(("v_b.x", "v_b.y", "v_b.z"), "m/s")
+    for joint in robot.joints:
+        units[f"qdot_m.{joint.name}"] = f"{joint.unit}/s"
+    return units
+
+
+def forces_of(robot: Robot) -> dict[str, str]:
+    """Return {name: unit} of the 6 + n generalised forces."""
+    units = dict.fromkeys(("tau_b.x", "tau_b.y", "tau_b.z"), BaseTorque.UNIT)
+    units |= dict.fromkeys(("F_b.x", "F_b.y", "F_b.z"), BaseForce.UNIT)
+    for joint in robot.joints:
+        units[f"tau_m.{joint.name}"] = joint.force_unit
+    return units
+
+
+# Where q0 is below the square root of the rounding unit, sqrt(1 - |q_b|^2) has no correct digit.
+SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
+
+_IDENTITY = np.eye(3)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Attitude chart at one or many base attitudes relative to the reference."""
+
+    standing: ClassVar[bool] = False  # whether the base is at the reference
+
+    q_b: Array  # vector part (.., 3) of the quaternion of refMb
+    q0: float | Array  # its scalar part (.., 1), positive
+    R: Array  # refMb.rotation (.., 3, 3)
+
+    @classmethod
+    def of(cls, quaternion: Array) -> Chart:
+        """Return the chart at unit quaternions (.., 4) of refMb, of either sign."""
+        if quaternion.ndim == 1:
+            quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
+            return cls(quaternion[:3], float(quaternion[3]), rotation_matrix(quaternion))
+        quaternion = quaternion * np.where(quaternion[..., 3:] < 0.0, -1.0, 1.0)
+        return cls(quaternion[..., :3], quaternion[..., 3:], rotation_matrices(quaternion))
+
+    @cached_property
+    def Q(self) -> Array:
+        """Q (.., 3, 3) of the quaternion kinematics (1.2): d q_b/dt = Q omega / 2."""
+        return np.asarray(self.q0)[..., None] * _IDENTITY + skew(self.q_b)
+
+    @cached_property
+    def N(self) -> Array:
+        """N = Q / 2 (.., 3, 3)."""
+        return 0.5 * self.Q
+
+    @cached_property
+    def J(self) -> Array:
+        """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes (1.3)."""
+        # Q^-1 = Q^T + q_b q_b^T / q0.
+        return 2.0 * (self.Q.mT + self._over_q0(self.q_b))
+
+    @cached_property
+    def _back(self) -> Array:
+        return np.ascontiguousarray(self.R.mT)
+
+    def rate(self, omega: Array) -> Array:
+        """Return d q_b/dt = N omega (.., 3), omega in base axes (1.2)."""
+        return 0.5 * omega if self.standing else times(self.N, omega)
+
+    def rotated(self, vectors: Array) -> Array:
+        """Return vectors (.., 3) in base axes in reference axes."""
+        return vectors if self.standing else times(self.R, vectors)
+
+    def turned(self, columns: Array) -> Array:
+        """Return columns (.., 3, k) in base axes in reference axes."""
+        return columns if self.standing else product(self.R, columns)
+
+    def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
+        """Return the derivative (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
+        return -0.5 * (crossed if self.standing else crossed + self._over_q0(omega))
+
+    def _over_q0(self, omega: Array) -> Array:
+        return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
+
+    def over_q_b(self, by_turn: Array) -> Array:
+        """Return derivatives (.., k, 3) over base rotations as derivatives over q_b (1.3)."""
+        return 2.0 * by_turn if self.standing else product(by_turn, self.J)
+
+    def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
+        """Rotate parts of x (.., m, k), three rows each, by R in place."""
+        _turn(self.R, () if self.standing else parts, x)
+
+    def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
+        """Rotate parts of x (.., k, m), three columns each, by R^T in place."""
+        for columns in () if self.standing else parts:
+            x[..., columns] = product(x[..., columns], self._back)
+
+    def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
+        """Return x (.., m, k) with some parts, three rows each, turned by R."""
+        return x if self.standing or not parts else _turn(self.R, parts, x.copy("K"))
+
+    def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
+        """Return x (.., m, k) with some parts, three rows each, turned to base axes by R^T."""
+        return x if self.standing or not parts else _turn(self._back, parts, x.copy("K"))
+
+
+class Standing(Chart):
+    """Chart of one or many bases at the reference, where R = Q = I and J = 2 I."""
+
+    standing = True
+    N = 0.5 * _IDENTITY
+
+    def __init__(self, *count: int) -> None:
+        super().__init__(np.zeros((*count, 3)), 1.0, _IDENTITY)
+
+
+def times(matrices: Array, vectors: Array) -> Array:
+    """Return matrices (.., 3, 3) times vectors (.., 3)."""
+    return (matrices @ vectors[..., None])[..., 0]
+
+
+def _turn(R: Array, parts: tuple[slice, ...], x: Array) -> Array:
+    for rows in parts:
+        x[..., rows, :] = product(R, x[..., rows, :])
+    return x
+
+
+_TURN = 2.0 * np.pi
+
+
+def states_of(state: StateMap, q: Array, nu: Array) -> Array:
+    """Return the states (.., nx) of valid q (.., nq) and nu (.., 6 + n) in base axes."""
+    return state.compose(state.charts(q), state.positions(q), state.joint_positions(q), nu)
+
+
+def unwound(state: StateMap, x: Array, near: Any = 0.0) -> Array:
+    """Remove full turns of continuous joints from states or errors (.., nx), in place.
+
+    Their angles are then within half a turn of those of `near` (nx,).
+    """
+    joints = 6 + state.unbounded
+    apart = x[..., joints] - np.broadcast_to(near, state.nx)[joints]
+    x[..., joints] -= _TURN * np.round(apart / _TURN)
+    return x
+
+
+def state_history(
+    state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
+) -> Array:
+    """Return the states (N, nx) of a motion; continuous joints count turns, from `near` on."""
+    # With the times t (N,) as many turns as the rates make between rows, else less than half of
+    # one.
+    rates = state.velocities(v)
+    x = states_of(state, q, rates)
+    q_m = x[:, state.groups.q_m]
+    before = np.zeros(q_m.shape[1]) if near is None else near[state.groups.q_m]
+    if (k := state.unbounded).size:
+        q_m[:, k] = np.unwrap(np.vstack((before, q_m))[:, k], axis=0)[1:]
+        if t is not None:
+            turned = 0.5 * np.diff(t)[:, None] * (rates[1:, 6 + k] + rates[:-1, 6 + k])
+            turns = np.round((turned - np.diff(q_m[:, k], axis=0)) / _TURN)
+            q_m[1:, k] += _TURN * turns.cumsum(axis=0)
+    return x
+
+
+def attitude_errors(x: Array, target: Array) -> Array:
+    """Return the angles (N,) [deg] between the attitudes of states and of a target, or of rows."""
+    turned, scalar = _apart(x, target)
+    angles: Array = 2.0 * np.arctan2(np.linalg.norm(turned, axis=1), np.abs(scalar[:, 0]))
+    return np.degrees(angles)
+
+
+def _apart(x: Array, target: Array) -> tuple[Array, Array]:
+    """Return the vector part (N, 3) and the scalar part (N, 1) of target^-1 x."""
+    at, to = x[:, :3], target[..., :3]
+    w, d = (
+        np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
+        for each in (at, to)
+    )
+    return d * at - w * to - np.cross(to, at), w * d + (at * to).sum(axis=-1, keepdims=True)
+
+
+def moving_errors(frame: str, x: Array, target: Array) -> Array:
+    """Return the errors (N, nx) of states from a moving reference, in its axes (9.5)."""
+    e, (_, R), (_, R_target) = x - target, _turned(x), _turned(target)
+    turned, scalar = _apart(x, target)
+    e[:, :3] = turned * np.where(scalar < 0.0, -1.0, 1.0)
+    e[:, 3:6] = (e[:, None, 3:6] @ R_target)[:, 0]
+    for rows in _in_reference(frame, x.shape[1]):
+        e[:, rows] = (x[:, None, rows] @ R - target[:, None, rows] @ R_target)[:, 0]
+    return e
+
+
+def moved_by(frame: str, target: Array, e: Array) -> Array:
+    """Return the states (N, nx) whose `moving_errors` are e; not finite if |q_b| exceeds 1."""
+    x, (turn_target, R_target), (turn, R) = target + e, _turned(target), _turned(e)
+    q_e, q_target = e[:, :3], target[:, :3]
+    x[:, :3] = turn_target * q_e + turn * q_target + np.cross(q_target, q_e)
+    scalar = turn * turn_target - (q_e * q_target).sum(axis=1, keepdims=True)
+    x[:, :3] *= np.where(scalar < 0.0, -1.0, 1.0)
+    x[:, 3:6] = target[:, 3:6] + (R_target @ e[:, 3:6, None])[..., 0]
+    R = R_target @ R
+    for rows in _in_reference(frame, x.shape[1]):
+        own = (target[:, None, rows] @ R_target)[:, 0] + e[:, rows]
+        x[:, rows] = (R @ own[..., None])[..., 0]
+    return x
+
+
+def _turned(x: Array) -> tuple[Array, Array]:
+    """Return the scalar part (N, 1) of the attitude of states, not negative, and the rotation."""
+    scalar = np.sqrt(1.0 - (x[:, :3] ** 2).sum(axis=1, keepdims=True))
+    return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
+
+
+def _in_reference(frame: str, nx: int) -> list[Any]:
+    """Return the rows of the base velocities in reference axes."""
+    velocities = np.arange(nx)[nx // 2 :]
+    return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
+
+
+def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array) -> Array:
+    """Return the error (nx,) from a moving reference, in its axes."""
+    g = state.groups
+    e = np.empty(state.nx)
+    turned = quaternion_product(conjugate(q_star[3:7]), q[3:7])
+    e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
+    e[g.r_b] = rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
+    e[g.q_m] = state.joints_apart(q_star, q)
+    e[-6 - state.robot.n :] = state.velocities(v - v_star)
+    return e
