@@ -1,5 +1,7 @@
 """Step, sample time, delay, recorded rows and duration of a simulation."""
 
+from __future__ import annotations
+
 import math
 import warnings
 from typing import TYPE_CHECKING, Any, NamedTuple
