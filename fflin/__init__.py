@@ -50,8 +50,7 @@ _PUBLIC = {
     },
     "Analysis": {
         "analysis.controllability": ["controllability", "Controllability"],
-        "analysis.observability": ["observability", "Observability"],
-        "analysis.gramians": ["gramians", "Gramians"],
+        "analysis.observability": ["observability", "Observability", "gramians", "Gramians"],
         "analysis.modes": ["modes", "Modes", "Mode"],
         "analysis.effective_masses": ["effective_masses", "EffectiveMasses"],
         "analysis.relative_equilibria": [

@@ -63,8 +63,8 @@ from fflin.analysis.controllability import controllability as controllability
 from fflin.analysis.controllability import Controllability as Controllability
 from fflin.analysis.observability import observability as observability
 from fflin.analysis.observability import Observability as Observability
-from fflin.analysis.gramians import gramians as gramians
-from fflin.analysis.gramians import Gramians as Gramians
+from fflin.analysis.observability import gramians as gramians
+from fflin.analysis.observability import Gramians as Gramians
 from fflin.analysis.modes import modes as modes
 from fflin.analysis.modes import Modes as Modes
 from fflin.analysis.modes import Mode as Mode

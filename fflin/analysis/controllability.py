@@ -14,7 +14,6 @@ from fflin.analysis.names import (
     momentum_names,
     undecided,
     unsettled,
-    with_rates,
 )
 from fflin.analysis.ranks import (
     FixedPoles,
@@ -100,7 +99,7 @@ class Controllability(FrozenArrays):
             f"{'' if self.stabilizable else 'not '}stabilizable"
         ]
         if self.uncontrollable:
-            lines.append(f"controllable: {with_rates(self.controllable)}")
+            lines.append(f"controllable: {', '.join(self.controllable)}")
             lines.append(f"uncontrollable: {', '.join(grouped(self.uncontrollable))}")
             placed = [f"{what} {count}" for what, count in self.reach.items()]
             lines.append(f"controllable directions: {', '.join(placed)}")

@@ -59,16 +59,6 @@ def rate_of(name: str) -> str:
     return f"{_RATES[group]}.{member}" if group in _RATES else ""
 
 
-def with_rates(names: tuple[str, ...]) -> str:
-    """List names in a sentence; a position and its rate are named together."""
-    pairs = {name: rate_of(name) for name in names if rate_of(name) in names}
-    if not pairs:
-        return ", ".join(names) or "none"
-    alone = [name for name in names if name not in pairs and name not in pairs.values()]
-    rates = "its rate" if len(pairs) == 1 else "their rates"
-    return "; ".join((f"{', '.join(pairs)} and {rates}", *alone))
-
-
 def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:
     """Show a linear combination by its largest terms; `sizes` makes the weights comparable."""
     order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 # Of the two routes to a block, one is drawn above its line and one below.
 _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
-# Bodies with a smaller fraction of the kinetic energy of a mode are not written.
-_LEAST = 0.005
-
 
 def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     """Draw the magnitudes of all entries of A and B that exceed rounding error, by state groups.
@@ -57,17 +54,22 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
         entries = np.concatenate([m.compressed() for m in drawn])
         top = float(entries.max(initial=0.0)) or 1.0
         norm = LogNorm(float(entries.min(initial=top)), 1.01 * top)
-        rows = lin.state_names, lin.state_names, lin.state_units
-        inputs = lin.input_names, input_keys(lin), lin.input_units
+        signals = (
+            (lin.state_names, lin.state_names, lin.state_units),
+            (lin.input_names, input_keys(lin), lin.input_units),
+        )
         letters = letters_of(1, 72.0 * cell)
-        for ax, sizes, columns in zip(axes, drawn, (rows, inputs), strict=True):
+        groups = [first for first, *_ in runs(lin.state_names, lin.state_units)[1:]]
+        for ax, sizes, (names, keys, units) in zip(axes, drawn, signals, strict=True):
             image = ax.imshow(sizes, cmap="viridis_r", norm=norm)
             ax.grid(visible=False)
             ax.spines[:].set_visible(True)
-            _name(ax, "x", *columns, letters)
-            _name(ax, "y", *rows, letters)
-            ax.tick_params("x", rotation=90)
-        axes[0].child_axes[1].set_yticks([])
+            ax.set_xticks(range(len(names)), names, fontsize=letters, rotation=90)
+            for first, *_ in runs(keys, units)[1:]:
+                ax.axvline(first - 0.5, color="#888888", lw=0.6)
+            for first in groups:
+                ax.axhline(first - 0.5, color="#888888", lw=0.6)
+        axes[0].set_yticks(range(nx), lin.state_names, fontsize=letters)
         axes[1].set_yticks([])
         axes[0].set_title(f"A ({nx} x {nx})")
         axes[1].set_title(f"B ({nx} x {nu})")
@@ -80,33 +82,8 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def _name(
-    axes: Axes,
-    side: str,
-    names: Sequence[str],
-    keys: Sequence[str],
-    units: Sequence[str],
-    size: float,
-) -> None:
-    """Name rows ("y") or columns ("x") on one side and their groups on the other, with lines."""
-    across = side == "x"
-    axis = axes.xaxis if across else axes.yaxis
-    axis.set_ticks(range(len(names)), [name.rpartition(".")[2] for name in names], fontsize=size)
-    opposite = axes.secondary_xaxis("top").xaxis if across else axes.secondary_yaxis("right").yaxis
-    found = runs(keys, units)
-    opposite.set_ticks(
-        [(first + last) / 2.0 for first, last, _, _ in found],
-        [f"{group}{chr(10) if across else ' '}[{of}]" for _, _, group, of in found],
-        # Three axes of the base are the narrowest group that stands beside others.
-        fontsize=max(4.0, min(7.0, 0.9 * size)) if across else 7.0,
-    )
-    opposite.set_tick_params(length=0)
-    for first, *_ in found[1:]:
-        (axes.axvline if across else axes.axhline)(first - 0.5, color="#888888", lw=0.6)
-
-
 def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
-    """Draw the frequency, damping and shape of each mode, and the bodies' kinetic energies.
+    """Draw the frequency, damping and shape of each mode.
 
     Parameters
     ----------
@@ -133,35 +110,16 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
         with drawing(path, 6.5, 1.0) as figure:
             figure.suptitle(f"{title}\nno mode to draw; give a joint a stiffness")
         return figure
-    energies = {body: [mode.energy[body] for mode in modes.modes] for body in modes.modes[0].energy}
-    bodies = [body for body, fractions in energies.items() if max(fractions) >= _LEAST]
-    columns = {name: column for column, name in enumerate(names)}
-    bodies.sort(key=lambda body: columns.get(f"q_m.{body}", -1))
-    with drawing(path, 5.0 + 0.2 * half + 0.3 * len(bodies), 2.6 + 0.36 * count) as figure:
+    with drawing(path, 5.0 + 0.2 * half, 2.6 + 0.36 * count) as figure:
         from matplotlib.patches import Patch
 
-        widths = (0.2 * half, 0.3 * len(bodies))[: 1 + bool(bodies)]
-        axes, *others = figure.subplots(
-            1, len(widths), squeeze=False, sharey=True, gridspec_kw={"width_ratios": widths}
-        )[0]
+        axes = figure.add_subplot()
         colors = dict(zip(dict.fromkeys(units), COLORS, strict=False))
         for line, mode in enumerate(modes.modes):
             _draw_shape(axes, line, mode.shape[:half], [colors[unit] for unit in units])
         axes.set_xticks(range(half), names, rotation=90, fontsize=8)
         axes.set_yticks(range(count), [_label(mode) for mode in modes.modes], fontsize=8)
         axes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
-        for table in others:
-            # The percentage of the kinetic energy of each mode that each body has.
-            fractions = np.array([energies[body] for body in bodies]).T
-            table.imshow(fractions, cmap="Blues", vmin=0.0, vmax=1.6, aspect="auto")
-            for (line, column), fraction in np.ndenumerate(fractions):
-                if fraction >= _LEAST:
-                    text = f"{100.0 * fraction:.0f}"
-                    table.text(column, line, text, ha="center", va="center", fontsize=7)
-            table.grid(visible=False)
-            table.set_xticks(range(len(bodies)), bodies, rotation=90, fontsize=8)
-            table.tick_params("y", labelleft=False)
-            table.set_title("kinetic energy [%]", fontsize=8)
         figure.legend(
             handles=[Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()],
             title="largest entry: 1; outline: modulus of an entry out of phase",

@@ -11,10 +11,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from fflin.analysis.mechanics import checked, conserved, floating_inertia, rate_matrix, second_order
+from fflin.analysis.mechanics import checked, conserved, floating_inertia, second_order
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin, Noisy, echelon, image, null_space
-from fflin.base.errors import InputError, StabilizabilityError, listed
+from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
@@ -302,23 +302,10 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     angles = {lin.state_names[i] for i in ignorable_wheels(lin)[0]}
     rest = [name for name in part.state_names if name not in angles]
     if len(rest) == len(part.M):
-        raise StabilizabilityError(f"the model contains wheel speeds alone{damped_wheels(part)}")
+        raise StabilizabilityError(
+            "the model contains wheel speeds alone; remove the damping of the wheels"
+        )
     return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
-
-
-def damped_wheels(part: LinearModel) -> str:
-    """Return what to do where wheels have damping, of a model that may be without their angles."""
-    nv, rates = len(part.M), rate_matrix(part)[-len(part.M) :, -len(part.M) :]
-    least = _ROUNDING * (np.abs(part.M) @ np.abs(rates)).diagonal()
-    dragged = -(part.M @ rates).diagonal() > least
-    names = [part.state_names[i - nv].removeprefix("qdot_m.") for i in np.flatnonzero(dragged)]
-    damped = [name for name in names if name in wheel_inputs(part)]
-    if not damped:
-        return ""
-    return (
-        f": the damping of {listed(damped)} keeps the wheel speeds in the model; remove this "
-        "damping"
-    )
 
 
 def rigid_forces(body: LinearModel) -> Noisy:

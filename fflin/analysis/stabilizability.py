@@ -1,6 +1,5 @@
 """Messages about states that inputs cannot stabilise or outputs cannot observe."""
 
-import re
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -9,10 +8,9 @@ import numpy as np
 
 from fflin.analysis.controllability import controllability
 from fflin.analysis.mechanics import conserved
-from fflin.analysis.names import grouped, with_rates
+from fflin.analysis.names import grouped
 from fflin.analysis.observability import observability
 from fflin.analysis.ranks import Margin, judged
-from fflin.analysis.reduction import damped_wheels
 from fflin.base.errors import (
     DetectabilityError,
     FflinError,
@@ -31,41 +29,25 @@ _RANK = 1e-7
 
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names the states that inputs cannot stabilise."""
+    missed = "the inputs cannot stabilise {}; add inputs"
     if len(lin.A) < 2 * len(lin.M):  # with speeds of wheels without their angles
-        missed = f"the inputs cannot stabilise {{}}{damped_wheels(lin) or '; add inputs'}"
-        try:
-            kind = StabilizabilityError
-            _check_reach(lin, lin.A, lin.B, "stabilised by the inputs", missed, kind)
-        except StabilizabilityError as error:
-            error.args = (f"{error}{_pendulums(lin, str(error))}",)
-            raise
+        robot = lin._robot
+        if robot and any(robot.damping.get(name) for name in robot.wheels):
+            missed += ", or remove the damping of the wheels"
+        _check_reach(lin, lin.A, lin.B, "stabilised by the inputs", missed, StabilizabilityError)
         return
     found, words = controllability(lin), ""
     if not found.stabilizable:
-        weights = conserved(lin).weights
-        forces = _forces_missing(lin, weights) if len(weights) else None
-        lost = forces or f"{', '.join(grouped(found.uncontrollable))}; add inputs"
-        words = f"the inputs cannot stabilise {lost}{_pendulums(lin, lost)}"
+        # The momenta come first, and then the coordinates that they drive.
+        count = len(conserved(lin).weights)
+        lost = (*found.uncontrollable[:count], *found.uncontrollable[2 * count :])
+        words = missed.format(listed(grouped(lost)))
+        if count:
+            words += (
+                ", give each joint that no input moves a spring (--stiffness, stiffness=), or "
+                "design on fflin.momentum_reduction(lin)"
+            )
     _conclude(StabilizabilityError, words, found.notes, found.margin)
-
-
-def _pendulums(lin: LinearModel, lost: str) -> str:
-    """Say what to do about pendulums of slosh without gravity or thrust among what is lost."""
-    robot = lin._robot
-    hanging = [
-        f"'{joint.name}'"
-        for joint in (robot.modes if robot else ())
-        if not joint.prismatic
-        and joint.kind == "slosh"
-        and re.search(rf"(?<!\w){re.escape(joint.name)}(?!\w)", lost)
-    ]
-    if not hanging:
-        return ""
-    return (
-        f"; slosh {', '.join(hanging)} is a pendulum, which has no stiffness without gravity or "
-        "thrust: linearise it under the thrust (u=, moving=True), or put the mass on springs (give "
-        "Slosh a frequency and no length, or Slosh.cylinder pendulum=False)"
-    )
 
 
 def require_detectable(lin: LinearModel) -> None:
@@ -75,7 +57,7 @@ def require_detectable(lin: LinearModel) -> None:
         _check_reach(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, DetectabilityError)
         return
     found = observability(lin)
-    words = "" if found.detectable else missed.format(with_rates(found.unobservable))
+    words = "" if found.detectable else missed.format(listed(found.unobservable))
     _conclude(DetectabilityError, words, found.notes, found.margin)
 
 
@@ -163,38 +145,6 @@ def _check_reach(
     )
     words = complaint.format(_dominant(np.array(missed), lin.state_names)) if missed else ""
     _conclude(error, words, doubts, margin, 5)
-
-
-def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
-    """Name the coordinates of the conserved momenta W M nu, W (k, nv); None for other models."""
-    names = lin.state_names[-len(lin.M) :]
-    if names[:3] == _BASE_VELOCITIES[:3] and names[3:4] != ("v_b.x",):
-        # The position has left, which nothing pushes.
-        names = (*_BASE_VELOCITIES, *names[3:])
-        weights = np.insert(weights, [3, 3, 3], 0.0, axis=1)
-    if names[:6] != _BASE_VELOCITIES:
-        return None
-    involved = np.abs(weights).max(axis=0) > 0.0
-    base = []
-    for word, rows in _BASE_WORDS:
-        axes = [axis for axis, x in zip("xyz", involved[rows], strict=True) if x]
-        if axes:
-            base.append(word if len(axes) == 3 else f"{word} {'/'.join(axes)}")
-    joints = [name.partition(".")[2] for name, x in zip(names[6:], involved[6:], strict=True) if x]
-    if joints:
-        moved = f"joint{'s' * (len(joints) > 1)} {listed(joints)}, which no input moves"
-        advice = "; give each of these joints a spring (--stiffness, stiffness=) or a motor"
-        return " and ".join((*base, moved)) + advice
-    kind = "" if len(base) == 2 else "angular " if involved[:3].any() else "linear "
-    what = " and ".join(base).replace("and base", "and")
-    return (
-        f"{what} ({kind}momentum is conserved); add inputs on the base, or design on "
-        "fflin.momentum_reduction(lin)"
-    )
-
-
-_BASE_VELOCITIES = tuple(f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz")
-_BASE_WORDS = (("base attitude", slice(0, 3)), ("base position", slice(3, 6)))
 
 
 def _dominant(vectors: Values, names: Sequence[str]) -> str:

@@ -246,11 +246,6 @@ def listed(names: Iterable[str]) -> str:
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
-def _visible(name: str) -> str:
-    """Quote a name that begins or ends with a blank."""
-    return name if name == name.strip() else repr(name)
-
-
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     """Build the error for a name that does not exist, with the names that are near."""
     import difflib
@@ -258,11 +253,11 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     names = list(known)
     near = difflib.get_close_matches(str(name), names, n=5, cutoff=0.5)
     if near:
-        hint = f"did you mean {', '.join(map(_visible, near))}?"
+        hint = f"did you mean {', '.join(near)}?"
     elif not names:
         hint = "no such names exist"
     else:
-        hint = f"known names: {', '.join(map(_visible, names[:12]))}"
+        hint = f"known names: {', '.join(names[:12])}"
         hint += f", ... ({len(names)} in all)" if len(names) > 12 else ""
     return UnknownNameError(f"no {kind} named '{name}'; {hint}")
 

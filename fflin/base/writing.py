@@ -53,14 +53,13 @@ def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
     """Return the content of a regular file of at most `limit` bytes, or raise `FileError`."""
     what = f"; give the path of a {kind} file"
     try:
-        # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
-        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-        if path.is_dir():
-            raise FileError(f"{path}: is a folder{what}")
-        with open(os.open(path, flags | getattr(os, "O_CLOEXEC", 0)), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise FileError(f"{path}: is not a regular file{what}")
-            content = file.read() if limit is None else file.read(limit + 1)
+        # Opening a pipe would wait for somebody to write into it.
+        if path.exists() and not path.is_file():
+            raise FileError(
+                f"{path}: is {'a folder' * path.is_dir() or 'not a regular file'}{what}"
+            )
+        with path.open("rb") as file:
+            content = file.read(-1 if limit is None else limit + 1)
     except FileError:
         raise
     except FileNotFoundError:

@@ -6,7 +6,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,7 +18,7 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import reading
 from fflin.base.validation import Array, FrozenArrays, share, whole
-from fflin.base.writing import as_path, write_atomically
+from fflin.base.writing import as_path, check_ending, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
 from fflin.campaign.spreads import SEED
@@ -335,10 +335,6 @@ class Campaign(FrozenArrays):
         at = whole("run", run, 0, len(self) - 1)
         return self._flown().replay(np.array(self.drawn[at]))
 
-    def courses(self, runs: Sequence[int], most: int) -> list[Array]:
-        """Return up to `most` + 1 evenly spaced configurations (.., nq) of each given run."""
-        return self._flown().paths(np.array(self.drawn[list(runs)]), most)
-
     def _flown(self) -> CampaignJob:
         if self._job is None:
             raise InputError(
@@ -394,6 +390,8 @@ class Campaign(FrozenArrays):
             If the file cannot be read, is damaged or does not contain a campaign.
         """
         source = as_path(path)
+        if source.suffix in (".csv", ".mat"):
+            check_ending(source, (".npz", ".h5"))
         with reading(source, "Campaign"):
             arrays, _, texts, _ = read_rows(source, verify=True)
             header = json.loads(texts["header"])

@@ -207,12 +207,9 @@ class Funnel(Design):
         P: Array = (1.0 - part) * self.P[k] + part * self.P[k + 1]
         return P
 
-    def root(self, t: float, *, smooth: bool = False) -> Array:
-        """Return W (nx, nx): the ellipsoid at time t is the set of all W z with norm(z) <= 1.
-
-        With `smooth`, the level is interpolated between knots, as in figures.
-        """
-        size = np.interp(t, self.t, np.sqrt(self.rho)) if smooth else np.sqrt(self.level(t))
+    def root(self, t: float) -> Array:
+        """Return W (nx, nx): the ellipsoid at time t is the set of all W z with norm(z) <= 1."""
+        size = np.sqrt(self.level(t))
         return size * ellipsoid_axes(self.cost(t))
 
     def contains(self, t: float, x: Any = None, *, q: Any = None, v: Any = None) -> bool:

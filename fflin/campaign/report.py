@@ -24,10 +24,13 @@ def campaign_report(campaign: Any) -> str:
         figures.append(quantile(f"worst {name}", 0.95).value)
         when = _when(quantile(f"settle {name}", 0.95).value)
         rows.append([name, unit, *(f"{x:.3g}" for x in figures), when])
-    correlations = []
+    causes: dict[str, list[str]] = {}
     for name, found in influences(campaign).items():
         first = ", ".join(f"{key}\u00a0{value:+.2f}" for key, value in list(found.items())[:4])
-        correlations.append(f"rank correlations with {name}: {first or 'none significant'}")
+        causes.setdefault(first or "none significant", []).append(name)
+    correlations = [
+        f"rank correlations with {', '.join(names)}: {first}" for first, names in causes.items()
+    ]
     goals = [goal_met(campaign, goal) for goal in campaign.goals]
     head = folded([*goals, ended_of(campaign), f"{title}, seed {campaign.seed}{by}"])
     return "\n".join([head, "", grid(rows, "ll"), "", folded(correlations)])

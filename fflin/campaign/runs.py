@@ -26,7 +26,7 @@ from fflin.dynamics.coordinates import states_of
 from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
-from fflin.simulation.lanes import LaneLoop, LaneRows, Runs, Statistics, engine_of, noises, recorded
+from fflin.simulation.lanes import LaneLoop, Runs, Statistics, engine_of, noises, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.packing import SLOTS, noise_of, packed
 from fflin.simulation.plan import Plan, SimulationOptions, law_of, planned
@@ -193,22 +193,6 @@ class CampaignJob:
         else:
             run = recorded(self.plan, self.plant, self._in_lanes(drawn[None]))
         return motion_of(plan, plant, conserved_by(plant.robot, plan.q, plant.field), run)
-
-    def paths(self, drawn: Array, most: int) -> list[Array]:
-        """Return up to `most` + 1 configurations (rows, nq) of each of some runs (N, k)."""
-        every = -(-self.plan.times.steps // most)
-        if self.engine == "python":
-            return [_recorded(*self.plan_of(each), every).q for each in drawn]
-        found = []
-        for first in range(0, len(drawn), LANES):
-            runs = self._in_lanes(drawn[first : first + LANES])
-            loop = LaneLoop(self.plan, self.plant, runs)
-            rows = LaneRows(loop, every, len(runs["q"]))
-            loop.fly(rows, rows.ends, runs)
-            q, ends = loop.columns[0], rows.ends["last"]
-            for run, count in enumerate(rows.counts):
-                found.append(np.vstack((rows.kept[:count, q, run], ends[run, q])))
-        return found
 
 
 def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:

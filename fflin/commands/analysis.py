@@ -239,16 +239,12 @@ def _momentum(lin: LinearModel) -> str:
     except InputError as error:
         text = f"no reduction: {error}"
     else:
-        count, left = len(reduced.momenta), len(reduced.A)
-        wheels = ", the wheels" * (len(lin.A) > left + 2 * count)
-        field = "orbit's field, the " * bool(lin.mean_motion)
-        text = (
-            f"no momentum is conserved: the {field}inputs, springs and dampers act on all momenta"
-        )
-        if count:
+        orbit = "the orbit, " * bool(lin.mean_motion)
+        text = f"no momentum is conserved: {orbit}inputs, springs and dampers act on all momenta"
+        if len(reduced.momenta):
             text = (
-                f"{count} momenta are conserved for all inputs; without these momenta{wheels} and "
-                f"the coordinates that they drive, {left} states remain"
+                f"{len(reduced.momenta)} momenta are conserved for all inputs; the reduced model "
+                f"has {len(reduced.A)} states"
             )
         elif not lin.is_equilibrium():
             text = "no momentum can be removed: the operating point is not an equilibrium"

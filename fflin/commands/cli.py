@@ -25,28 +25,27 @@ TASKS = {
         **{"uncertain": "analysis", "validity": "regions", "funnel": "regions"},
     },
     "design and simulate": {
-        **{"lqr": "regulator", "tvlqr": "tracking", "plan": "simulation", "simulate": "simulation"},
+        **{
+            "lqr": "regulator",
+            "tvlqr": "regulator",
+            "plan": "simulation",
+            "simulate": "simulation",
+        },
         "export": "regulator",
     },
-    "many models or simulations": {"sweep": "sweeps", "montecarlo": "montecarlo"},
+    "many models or simulations": {"sweep": "sweeps", "montecarlo": "simulation"},
 }
 _MODULES = {name: module for names in TASKS.values() for name, module in names.items()}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return 0 done, 1 a check failed, 2 invalid input."""
-    # Warnings of other packages are shown after success only: an error has its own reason.
-    held: list[str] = []
-    reported: set[str] = set()  # each once per command
+    reported: set[str] = set()  # each warning once per command
 
-    def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
-        text = str(message)
-        if issubclass(category, FflinWarning):
-            if text not in reported:
-                parser.print_error(f"fflin: warning: {text}")
-            reported.add(text)
-        else:
-            held.append(f"fflin: {category.__name__}: {' '.join(text.split())}")
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        if (text := str(message)) not in reported:
+            parser.print_error(f"fflin: warning: {text}")
+        reported.add(text)
 
     warnings.showwarning = show
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -64,8 +63,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = finish(arguments.run(arguments), arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
-        for line in held:
-            parser.print_error(line)
         return code
     except (FflinError, FflinWarning) as error:  # a warning if Python raises warnings
         parser.print_error(f"fflin: error: {error}")

@@ -20,8 +20,15 @@ from fflin.commands.points import (
     refuse_pose,
     velocity_of,
 )
-from fflin.commands.regulator import add_weights, gain_of, regulated_part
-from fflin.commands.tracking import add_trajectory, models_along, schedule_of
+from fflin.commands.regulator import (
+    add_trajectory,
+    add_weights,
+    gain_of,
+    models_along,
+    regulated_part,
+    schedule_of,
+    weights_of,
+)
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -234,14 +241,13 @@ def about_point(
 
 def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Feedback:
     """Return the predictive controller of the weights and limits."""
-    from fflin.control.default_weights import rule_weights
     from fflin.control.mpc import mpc
+    from fflin.control.weights import rule_weights
 
     if arguments.sample is None:
         raise InputError("--mpc needs the sample time of the controller; add --sample H")
     settings: dict[str, Any] = {"weights": arguments.weights}
-    given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
-    if any(given.values()):
+    if given := weights_of(arguments):
         Q, R, _, _ = rule_weights(lin.discretize(arguments.sample), arguments.weights, given)
         settings = {"Q": Q, "R": R}
     limits = limits_of_options(arguments)

@@ -17,8 +17,8 @@ from fflin.base.tables import cut, grid, matrix, signals, width
 from fflin.base.writing import check_ending
 from fflin.commands import options, parser
 from fflin.commands.points import configuration_of, linear_model, load_robot, velocity_of
+from fflin.commands.regulator import add_trajectory, check_along, checked, linearize_along
 from fflin.commands.results import Report, figure_of
-from fflin.commands.tracking import add_trajectory, check_along, checked, linearize_along
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
@@ -125,8 +125,6 @@ def _robots(_: argparse.Namespace) -> Report:
 
 
 def _info(arguments: argparse.Namespace) -> Report:
-    from dataclasses import replace
-
     import numpy as np
 
     from fflin.control.authority import point_properties, point_report
@@ -139,13 +137,7 @@ def _info(arguments: argparse.Namespace) -> Report:
     q = configuration_of(robot, arguments, robot.point)
     v = velocity_of(robot, arguments, robot.point, "velocity")
     properties = point_properties(robot, q, np.zeros(robot.nv) if v is None else v)
-    text = robot_info(robot, point_report(properties))
-    if (
-        arguments.inputs is not None
-        or robot.limits
-        or robot.inputs != replace(robot, inputs=()).inputs
-    ):
-        text += f"\n\n{inputs_report(robot)}"
+    text = f"{robot_info(robot, point_report(properties))}\n\n{inputs_report(robot)}"
     state = StateMap(robot)
     inputs = Actuation(state)
     result = {

@@ -256,7 +256,8 @@ def add_output_file(
 ) -> None:
     """Add -o FILE."""
     group.add_argument(
-        *("-o", "--output-file"),
+        "-o",
+        "--output-file",
         metavar="FILE",
         type=endings,
         required=required,

@@ -10,9 +10,8 @@ from fflin.base.errors import InputError
 from fflin.commands import options, parser
 from fflin.commands.loops import along
 from fflin.commands.points import limits_of_options, linear_model, load_robot, once
-from fflin.commands.regulator import add_weights, gain_of, regulated_part
+from fflin.commands.regulator import add_trajectory, add_weights, gain_of, regulated_part
 from fflin.commands.results import Report, figure_of
-from fflin.commands.tracking import add_trajectory
 
 _ERRORS = "attitude [deg], position [m], joints, omega_b, v_b or joint rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
@@ -73,7 +72,7 @@ def _add_funnel(commands: parser.Commands) -> None:
         "find the initial errors from which the regulator along a trajectory reaches a goal",
         example="fflin funnel arm.toml --schedule gains.npz --goal attitude=1",
         common="trajectory schedule goal within weights q r knots samples seed threads "
-        "dt limits limit frame inputs output-file plot html",
+        "dt limits limit frame inputs output-file plot",
     )
     options.add_robot(funnel)
     options.add_system(funnel)
@@ -97,7 +96,6 @@ def _add_funnel(commands: parser.Commands) -> None:
     runs.add("--confidence", "confidence level of the intervals", float, "P", default=0.95)
     runs.add("--threads", "number of threads; by default one per core", int)
     options.add_step(runs)
-    shown.add("--html", "write a page that plays the motion with the funnel as a tube", parser.PAGE)
     options.add_figure(funnel, "the funnel")
     options.add_output_file(shown, "the funnel", parser.RECORD)
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
@@ -158,15 +156,8 @@ def _funnel(arguments: argparse.Namespace) -> Report:
     finally:
         bar.close()
 
-    def page(path: Path) -> None:
-        from fflin.simulation.simulate import simulate
-        from fflin.view.visualize import visualize
-
-        visualize(robot, simulate(robot, policy, **settings), html=path, funnel=found)
-
     files = {
         arguments.plot: figure_of("plot_funnel", found),
         arguments.output_file: found.save,
-        arguments.html: page,
     }
     return Report(robot.name, found, str(found), files)

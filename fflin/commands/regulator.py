@@ -1,25 +1,32 @@
-"""The commands `lqr` and `export`, and the design options that other commands share."""
+"""The commands `lqr`, `tvlqr` and `export`, and the design options that other commands share."""
 
 from __future__ import annotations
 
 import argparse
 import warnings
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityError
-from fflin.commands import options, parser
-from fflin.commands.points import linear_model, once
+from fflin.commands import DONE, FELL_SHORT, options, parser
+from fflin.commands.points import linear_model, load_robot, once, refuse
 from fflin.commands.results import Report, figure_of
 
 if TYPE_CHECKING:
     from fflin.control.gain import Gain
+    from fflin.control.gain_schedule import GainSchedule
+    from fflin.linear.check import Check
+    from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
+    from fflin.robot.robot import Robot
 
 
 def add_commands(commands: parser.Commands) -> None:
-    """Add lqr and export."""
+    """Add lqr, tvlqr and export."""
     _add_lqr(commands)
+    _add_tvlqr(commands)
     _add_export(commands)
 
 
@@ -37,6 +44,31 @@ def _add_lqr(commands: parser.Commands) -> None:
     add_weights(lqr)
     options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD)
     options.add_figure(lqr, "the poles, and the loop gain of each input with its margins,")
+
+
+def _add_tvlqr(commands: parser.Commands) -> None:
+    tvlqr = parser.command(
+        commands,
+        "tvlqr",
+        _tvlqr,
+        "design the time-varying regulator along a trajectory",
+        example="fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 "
+        "-o gains.npz",
+        common="trajectory hold strict weights q r bryson sample qf inputs frame output-file",
+    )
+    options.add_robot(tvlqr)
+    options.add_system(tvlqr)
+    options.add_frame(tvlqr.group(parser.TRAJECTORY))
+    add_trajectory(tvlqr, required=True)
+    add_weights(tvlqr)
+    tvlqr.group(parser.CONTROLLER).add(
+        "--qf",
+        "weight on the final error. The default is the solution of the algebraic Riccati equation "
+        "at the last configuration",
+        parser.assignment,
+        repeatable=True,
+    )
+    options.add_output_file(tvlqr.group(parser.OUTPUT), "the gains", parser.RECORD)
 
 
 def _add_export(commands: parser.Commands) -> None:
@@ -126,6 +158,13 @@ def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
     )
 
 
+def weights_of(arguments: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Return the weights of --q, --r and --bryson; nothing if none of them is given."""
+    names = ("q", "r", "bryson")
+    given = {name: once(f"--{name}", getattr(arguments, name)) for name in names}
+    return given if any(given.values()) else {}
+
+
 def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearModel:
     """Return the model of the design; with --reduce, its controllable part."""
     if not arguments.reduce:
@@ -137,9 +176,9 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     """Return the regulator of the weights; warn if its margins are small."""
-    from fflin.control.default_weights import rule_weights
     from fflin.control.gain import fragility, one_sided
     from fflin.control.lqr import lqr, require_fixed_point
+    from fflin.control.weights import rule_weights
 
     try:
         require_fixed_point(lin)
@@ -151,9 +190,8 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     if arguments.sample is not None:
         lin = lin.discretize(arguments.sample)
     try:
-        given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
         speeds = arguments.wheel_speeds
-        if any(given.values()):
+        if given := weights_of(arguments):
             *weights, rule = rule_weights(lin, arguments.weights, given, wheel_speeds=speeds)
             gain = replace(lqr(lin, *weights, wheel_speeds=speeds), weights=rule)
         else:
@@ -199,3 +237,83 @@ def _export(arguments: argparse.Namespace) -> Report:
     test = f"cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm && ./{name}_test"
     said = f"{law!r} in C99, with numbers of type {real}\nto test it in {folder}: {test}"
     return Report(law.robot, {"name": name, "real": real, "folder": str(folder)}, said)
+
+
+def add_trajectory(command: parser.Command, *, required: bool = False) -> None:
+    """Add --trajectory, --hold and --strict; the file then sets the default of --frame."""
+    group = command.group(parser.TRAJECTORY)
+    group.add(
+        "--trajectory",
+        "use the trajectory in FILE: .npz, .mat, .json or .csv; see fflin.Trajectory.load. --frame "
+        "defines the axes of the data. The default of --frame is the frame named in FILE, or local",
+        Path,
+        required=required,
+    )
+    group.add(
+        "--hold",
+        "inputs between the knots of FILE: linearly interpolated (linear), or constant from each "
+        "knot to the next (previous). The default is the setting in FILE, or linear",
+        choices=("linear", "previous"),
+    )
+    group.switch(
+        "--strict", "report an error if the trajectory in FILE violates the dynamics of the robot"
+    )
+
+
+def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> LinearTrajectory:
+    """Return the linear models along the given trajectory."""
+    from fflin.linear.linear_trajectory import linearize_trajectory
+    from fflin.linear.trajectory import Trajectory
+
+    point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
+    refuse(arguments, point, "--trajectory defines a motion, and no operating point applies")
+    robot = robot or load_robot(arguments)
+    settings = {"hold": arguments.hold, "frame": arguments.frame}
+    motion = Trajectory.load(arguments.trajectory, robot, **settings)
+    return linearize_trajectory(robot, motion, strict=arguments.strict)
+
+
+def linearize_along(arguments: argparse.Namespace) -> Report:
+    """Show or save the models along a trajectory."""
+    along = models_along(arguments)
+    if arguments.dt is not None:
+        along = along.discretize(arguments.dt)
+    return Report(along.robot.name, along, str(along), {arguments.output_file: along.save})
+
+
+def check_along(arguments: argparse.Namespace) -> Report:
+    """Check the models along a trajectory."""
+    from fflin.linear.check import held_to
+
+    along = models_along(arguments)
+    found = held_to(arguments.tolerance, along.check())
+    return checked(along.robot, found, f"{found}\n\n{along}")
+
+
+def checked(robot: Robot, found: Check, text: str, files: Any = MappingProxyType({})) -> Report:
+    """Return the report of a check."""
+    result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
+    return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)
+
+
+def _tvlqr(arguments: argparse.Namespace) -> Report:
+    refuse(arguments, ("reduce",), "the finite-horizon cost along a trajectory always exists")
+    along = models_along(arguments)
+    schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
+    return Report(along.robot.name, schedule, str(schedule), {arguments.output_file: schedule.save})
+
+
+def schedule_of(
+    along: LinearTrajectory, arguments: argparse.Namespace, Qf: Any = "steady"
+) -> GainSchedule:
+    """Return the regulator of the weights along a trajectory."""
+    from fflin.control.default_weights import pace_along
+    from fflin.control.tvlqr import steady_end, tvlqr
+    from fflin.control.weights import rule_weights
+
+    settings: dict[str, Any] = {"sample": arguments.sample, "weights": arguments.weights}
+    if given := weights_of(arguments):
+        pace = pace_along(float(along.t[-1] - along.t[0]), arguments.sample or 0.0)
+        Q, R, _, rule = rule_weights(steady_end(along), arguments.weights, given, pace=pace)
+        settings |= {"Q": Q, "R": R, "weights": None, "rule": rule}
+    return tvlqr(along, Qf=Qf, **settings)

@@ -9,22 +9,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FileError, InputError, MissingPackageError
+from fflin.base.errors import InputError
 from fflin.commands import options, parser
-from fflin.commands.points import configuration_of, load_robot, once, refuse, velocity_of
+from fflin.commands.points import configuration_of, load_robot, once, velocity_of
 from fflin.commands.results import Report
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
     import pinocchio as pin
 
     from fflin.base.process import Progress
     from fflin.base.validation import Array
     from fflin.batch.configurations import Configurations
     from fflin.robot.robot import Robot
-
-_DASK_TIMEOUT = 10  # seconds
 
 
 def add_commands(commands: parser.Commands) -> None:
@@ -36,13 +32,13 @@ def add_commands(commands: parser.Commands) -> None:
         "linearise about many points and save all models",
         example="fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 "
         "-o grid.h5",
-        common="grid random configurations seed range joint velocity inputs output frame engine "
+        common="grid random seed range joint velocity inputs output frame engine "
         "workers output-file",
     )
     points = sweep.group(
         "points",
-        "give --grid, --random or --configurations. The default velocity of all points is the "
-        "velocity in [point] of robot.toml, or zero",
+        "give --grid or --random. The default velocity of all points is the velocity in [point] of "
+        "robot.toml, or zero",
     )
     points.add(
         "--grid",
@@ -54,13 +50,6 @@ def add_commands(commands: parser.Commands) -> None:
     )
     drawn = "N points, uniformly distributed within the joint limits"
     points.add("--random", drawn, int)
-    points.add(
-        "--configurations",
-        "file of numpy.savez with q (N, nq) in Pinocchio's order, and optionally v (N, nv) and u "
-        "(N, nu)",
-        Path,
-        "FILE.npz",
-    )
     points.add("--seed", "random seed of --random", parser.whole, "S", default=0)
     points.add(
         "--range",
@@ -91,8 +80,6 @@ def add_commands(commands: parser.Commands) -> None:
     )
     workers = "distribute the work over N processes; at most one per core"
     work.add("--workers", workers, int)
-    dask = "distribute the work over the workers of a dask scheduler"
-    work.add("--dask", dask, metavar="ADDRESS")
     what = "the models (after an interruption, the same command resumes from FILE.part)"
     options.add_output_file(sweep.group(parser.OUTPUT), what, parser.ROWS, required=True)
 
@@ -134,14 +121,12 @@ def _sweep(arguments: argparse.Namespace) -> Report:
     check_room(len(q), size, path)
     part = part_of(path)
     resuming = f", resuming from {part}" * part.exists()
-    with executor_of(arguments) as executor:
-        # All options are valid.
-        said = f"fflin: {len(q):,} points of '{robot.name}', {readable(size)} to {path}{resuming}"
-        print(said, file=sys.stderr)
-        with going_on(path, "points") as progress:
-            work = {name: getattr(arguments, name) for name in ("engine", "workers")}
-            work |= {"executor": executor, "progress": progress}
-            batch = sweep(robot, q, v, u, **settings, **work, out=path)
+    # All options are valid.
+    said = f"fflin: {len(q):,} points of '{robot.name}', {readable(size)} to {path}{resuming}"
+    print(said, file=sys.stderr)
+    with going_on(path, "points") as progress:
+        work = {"engine": arguments.engine, "workers": arguments.workers, "progress": progress}
+        batch = sweep(robot, q, v, u, **settings, **work, out=path)
     states, inputs = len(batch.state_names), len(batch.input_names)
     text = f"{robot.name}: {len(batch):,} points, {states} states, {inputs} inputs"
     names = ("state_names", "state_units", "input_names", "input_units", "frame")
@@ -151,33 +136,20 @@ def _sweep(arguments: argparse.Namespace) -> Report:
 
 def _points(
     robot: Robot, arguments: argparse.Namespace
-) -> tuple[Array | Configurations, Array | None, Array | None]:
+) -> tuple[Configurations, Array | None, Array | None]:
     """Return q, v and u of the points."""
     import numpy as np
 
-    from fflin.batch.configurations import as_configurations, grid, random_configurations
+    from fflin.batch.configurations import grid, random_configurations
     from fflin.dynamics.points import effort
     from fflin.robot.joints import by_joint
 
-    file = arguments.configurations
-    if [bool(arguments.grid), arguments.random is not None, file is not None].count(True) != 1:
-        raise InputError(
-            "the points of the sweep are not defined; give exactly one of --grid, --random and "
-            "--configurations"
-        )
+    if bool(arguments.grid) == (arguments.random is not None):
+        raise InputError("the points of the sweep are not defined; give either --grid or --random")
     if arguments.range and arguments.random is None:
         raise InputError("--range needs --random; --grid has its own ranges")
-    if file:
-        refuse(arguments, ("joint", "rpy", "position"), "--configurations contains q")
-        given = _given(file)
-        for name, option in (("v", "velocity"), ("u", "effort")):
-            if name in given:
-                refuse(arguments, (option,), f"{file} contains {name}")
-    # A file of configurations has its own velocities.
-    v = velocity_of(robot, arguments, {} if file else robot.point, "velocity")
+    v = velocity_of(robot, arguments, robot.point, "velocity")
     u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
-    if file:
-        return as_configurations(robot, given["q"]), given.get("v", v), given.get("u", u)
     fixed = once("--joint", arguments.joint)
     base = _base(robot, configuration_of(robot, arguments, robot.point))
     if arguments.random is not None:
@@ -200,20 +172,6 @@ def _base(robot: Robot, q: Array) -> pin.SE3:
     return robot.model.jointPlacements[1] * pin.XYZQUATToSE3(q[:7])
 
 
-def _given(path: Path) -> dict[str, Array]:
-    from fflin.base.record import decoded, reading
-    from fflin.base.writing import read_file
-
-    with reading(path, "npz file", by="numpy.savez"):
-        arrays, _ = decoded(".npz", read_file(path, ".npz"))
-    given: dict[str, Array] = {key: arrays[key] for key in ("q", "v", "u") if key in arrays}
-    if "q" not in given:
-        raise FileError(f"{path}: contains no array q; save the configurations as q (N, nq)")
-    if given["q"].ndim != 2:
-        raise InputError(f"{path}: q has shape {given['q'].shape}, expected (N, nq)")
-    return given
-
-
 @contextmanager
 def going_on(path: Path | None, what: str) -> Iterator[Progress]:
     """Yield the progress bar; after Ctrl-C report the progress and the saved part."""
@@ -232,27 +190,3 @@ def going_on(path: Path | None, what: str) -> Iterator[Progress]:
         raise KeyboardInterrupt(said) from None
     finally:
         bar.close()
-
-
-@contextmanager
-def executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
-    """Yield the executor of a dask scheduler, or None without an address."""
-    address = arguments.dask
-    if address is None:
-        yield None
-        return
-    if arguments.workers:
-        raise InputError("--workers and --dask both distribute the work; give only one of them")
-    try:
-        from distributed import Client
-    except ImportError:
-        raise MissingPackageError(
-            "--dask needs distributed; install it with: pip install 'fflin[dask]'"
-        ) from None
-    try:
-        client = Client(address, timeout=_DASK_TIMEOUT)
-    except (OSError, ValueError) as error:
-        said = " ".join(str(error).split())
-        raise InputError(f"no dask scheduler answers at '{address}': {said}") from None
-    with client:
-        yield client.getexecutor_of()

@@ -13,7 +13,6 @@ from fflin.commands.points import configuration_of, load_robot
 from fflin.commands.results import Report
 
 if TYPE_CHECKING:
-    from fflin.campaign.campaign import Campaign
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
 
@@ -93,7 +92,6 @@ def pictures(
     robot: Robot,
     motion: Callable[[], Motion],
     arguments: argparse.Namespace,
-    cloud: Campaign | None = None,
 ) -> dict[Path | None, Callable[[Path], object]]:
     """Return the files of the options of `add_pictures`, with the functions that write them."""
     how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *_SHOWN)}
@@ -102,7 +100,7 @@ def pictures(
         from fflin.view.visualize import visualize
 
         kind: Any = {path.suffix.removeprefix("."): path}
-        visualize(robot, motion(), **kind, **how, cloud=cloud)
+        visualize(robot, motion(), **kind, **how)
 
     return {getattr(arguments, name): show for name in _FILES}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from itertools import combinations, islice, product
+from itertools import combinations, islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -108,39 +108,38 @@ def wheel_report(properties: Mapping[str, Any]) -> str:
     """Show the total momentum of the wheels, and whether they span three axes."""
     if not properties["wheels"]:
         return ""
-    total = properties["total"]
-    spans = {3: "three axes", 2: "only two axes", 1: "only one axis"}[properties["axes"]]
+    total, least = properties["total"], properties["least"]
     text = (
         f"{counted(properties['wheels'], 'wheel')}: total momentum {_vector(total)} N m s, "
-        f"{np.linalg.norm(total):.4g} in all; they span {spans}"
+        f"{np.linalg.norm(total):.4g} in all; they span "
+        f"{('no', 'only one', 'only two', 'three')[properties['axes']]} axes"
     )
-    if (least := properties["least"]) is not None:
+    if least is not None:
         text += f", with at least {least:.4g} N m s in every direction at their largest speeds"
     return folded([text])
 
 
 def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]:
-    """Return what the thrusters alone reach: pure forces and torques, and their least sizes.
+    """Return what the thrusters alone reach: every wrench or not, least force and torque.
 
-    The sizes are None unless the thrusters push every way, all have limits and are not too many.
+    These are None unless the thrusters push every way, all have limits and are not too many.
     """
-    actuation, found = Actuation(StateMap(robot)), dict[str, Any]()
-    found |= {"thrusters": 0, "every_way": False, "bounded": False, "unreachable": {}}
+    actuation = Actuation(StateMap(robot))
+    thrusters = actuation.groups.get("thrust", ())
+    found = dict[str, Any](thrusters=len(thrusters), every_way=False, bounded=False)
     found |= {"least_force": None, "least_torque": None}
-    if "thrust" not in actuation.groups:
+    if not len(thrusters):
         return found
     from fflin.control.channel import input_limits
 
-    thrusters = actuation.groups["thrust"]
     W = actuation.columns(robot.create_data(), _at_origin(q))[:6, thrusters]
     W[:3] -= np.cross(center, W[3:].T).T
     low, high = (each[thrusters] for each in input_limits(robot, limits_of(robot)))
-    found |= {"thrusters": len(thrusters), "bounded": bool(np.isfinite(high).all())}
-    found["unreachable"] = unreachable(W)
-    found["every_way"] = not any(found["unreachable"].values())
+    found["every_way"] = gives_every_wrench(W, np.full(len(thrusters), True))
+    found["bounded"] = bool(np.isfinite(high).all())
     if found["every_way"] and found["bounded"] and len(thrusters) <= _MANY:
-        for kind, axes in zip(("torque", "force"), np.hsplit(np.eye(6), 2), strict=True):
-            found[f"least_{kind}"] = least_reach(W, low, high, axes)
+        found["least_torque"] = least_reach(W, low, high, np.eye(6)[:, :3])
+        found["least_force"] = least_reach(W, low, high, np.eye(6)[:, 3:])
     return found
 
 
@@ -148,12 +147,10 @@ def thruster_report(properties: Mapping[str, Any]) -> str:
     """Report whether the thrusters push in every direction, with least force and torque."""
     if not properties["thrusters"]:
         return ""
-    text = f"{counted(properties['thrusters'], 'thruster')} alone"
+    text = f"{counted(properties['thrusters'], 'thruster')} alone "
     if not properties["every_way"]:
-        missing = properties["unreachable"].items()
-        shown = [f"{kind} along {', '.join(axes)}" for kind, axes in missing if axes]
-        return folded([f"{text} do not push every way: no pure {' and no pure '.join(shown)}"])
-    text += " push every way"
+        return folded([f"{text}do not push every way: they lack some pure force or torque"])
+    text += "push every way"
     if not properties["bounded"]:
         text += "; not all of them have a limit (max)"
     elif properties["least_force"] is not None:
@@ -164,24 +161,15 @@ def thruster_report(properties: Mapping[str, Any]) -> str:
     return folded([text])
 
 
-def unreachable(W: Array) -> dict[str, list[str]]:
-    """Return the pure torques and forces that W u does not reach with thrusts u >= 0."""
-    from scipy.optimize import nnls
-
-    size = np.linalg.norm(W, axis=0)
-    directions = W[:, size > 0.0] / size[size > 0.0]
-    found: dict[str, list[str]] = {"torque": [], "force": []}
-    for (kind, axis), unit in zip(product(found, _AXES), np.eye(6), strict=True):
-        for sign, wanted in (("+", unit), ("-", -unit)):
-            if nnls(directions, wanted)[1] > _ROUNDING:
-                found[kind].append(f"{sign}{axis}")
-    return found
-
-
 def gives_every_wrench(W: Array, pushing: NDArray[np.bool_]) -> bool:
     """Return whether columns W (6, k), some of them only positive, produce every wrench."""
+    from scipy.optimize import nnls
+
     both = np.hstack((W, -W[:, ~pushing]))
-    return not any(unreachable(both).values())
+    size = np.linalg.norm(both, axis=0)
+    directions = both[:, size > 0.0] / size[size > 0.0]
+    units = np.vstack((np.eye(6), -np.eye(6)))
+    return all(nnls(directions, wanted)[1] <= _ROUNDING for wanted in units)
 
 
 def thrusters_give_every_wrench(robot: Robot) -> bool:
@@ -191,8 +179,7 @@ def thrusters_give_every_wrench(robot: Robot) -> bool:
     if thrusters is None:
         return False
     W = actuation.columns(robot.create_data(), robot.neutral())[:6]
-    pushing = np.isin(np.arange(W.shape[1]), thrusters)
-    return gives_every_wrench(W, pushing)
+    return gives_every_wrench(W, np.isin(np.arange(W.shape[1]), thrusters))
 
 
 def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:

@@ -34,7 +34,7 @@ def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Arra
     low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in inputs]).T
     low = np.maximum(low, [-math.inf if item.PULLS else 0.0 for item in inputs.values()])
     for index, (_, item) in _pulsed(robot).items():
-        high[index] = min(high[index], math.inf if item.max is None else item.max)
+        high[index] = min(high[index], item.max or math.inf)
     return low, high
 
 
@@ -63,7 +63,7 @@ def saturation(
         )
         within = within._replace(wheels=wheels, wheel_names=tuple(spun))
     if pulsed and (thrusters := _pulsed(robot)):
-        return within._replace(pulses=_pulses(thrusters, high, sample, dt))
+        return within._replace(pulses=_pulses(thrusters, high, sample * dt, dt))
     return within
 
 
@@ -78,38 +78,34 @@ def _pulsed(robot: Robot) -> dict[int, tuple[str, Thruster]]:
 
 
 def _pulses(
-    thrusters: Mapping[int, tuple[str, Thruster]], high: Array, sample: int, dt: float
+    thrusters: Mapping[int, tuple[str, Thruster]], high: Array, time: float, dt: float
 ) -> Pulses:
-    """Return pulsed thrusters {input: (name, thruster)}; `high` (nu,) is the limit of the inputs.
+    """Return pulsed thrusters {input: (name, thruster)} with samples of `time` [s], 0 without.
 
-    Where it is infinite, an on-off thruster gives its own `max`.
+    Where the limit `high` (nu,) of the inputs is infinite, an on-off thruster gives its own `max`.
     """
-    at, items = list(thrusters), [item for _, item in thrusters.values()]
-    on_off = np.array([item.on_off for item in items])
-    own = np.array([item.ranges[0][1] if item.on_off else np.inf for item in items])
+    at, zero = list(thrusters), np.zeros(len(thrusters))
+    on_off = np.array([item.on_off for _, item in thrusters.values()])
+    least = np.array([item.least_impulse or 0.0 for _, item in thrusters.values()])
+    own = [item.ranges[0][1] if item.on_off else np.inf for _, item in thrusters.values()]
     most = np.where(np.isfinite(high[at]), high[at], own)
-    for (name, item), largest in zip(thrusters.values(), most.tolist(), strict=True):
-        if not sample:
-            raise InputError(
-                f"thruster '{name}' is pulsed (on_off, least_impulse), which needs sampled "
-                "commands; give sample=, or a policy for a sampled model"
-            )
-        if (item.least_impulse or 0.0) > largest * sample * dt:
-            raise InputError(
-                f"thruster '{name}' has a least impulse of {item.least_impulse:g} N s, but "
-                f"can give only {largest * sample * dt:.3g} N s within a sample; give a longer "
-                "sample time"
-            )
+    if (short := least > most * time).any() or not time:
+        name, item = thrusters[at[int(short.argmax())]]
+        raise InputError(
+            f"thruster '{name}' is pulsed and its samples last {time:g} s, expected samples that "
+            f"fit its least impulse of {item.least_impulse or 0.0:g} N s; give a longer sample=, "
+            "or a sampled policy"
+        )
     return Pulses(
         at=np.array(at),
         on_off=on_off,
         most=most,
-        least=np.array([item.least_impulse or 0.0 for item in items]),
+        least=least,
         quantum=np.where(on_off, most * dt, 1.0),
-        left=np.zeros(len(at)),
-        level=np.zeros(len(at)),
-        end=np.zeros(len(at)),
-        time=sample * dt,
+        left=zero,
+        level=zero.copy(),
+        end=zero.copy(),
+        time=time,
     )
 
 
@@ -156,18 +152,15 @@ class Law:
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` if it is not finite or of wrong shape."""
         u = self.policy(t, q.copy(), v.copy())
-        if type(u) is not np.ndarray or u.dtype is not DOUBLE:
-            u = as_double(f"policy(t, q, v) at t = {t:g} s", u)
-        else:
-            u = u.copy()
+        own = type(u) is np.ndarray and u.dtype is DOUBLE
+        u = u.copy() if own else as_double(f"policy(t, q, v) at t = {t:g} s", u)
         if u.shape == self._shape and math.isfinite(u.dot(u)):
             return u
         names = self._names
         if u.shape != self._shape:
             raise InputError(
                 f"policy(t, q, v) returned shape {u.shape} at t = {t:g} s, expected {self._shape} "
-                "with one value for each of "
-                f"{', '.join(names[:8])}" + (", ..." if names[8:] else "")
+                f"with one value for each of {listed(names)}"
             )
         wrong = np.flatnonzero(~np.isfinite(np.clip(u, *self._limits)))
         if len(wrong) and float(v.dot(v)) < self._slow:
@@ -216,22 +209,14 @@ class Channel:
         delay: int,
         speeds: Callable[..., Array],
     ) -> None:
-        self._law, self._speeds, self._u = law, speeds, initial.tolist()
+        self._law, self._speeds, self._u = law, speeds, initial.copy()
         self._wheels, self._pulses = len(limits.wheels.at), len(limits.pulses.at)
         self._limited = bool(np.isfinite((limits.low, limits.high)).any())
         own = channel_of(limits, initial, sample, delay)
-        # The entries of a list are read faster than the entries of an array.
+        counts = ("left", "level", "end")  # of this run alone
         self._rules = own._replace(
-            low=own.low.tolist(),
-            high=own.high.tolist(),
-            held=own.held.tolist(),
-            pending=own.pending.tolist(),
-            wheels=own.wheels._replace(row=range(self._wheels)),
-            pulses=own.pulses._replace(
-                left=np.zeros(self._pulses),
-                level=np.zeros(self._pulses),
-                end=np.zeros(self._pulses),
-            ),
+            wheels=own.wheels._replace(row=np.arange(self._wheels)),
+            pulses=own.pulses._replace(**{key: np.zeros(self._pulses) for key in counts}),
         )
 
     @property
@@ -249,10 +234,10 @@ class Channel:
         if not (self._rules.sample or self._limited or self._wheels):
             return self._law(*point)
         if rules.is_asked(self._rules, step):
-            self._u[:] = self._law(*point).tolist()
-        speeds = self._speeds(*point).tolist() if self._wheels else []
+            self._u[:] = self._law(*point)
+        speeds = self._speeds(*point) if self._wheels else self._u[:0]
         rules.transmit(self._rules, step, speeds, self._u)
-        return np.array(self._u)
+        return self._u.copy()
 
     def ask(self, *point: Any) -> Array:
         """Return the applied inputs of the law's present command, if there is no sample time."""

@@ -2,32 +2,16 @@
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
 
 from fflin.analysis.mechanics import rate_matrix, second_order
-from fflin.analysis.ranks import Noisy, null_space
-from fflin.analysis.reduction import (
-    ignorable_wheels,
-    regulated_part,
-    rigid_forces,
-    selection,
-    without,
-)
-from fflin.base.errors import InputError, listed, unknown
-from fflin.base.validation import Array
-from fflin.control.loop_limits import (
-    NOT_ENOUGH,
-    Limit,
-    efforts_left,
-    growth,
-    largest_use,
-    limits_on,
-    slowed,
-)
-from fflin.control.weights import GivenWeight, reweighed, sampled_cost, weights_of
+from fflin.base.errors import InputError, listed
+from fflin.base.validation import Array, Complex, Values
+from fflin.control.channel import warn_beyond
+from fflin.control.optimal.riccati import rates_of, solve
 from fflin.linear.model import LinearModel
 
 # The bandwidth [rad/s] of a loop that no limit slows: it settles in about thirty seconds. With
@@ -52,6 +36,15 @@ _IDLE = 1e-12
 # Iterations for the bandwidth of a robot with dampers, whose effect depends on the bandwidth.
 _PASSES = 4
 
+# A loop with springs or gravity is slowed at most this many times. The fastest loop is taken that
+# leaves the efforts at least this fraction of the best.
+_TRIALS, _IN_VAIN = 8, 0.9
+
+# The report names a mode whose decay is below this fraction of the decay at rest.
+_AS_SLOW = 0.9
+
+_NOT_ENOUGH = "is too small for all displacements"
+
 
 class Weights(NamedTuple):
     """Weights of a continuous cost (nx, nx) and (nu, nu), the rule that made them, and w."""
@@ -72,6 +65,13 @@ class Pace(NamedTuple):
     held: float = _HELD  # what the fastest of the loop may do within a hold [rad]
 
 
+class Limit(NamedTuple):
+    """Largest bandwidth permitted by a limit, and the name of this limit."""
+
+    bandwidth: float
+    what: str
+
+
 AT_A_POINT = Pace()
 
 
@@ -90,7 +90,7 @@ def default_weights(
     for _ in range(_PASSES if damping.any() else 1):
         found = _of_inertia(lin, lin.M + damping / w, np.linalg.inv(N), pace, momenta or {})
         w, before = found.bandwidth, w
-        if NOT_ENOUGH in found.rule or w > 0.97 * before:
+        if _NOT_ENOUGH in found.rule or w > 0.97 * before:
             break
     return found
 
@@ -144,17 +144,17 @@ def _of_inertia(
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
     motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta]
     taken = np.vstack((T, added[motors]))
-    use = largest_use(gain, size, lin.state_names)
+    use = _largest_use(gain, size, lin.state_names)
     limits = [
         Limit(pace.bandwidth, ""),
-        *limits_on("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0),
-        *limits_on("effort", efforts_left(lin), use, 2.0),
+        *_limits_on("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0),
+        *_limits_on("effort", _efforts_left(lin), use, 2.0),
     ]
     limit, achieved = min(limits), ""
     rate = rate_matrix(lin)
     loaded = rate[m:].any() or rate[:m, :m].any()
     if loaded:
-        grows = growth(lin)
+        grows = _growth(lin)
         limit = max(limit, grows._replace(bandwidth=_OF_GROWTH * grows.bandwidth))
     if pace.hold or lin.dt:
         fastest = pace.held / ((pace.hold or lin.dt) * rates[-1])
@@ -172,7 +172,7 @@ def _of_inertia(
     if loaded:
         driven = (S**2 / cost).sum(axis=1) > _IDLE * D / unit
         least = min(grows._replace(bandwidth=_LEAST_OF_GROWTH * grows.bandwidth), limit)
-        limit, achieved = slowed(lin, costs, size, size * driven, limit, least)
+        limit, achieved = _slowed(lin, costs, size, size * driven, limit, least)
     rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION) + (
         "; joint damping is included" if damped else ""
     )
@@ -257,7 +257,7 @@ def _fastest(
     if (mass < 1.0).any():
         fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
         moving = (rates**2 * (slow - fast) / root).real
-    return largest_use(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
+    return _largest_use(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
 
 
 def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: float) -> str:
@@ -265,20 +265,136 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
     base = [f"{turn:g} deg"] * ("q_b" in groups)
     if "r_b" in groups:
         base.append(f"{size[groups.index('r_b')]:.2g} m")
-    joints: dict[str, float] = {}
-    for group, unit, d in zip(groups, lin.state_units, size, strict=False):
-        if group == "q_m" and unit != "kg^0.5 m":
-            joints[unit] = max(d, joints.get(unit, 0.0))
+    sizes = [x for x in zip(lin.state_units, size, groups, strict=False) if x[2] == "q_m"]
+    units = dict.fromkeys(unit for unit, *_ in sizes if unit != "kg^0.5 m")
+    largest = {unit: max(d for of, d, _ in sizes if of == unit) for unit in units}
     from_where = [f"{' and '.join(base)} of the base"] if base else []
-    if joints:
-        sizes = " or ".join(f"{d:.2g} {unit}" for unit, d in joints.items())
-        from_where.append(f"{sizes} of the joints")
+    if largest:
+        each = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
+        from_where.append(f"{each} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
     slow = f"; bandwidth limited by {limit.what}" if limit.what else ""
-    if beyond := [name for name, room in efforts_left(lin).items() if room <= 0.0]:
+    if beyond := [name for name, room in _efforts_left(lin).items() if room <= 0.0]:
         slow += f"; already at or beyond the URDF limit at the operating point: {listed(beyond)}"
     pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"
     return f"from {source}, for displacements of {' and '.join(from_where)}: {pace}{slow}"
+
+
+def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
+    """Return the largest K d of all displacements d: the base's in any direction, joints' signs."""
+    groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
+    scaled = K[..., : len(size)] * size
+    total: Array = np.abs(scaled[..., ~np.isin(groups, ("q_b", "r_b"))]).sum(axis=-1)
+    for group in ("q_b", "r_b"):
+        total += np.linalg.norm(scaled[..., groups == group], axis=-1)
+    return total
+
+
+def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
+    """Return the factors of the bandwidth at which the inputs reach their limits."""
+    return [
+        Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
+        for (name, most), size in zip(room.items(), used.tolist(), strict=True)
+        if 0.0 < most < math.inf and size > 0.0
+    ]
+
+
+def _efforts_left(lin: LinearModel) -> dict[str, float]:
+    """Return the input limits minus the inputs at the operating point."""
+    inputs = zip(lin.input_names, lin.u0.tolist(), strict=True)
+    return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
+
+
+def _growth(lin: LinearModel) -> Limit:
+    """Return the largest rate of growth [1/s] of the model, and which mode has it."""
+    poles, modes = np.linalg.eig(lin.A)
+    rates = rates_of(poles, lin.dt).real
+    fastest, k = float(rates.max()), int(rates.argmax())
+    moving = listed(_moving_most(lin, modes[:, [k]]))
+    return Limit(fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})")
+
+
+class _Trial(NamedTuple):
+    """A loop that was tried: its limit and modes, and what its inputs require."""
+
+    limit: Limit
+    left: float  # factor on the bandwidth that the efforts allow, as far as it is below 1
+    effort: str  # the input that allows the least
+    rates: Values  # of the modes (nx,) [1/s]
+    modes: Complex
+    required: Array  # largest inputs (nu,)
+
+
+def _slowed(
+    lin: LinearModel,
+    costs: Callable[[float], tuple[Array, Array]],
+    size: Array,
+    driven: Array,
+    limit: Limit,
+    least: Limit,
+) -> tuple[Limit, str]:
+    """Slow a loop with springs or gravity until it respects the limits; report what it achieves.
+
+    The loop is slowed down to `least` and no further. Displacements `size` (m,) require efforts at
+    the start, and displacements `driven` also on the way back. The latter omit joints without a
+    motor, which springs or gravity move.
+    """
+    trials = list[_Trial]()
+    for _ in range(_TRIALS):
+        Q, R = costs(limit.bandwidth)
+        try:
+            K = solve(lin.A, lin.B, Q, R, None, lin.dt).K
+        except np.linalg.LinAlgError:
+            break
+        poles, modes = np.linalg.eig(lin.A - lin.B @ K)
+        rates = rates_of(poles, lin.dt)
+        time = np.geomspace(0.1 / np.abs(rates).max(), 3.0 / np.abs(rates).min(), 60)
+        decaying = (K @ modes) * np.exp(rates * time[:, None])[:, None]
+        later = (decaying @ np.linalg.inv(modes)[:, : len(size)]).real
+        use = np.maximum(
+            _largest_use(K, size, lin.state_names),
+            _largest_use(later, driven, lin.state_names).max(axis=0),
+        )
+        left, what = min(_limits_on("effort", _efforts_left(lin), use, 2.0), default=Limit(1.0, ""))
+        trials.append(_Trial(limit, left, what, rates, modes, np.abs(lin.u0) + use))
+        if left >= 1.0 - 1e-6:
+            return limit, _achieved(lin, trials[-1])
+        if limit.bandwidth <= least.bandwidth:
+            break
+        # What springs and gravity require remains, however slow the loop is.
+        slower = Limit(min(max(left, 0.3), 0.8) * limit.bandwidth, what)
+        limit = max(slower, least)
+    if not trials:
+        return limit, ""  # the regulator raises with the reason
+    most = max(trial.left for trial in trials)
+    trial = next(x for x in trials if x.left >= _IN_VAIN * most)
+    limit, effort = trial.limit, trial.effort
+    high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
+    where = "to return from the displacements of the default weights"
+    required = trial.required[None]
+    warn_beyond(lin.robot, where, lin.input_names, lin.input_units, required, -high, high)
+    held = limit.what == least.what  # a slower loop loses an unstable mode
+    what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
+    return limit._replace(what=what), _achieved(lin, trial)
+
+
+def _achieved(lin: LinearModel, trial: _Trial) -> str:
+    """Return a report of a loop's bandwidth and decay, and of modes slower than at rest."""
+    decay, fast = -trial.rates.real, np.abs(trial.rates)
+    said = f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} 1/s, "
+    said += f"damping ratio at least {(decay / fast).min():.2g}"
+    slow = decay < _AS_SLOW * math.sqrt(0.5) * trial.limit.bandwidth
+    if names := _moving_most(lin, trial.modes[:, slow]):
+        said += f"; decaying more slowly: {listed(names)}"
+    return said
+
+
+def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
+    """Return the coordinates that modes (nx, k) move most, weighed by inertia."""
+    m = len(lin.M)
+    large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
+    among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
+    return [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]
 
 
 # Along a trajectory the displacements are a tenth as large. They must decay within its duration:
@@ -286,86 +402,7 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
 # With held inputs the loop may be faster than at a point, since the sampled regulator is exact.
 _BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
 
-# The speeds of wheels come back at this fraction of the bandwidth.
-_SPEEDS = 0.1
-
 
 def pace_along(duration: float, hold: float) -> Pace:
     """Return the pace of a loop along a trajectory of that duration [s]."""
     return Pace(min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold, _HELD_ALONG)
-
-
-def rule_weights(
-    lin: LinearModel,
-    name: str | None,
-    given: Mapping[str, Any] | None = None,
-    *,
-    wheel_speeds: bool | None = None,
-    pace: Pace = AT_A_POINT,
-) -> tuple[Array, Array, Array | None, str]:
-    """Return Q, R and N of a model by a rule, changed by `given` weights, and the rule in words."""
-    # The cost of a sampled model is the continuous one under the hold, where it is known what it
-    # was sampled from. The rule is by default what the robot has in its `weights`, else "urdf".
-    source = lin.generator or lin
-    layers = [(given, False)] if given else []
-    if name is None and lin.weights:
-        layers.insert(0, (lin.weights, True))
-        name = lin.weights.get("rule")
-    terms: Array = np.zeros(sum(lin.B.shape))
-    if name is None or name == "urdf":
-        pace = pace._replace(hold=lin.dt or pace.hold)
-        Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
-    elif name == "identity":
-        nx, nu = lin.B.shape
-        Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
-    else:
-        raise unknown("rule of weights", name, ("urdf", "identity"))
-    given_weights: dict[int, GivenWeight] = {}
-    named: dict[str, None] = {}
-    for layer, of_robot in layers:
-        weights, names = weights_of(lin, layer, of_robot)
-        given_weights |= weights
-        named |= dict.fromkeys(names)
-    if named:
-        Q, R = reweighed(lin, Q, R, terms, given_weights)
-        rule = f"{', '.join(named)} as given, the others {rule}"
-        rule += " (with this rule alone)" if terms.any() else ""
-    if source.dt == lin.dt:
-        return Q, R, None, rule
-    return (*sampled_cost(source, lin.dt, Q, R), rule)
-
-
-def _of_regulated(
-    lin: LinearModel, pace: Pace, wheel_speeds: bool | None
-) -> tuple[Array, Array, str, Array]:
-    """Return Q (nx, nx), R, the rule and costs, for a model that may have wheels.
-
-    The costs (nx + nu,) are those of the largest value of each state and input, 0 if the rule has
-    none.
-    """
-    part = regulated_part(lin, wheel_speeds)
-    if part is lin:
-        Q, R, rule, _, (of_positions, of_inputs) = default_weights(lin, pace)
-        return Q, R, rule, np.concatenate((np.tile(of_positions, 2), of_inputs))
-    wheels, _ = ignorable_wheels(lin)
-    body = regulated_part(without(lin, wheels))
-    at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
-    names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
-    most = np.array([lin.limits[name] for name in names])
-    # A wheel that is at its limit already is counted as one at rest, and named in the report.
-    room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
-    found = default_weights(body, pace, dict(zip(names, room, strict=True)))
-    Q, R, rule, bandwidth, (of_positions, of_inputs) = found
-    if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
-        rule += f"; already at or beyond the URDF limit at the operating point: {listed(beyond)}"
-    S = selection(body.state_names, lin.state_names)
-    Q = S.T @ Q @ S
-    terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
-    if speeds := [name for name in part.state_names if name not in body.state_names]:
-        S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
-        # Inputs R^-1/2 Z n that turn no body change the speeds at X n.
-        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
-        X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
-        Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
-        rule = f"{rule}; wheel speeds at {slow:.3g} rad/s"
-    return Q, R, rule, terms

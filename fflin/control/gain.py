@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
-from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -16,16 +16,20 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array, Values
-from fflin.control.margins import Margins, input_margins
 from fflin.control.optimal.riccati import rates_of
 from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from fflin.control.optimal.riccati import Solution
     from fflin.linear.exchange import ToolGain
 
-# A larger gain, of more than three joints, is shown by the norms of its blocks.
+# A larger gain, of more than three joints, is not shown.
 _LARGE = 9 * 18
+
+# Relative accuracy of the largest gain over frequency.
+ACCURACY = 1e-5
 
 # A disk margin below which a loop is called fragile.
 _FRAGILE = 0.3
@@ -124,7 +128,7 @@ class Gain(Design):
         if self.K.size <= _LARGE:
             shown = f"\n\n{matrix(self.K, self.input_names, self.state_names)}"
         else:
-            shown = f", norms of its blocks; save() writes every entry\n\n{_blocks(self)}"
+            shown = ": large, not shown; save() writes every entry"
         fold = partial(textwrap.fill, width=width())
         more = {
             "not regulated": _unregulated(self),
@@ -195,8 +199,11 @@ def titled(record: Any, **sizes: int) -> str:
     """Return a one-line title: the robot, the sizes, the sampling time and the residual."""
     time = f"dt={record.dt:g} s" if record.dt else "continuous"
     parts = [f"'{record.robot}'", *(f"{key}={size}" for key, size in sizes.items()), time]
-    if hasattr(record, "residual"):
-        parts += [f"margin={record.margin:.3g}", f"residual={record.residual:.1e}"]
+    parts += [
+        f"{key}={getattr(record, key):{form}}"
+        for key, form in (("margin", ".3g"), ("residual", ".1e"))
+        if hasattr(record, key)
+    ]
     return f"{type(record).__name__}({', '.join(parts)})"
 
 
@@ -238,11 +245,6 @@ _FROM_MODEL = (
 
 def fragility(gain: Gain) -> str:
     """Return a warning if the disk margin at the inputs is small, else an empty string."""
-    # A continuous optimal loop with a diagonal R has a disk margin of 2/3 at least.
-    R = gain.R
-    alone = np.count_nonzero(R) == np.count_nonzero(R.diagonal())
-    if alone and not gain.dt and not gain.N.any():
-        return ""
     margins = gain.margins
     if margins.disk >= _FRAGILE:
         return ""
@@ -256,12 +258,9 @@ def fragility(gain: Gain) -> str:
 
 def one_sided(gain: Gain) -> str:
     """Return a warning if a gain commands negative thrust, else an empty string."""
+    keys = zip(input_keys(gain), gain.input_names, gain.K, gain.u0, strict=True)
     thrusters = [
-        name
-        for key, name, row, at in zip(
-            input_keys(gain), gain.input_names, gain.K, gain.u0, strict=True
-        )
-        if group_of(key) == "thrust" and row.any() and at <= 0.0
+        name for key, name, row, at in keys if group_of(key) == "thrust" and row.any() and at <= 0.0
     ]
     if not thrusters:
         return ""
@@ -274,56 +273,98 @@ def one_sided(gain: Gain) -> str:
 
 
 def _unregulated(gain: Gain) -> str:
-    """Say which states are not fed back, and why."""
+    """Return the states that are not fed back, with the reasons."""
     left = [name for name in gain.state_names if gain.regulated and name not in gain.regulated]
-    base = [name for name in left if name.startswith(("r_b.", "v_b."))]
-    shown = "r_b, v_b" if len(base) == 6 else ", ".join(base)
-    parts = [f"{shown} (no input pushes the base)"] if base else []
-    if any(name.startswith("q_m.") for name in left):
-        parts.append("wheel angles (ignorable)")
-    if speeds := [name for name in left if name.startswith("qdot_m.")]:
-        B = gain.B / np.linalg.norm(gain.B, axis=1, keepdims=True).clip(1e-300)
-        held, both = (
-            np.linalg.matrix_rank(selection(names, gain.state_names) @ B)
-            for names in (gain.regulated, (*gain.regulated, *speeds))
-        )
-        tied = "determined by the body's rate, as momentum is conserved"
-        if gain.frame in ("lvlh", "hill"):
-            tied = "determined by the body's rate, except for orbital forces"
-        why = tied if held == both else "wheel_speeds=True regulates the controllable ones"
-        parts.append(f"wheel speeds ({why})")
-    return ", ".join(parts)
-
-
-def _blocks(gain: Gain) -> str:
-    of_rows, of_columns = (
-        np.array([name.partition(".")[0] for name in names])
-        for names in (gain.input_names, gain.state_names)
+    if not left:
+        return ""
+    return (
+        f"{listed(left)} (no input reaches them, or other states determine them; "
+        "wheel_speeds=True regulates all controllable wheel speeds)"
     )
-    rows, columns = (list(dict.fromkeys(groups)) for groups in (of_rows, of_columns))
-    norms = [
-        [np.linalg.norm(gain.K[np.ix_(of_rows == i, of_columns == j)]) for j in columns]
-        for i in rows
-    ]
-    return matrix(np.array(norms), rows, columns)
 
 
 def _poles(gain: Gain) -> str:
+    """Return a table of the poles, complex pairs once, the slowest first."""
     poles = gain.poles[gain.poles.imag >= 0.0]
-    if gain.dt:
-        order, heads = np.argsort(-np.abs(poles)), ["pole", "modulus", "frequency [rad/s]"]
-        rates = rates_of(poles, gain.dt)
-        columns = [np.abs(poles), np.abs(rates.imag)]
-    else:
-        order, heads = np.argsort(-poles.real), ["pole [1/s]", "frequency [rad/s]", "damping"]
-        columns = [np.abs(poles), -poles.real / np.abs(poles)]
-    shown = [f"{p.real:.5g}" + (f" +- {p.imag:.5g}i" if p.imag else "") for p in poles.tolist()]
-    every = [(shown[i], *(f"{column[i]:.4g}" for column in columns)) for i in order]
-    times = Counter(every)
-    body = [[*row, f"{times[row]}"] for row in dict.fromkeys(every)]
-    if max(times.values()) > 1:
-        heads.append("times")
-    else:
-        body = [row[:-1] for row in body]
-    title = "poles of A - B K, slowest first"
-    return f"{title}\n\n{grid(cut([heads, *body]), 'l')}"
+    rates = rates_of(poles, gain.dt)
+    heads = ["pole" if gain.dt else "pole [1/s]", "frequency [rad/s]", "damping"]
+    body = [
+        [
+            f"{poles[k].real:.5g}" + (f" +- {poles[k].imag:.5g}i" if poles[k].imag else ""),
+            f"{abs(rates[k]):.4g}",
+            f"{-rates[k].real / abs(rates[k]):.4g}",
+        ]
+        for k in np.argsort(-rates.real)
+    ]
+    return f"poles of A - B K, slowest first\n\n{grid(cut([heads, *body]), 'l')}"
+
+
+class Margins(NamedTuple):
+    """Margins of gain and phase for simultaneous changes of all inputs.
+
+    Attributes
+    ----------
+    disk : float
+        Symmetric disk margin, at most 2; 0 at the stability boundary.
+    gain : tuple of float
+        Least and largest factor on the gain of each input.
+    phase : float
+        Phase lag or lead of each input [deg].
+    """
+
+    disk: float
+    gain: tuple[float, float]
+    phase: float
+
+
+def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
+    """Return the margins at the inputs of a stable loop u = -K x, to five digits."""
+    # Seiler, Packard and Gahinet, IEEE Control Systems 40(5), 2020: 1/|(S - T)/2| at the inputs,
+    # each counted in sqrt(R_ii). Bruinsma and Steinbuch, Systems and Control Letters 14(4), 1990:
+    # the norm by eigenvalues of Hamiltonian matrices, not from a grid of frequencies.
+    scale = np.sqrt(R.diagonal())
+    F, G, H, D = A - B @ K, B / scale, -scale[:, None] * K, 0.5 * np.eye(len(K))
+    if dt:
+        # The bilinear map s = (z - 1)/(z + 1) preserves the norm.
+        inverse = np.linalg.inv(F + np.eye(len(F)))
+        D = D - H @ inverse @ G
+        F, G, H = inverse @ (F - np.eye(len(F))), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
+    disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
+    gain = ((2.0 - disk) / (2.0 + disk), (2.0 + disk) / (2.0 - disk) if disk < 2.0 else math.inf)
+    return Margins(disk, gain, math.degrees(2.0 * math.atan(disk / 2.0)))
+
+
+def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
+    """Return the largest gain of a stable system, to five digits, and the frequency of it."""
+
+    def gain(frequency: float) -> tuple[float, float]:
+        response = D + C @ np.linalg.solve(1j * frequency * np.eye(len(A)) - A, B)
+        return float(np.linalg.norm(response, 2)), frequency
+
+    poles = np.linalg.eigvals(A)
+    found = max((float(np.linalg.norm(D, 2)), math.inf), *map(gain, {0.0, *np.abs(poles).tolist()}))
+    while True:
+        bound = found[0] * (1.0 + ACCURACY)
+        crossings, on_axis = gain_crossings(A, B, C, D, bound)
+        frequencies = np.sort(np.abs(crossings.imag[on_axis]))
+        between = np.concatenate((frequencies, 0.5 * (frequencies[1:] + frequencies[:-1])))
+        best = max(map(gain, between.tolist()), default=found)
+        if best[0] <= bound:
+            return max(found, best)
+        found = best
+
+
+def gain_crossings(
+    A: Array, B: Array, C: Array, D: Array, bound: float
+) -> tuple[Values, NDArray[np.bool_]]:
+    """Return eigenvalues (.., 2 nx), and which are imaginary: there the gain crosses the bound.
+
+    A superfluous crossing costs only one more evaluation of the response.
+    """
+    inverse = np.linalg.inv(bound**2 * np.eye(D.shape[1]) - D.T @ D)
+    F = A + B @ inverse @ D.T @ C
+    spread = C.T @ (np.eye(len(D)) + D @ inverse @ D.T) @ C
+    lower = np.concatenate((np.broadcast_to(-spread, F.shape), -F.mT), axis=-1)
+    upper = np.concatenate((F, B @ inverse @ B.mT), axis=-1)
+    crossings = np.linalg.eigvals(np.concatenate((upper, lower), axis=-2))
+    return crossings, np.abs(crossings.real) <= 1e-6 * np.abs(crossings)

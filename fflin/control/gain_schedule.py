@@ -14,6 +14,7 @@ from fflin.base.errors import InputError
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import folded
 from fflin.base.validation import Array, number
+from fflin.control.gain import titled
 from fflin.control.optimal.differential_riccati import Coefficients, imbalance
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
@@ -29,22 +30,7 @@ _nothing = partial(np.zeros, 0)
 class Schedule(Design):
     """Gain as a function of time, given at the knots or samples of a trajectory."""
 
-    WIDTH: ClassVar = "nu"
-
     t: Array
-
-    def __repr__(self) -> str:
-        of: Any = self
-        time, wide = f"dt={of.dt:g} s, " if of.dt else "", self.interpolant.K.shape[1]
-        return (
-            f"{type(self).__name__}('{of.robot}', {len(self.t)} knots, {self.t[0]:g} to "
-            f"{self.t[-1]:g} s, {time}nx={of.P.shape[1]}, {self.WIDTH}={wide}, "
-            f"residual={of.residual:.1e})"
-        )
-
-    def __call__(self, t: float) -> Array:
-        """Return the gain at a time."""
-        return self.gain(t)
 
     def gain(self, t: float) -> Array:
         """Return the gain at time t, or raise `InputError` if t is outside the knots.
@@ -52,10 +38,7 @@ class Schedule(Design):
         Between knots, the gain is computed from the interpolated model and P. A sampled schedule
         returns the gain of the most recent sample.
         """
-        over_time = self.interpolant
-        if type(t) is not float or not over_time.first <= t <= over_time.last:
-            t = self._within(t)
-        return over_time.gain(t)
+        return self.interpolant.gain(self._within(t))
 
     def _within(self, t: float) -> float:
         t, over_time = number("t", t), self.interpolant
@@ -135,6 +118,9 @@ class GainSchedule(Schedule):
     hold: str = field(default_factory=str)
     frame: str = field(default_factory=str)
 
+    def __repr__(self) -> str:
+        return titled(self, knots=len(self.t), nx=self.K.shape[2], nu=self.K.shape[1])
+
     def __str__(self) -> str:
         """Return the report: the sizes, the residual and the rule of the weights."""
         verdict = [] if self.verified else [NOT_VERIFIED]
@@ -165,42 +151,39 @@ class GainSchedule(Schedule):
     def interpolant(self) -> Interpolant:
         """Gain and cost over time."""
         model = (self.A, self.B, self.Q, self.R)
-        return Interpolant(self.t, self.P, self.K, model, self.dt, -1.0)
+        return Interpolant(self.t, self.P, self.K, model, self.dt)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FilterSchedule(Schedule):
     r"""Time-varying Kalman filter for the error e relative to a trajectory.
 
-    With the innovation :math:`\nu = y - y^*(t) - C \hat e - D\,\delta u`,
+    With the innovation :math:`\nu = y - y^*(t) - C \hat e - D\,\delta u` of a sample, the estimate
+    for the next sample is
 
-    .. math:: \dot{\hat e} = A(t)\,\hat e + B(t)\,\delta u + L(t)\,\nu.
-
-    For a sampled filter, the left side is the estimate for the next sample.
+    .. math:: \hat e^+ = A\,\hat e + B\,\delta u + L\,\nu.
 
     Attributes
     ----------
     t : ndarray (M,)
-        Times [s] of the knots: the trajectory's knots, and knots added to interpolate P. For a
-        sampled filter, the sample times.
+        Times [s] of the samples.
     L : ndarray (M, nx, ny)
-        Filter gains. In a sampled filter, the last two gains are equal.
+        Filter gains. The last two gains are equal.
     P : ndarray (M, nx, nx)
-        Covariance of the estimation error; for a sampled filter, before the measurement update.
-    A, B, W : ndarray (M, nx, nx), (M, nx, nu), (M, nx, nx)
-        Linear model and intensity of the disturbance at the knots. A sampled filter has M - 1 of
-        each: transition matrices from one sample to the next, and the covariance of the
-        disturbance over one sample.
+        Covariance of the estimation error before the measurement update.
+    A, B, W : ndarray (M - 1, nx, nx), (M - 1, nx, nu), (M - 1, nx, nx)
+        Transition matrices from one sample to the next, and the covariance of the disturbance
+        over one sample.
     C, D, y : ndarray (M, ny, nx), (M, ny, nu), (M, ny)
         Output matrices, and the outputs along the trajectory.
     V : ndarray (ny, ny)
-        Intensity of the measurement noise; for a sampled filter, its covariance per sample.
+        Covariance of the measurement noise at a sample.
     residual : float
-        Residual of the Riccati equation, as in `GainSchedule`.
+        Residual of the difference equation of P, as in `GainSchedule`.
     state_names, input_names, output_names : tuple of str
     robot : str
     dt : float
-        Sampling time [s]; 0 for continuous time.
+        Sampling time [s].
 
     Examples
     --------
@@ -214,7 +197,6 @@ class FilterSchedule(Schedule):
     """
 
     VECTORS: ClassVar = ("t",)
-    WIDTH: ClassVar = "ny"
 
     L: Array
     P: Array
@@ -232,31 +214,27 @@ class FilterSchedule(Schedule):
     robot: str
     dt: float = field(default_factory=float)
 
-    def gain(self, t: float) -> Array:
-        """Return the filter gain L (nx, ny) at time t; see `GainSchedule.gain`."""
-        return super().gain(t).T
+    def __repr__(self) -> str:
+        return titled(self, knots=len(self.t), nx=self.L.shape[1], ny=self.L.shape[2])
 
     def covariance(self, t: float) -> Array:
-        """Return P (nx, nx) at time t by cubic interpolation; if sampled, at the latest sample."""
+        """Return P (nx, nx) of the most recent sample at time t."""
         return self.interpolant.cost(self._within(t))
 
     @cached_property
     def interpolant(self) -> Interpolant:
         """Gain and cost over time."""
-        A, C, L = (each.transpose(0, 2, 1) for each in (self.A, self.C, self.L))
-        return Interpolant(self.t, self.P, L, (A, C, self.W, self.V), self.dt, 1.0)
+        return Interpolant(self.t, self.P, self.L, (), self.dt)
 
 
 class Interpolant:
-    """P (nx, nx) and K = R^-1 B' P over time; `sign` is -1 if P was integrated backwards."""
+    """Cost P (nx, nx) and gain K = R^-1 B' P over time."""
 
     # Between knots P is a cubic and B a spline. A sampled schedule keeps the last sample's values.
 
-    def __init__(
-        self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float, sign: float
-    ) -> None:
+    def __init__(self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float) -> None:
         self.first, self.last = float(t[0]), float(t[-1])
-        self._t, self._P, self.K, self._dt, self._sign = t, P, K, dt, sign
+        self._t, self._P, self.K, self._dt = t, P, K, dt
         if dt:
             # A little early, since clocks are rounded.
             self.starts = [self.first, *(t[1:] - 1e-9 * dt).tolist()]
@@ -264,7 +242,7 @@ class Interpolant:
         self.starts = t[:-1].tolist()
         A, self._B, Q, self._R = model
         drift, spent = P @ A, K.mT @ self._R @ K
-        rate = sign * (drift + drift.mT + Q - spent)
+        rate = spent - drift - drift.mT - Q
         h = np.diff(t)[:, None, None]
         # Powers of the fraction of the interval that is over.
         self._cubics = cubic(P[:-1], P[1:], h * rate[:-1], h * rate[1:])
@@ -308,4 +286,4 @@ class Interpolant:
         rate = (second + third + 0.75 * fourth) / h[:, None, None]
         A, S, Q = at(self._t[:-1] + 0.5 * h)
         drift = P @ A
-        return imbalance(np.array((drift, drift.mT, -P @ S @ P, Q, -self._sign * rate)))
+        return imbalance(np.array((drift, drift.mT, -P @ S @ P, Q, rate)))

@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,9 +15,6 @@ from fflin.control.policies import Clock
 # Settings of DAQP for rows of length 1, relative to the typical width of the limits: tolerance,
 # weight and regularisation of soft limits, and the smallest violation that is reported.
 _EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
-
-# Violations by the robot below this fraction of a limit's width are not reported.
-_OVER = 1e-3
 
 # DAQP's infinity, its code of a soft limit, its exit flag of a softened plan, and most iterations.
 _OPEN, _SOFT, _SOFTENED, _MOST = 1e30, 8, 2, 10_000
@@ -96,18 +92,12 @@ class Horizon:
     inputs: tuple[str, ...]
     acting: NDArray[np.intp]  # indices of the inputs that have limits
     limited: tuple[str, ...]
-    ranges: Array  # (2, m), limits of the values, or of the errors of q_b and r_b
     robot: str
 
-    @cached_property
-    def _last(self) -> tuple[Stage, ...]:
-        return self.stages[-self.samples :]
-
     def window(self, t: float) -> tuple[Stage, ...]:
-        """Return the N samples from time t on; the same object if they have not changed."""
-        k = round(min(t / self.dt, len(self.stages)))
-        moves = k < len(self.stages) - self.samples
-        return self.stages[k : k + self.samples] if moves else self._last
+        """Return the N samples from time t on."""
+        k = min(round(min(t / self.dt, len(self.stages))), len(self.stages) - self.samples)
+        return self.stages[k : k + self.samples]
 
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return the lower and upper limits (m,) of samples, and which limits are soft."""
@@ -138,9 +128,8 @@ class Receding:
     def __init__(self, horizon: Horizon, at: Any = None) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
-        self.solves = self.softened = self.unfinished = self.passed = 0
-        self._worst, self._said, self._over, self._met = 0.0, "", _OVER, ""
-        self._due: tuple[Stage, Array] | None = None  # the sample that is being applied
+        self.solves = self.softened = self.unfinished = 0
+        self._worst, self._said = 0.0, ""
         if horizon.limited:  # prepared here, so that the first sample takes no longer than others
             self._change(horizon.window(0.0))
 
@@ -150,15 +139,8 @@ class Receding:
         said = f"{self.solves} plans of {self.of.samples} samples of {self.of.dt:g} s"
         if self.softened:
             said += f"; {self.softened} plans exceed a soft limit (worst: {self._said})"
-        if self.passed:
-            said += (
-                f"; the robot exceeds a soft limit at {self.passed} samples (worst: {self._met})"
-            )
         if self.unfinished:
-            said += (
-                f"; {self.unfinished} plans had no solution, so that the saturated LQR command was "
-                "applied"
-            )
+            said += f"; the saturated LQR command replaces {self.unfinished} plans without solution"
         return (said,) if self.solves else ()
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
@@ -174,11 +156,10 @@ class Receding:
         now, d = stages[0], -stages[0].K @ e
         if not self.of.limited:
             return d
-        if stages is not self._stages:
+        if not self._stages or stages[0] is not self._stages[0]:
             self._change(stages)
         free = self._free @ e
         self.solves += 1
-        self._judge(t, e)
         z, flag = self._solved(free)
         if flag <= 0:  # once more, without a warm start
             self._start()
@@ -198,22 +179,7 @@ class Receding:
                     2,
                 )
         d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
-        self._due = now, d
         return d
-
-    def _judge(self, t: float, e: Array) -> None:
-        """Record violations of soft limits by the robot, which differs from the linear model."""
-        if self._due is None:
-            return
-        (by, d), first = self._due, len(self.of.acting)
-        reached, low, high = ((by.E @ e + by.D @ d)[first:], by.low[first:], by.high[first:])
-        width = np.where(np.isfinite(high - low), high - low, 1.0)
-        fractions = np.maximum(low - reached, reached - high) / width
-        self.passed += bool(fractions.max(initial=0.0) > _OVER)
-        if fractions.max(initial=0.0) > self._over:
-            at = int(fractions.argmax())
-            self._over, by_much = float(fractions[at]), fractions[at] * width[at]
-            self._met = f"{self.of.limited[first + at]} by {by_much:.2g} at {t:.4g} s"
 
     def _count(self, t: float, reached: Array) -> None:
         """Record how far a plan violates the soft limits."""

@@ -1,138 +1,46 @@
-"""Output feedback by a linear system: a controller from another tool, or a compensator."""
+"""Output feedback by a linear system: a controller from another tool, a file or a compensator."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.base.errors import InputError, listed
-from fflin.base.validation import Array, instance, number, vector
+from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
+from fflin.base.record import FORMATS, read_record, reading, texts
+from fflin.base.validation import Array, as_double, instance, number
+from fflin.base.writing import as_path, check_ending, reason
 from fflin.control.kalman import Compensator
-from fflin.control.policies import Clock, Feedback, Policy, decider, feedback_of
-from fflin.control.systems import fitted, system_of
-from fflin.dynamics.aba import Aba
+from fflin.control.policies import Feedback, Loop, Policy, Sample, decider, feedback_of
 from fflin.dynamics.integrators import held_exponential
-from fflin.dynamics.outputs import KINDS, Measuring, state_indices
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.outputs import Measuring
 from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel
-from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
+
+_NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # the names that signals have of themselves
 
 # A pole counts as unstable if it grows faster than this fraction of the fastest pole.
 _ROUNDING = 1e-6
 
 
-def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
-    """Return the state index of each output, and the gyroscopes, which are numbered after states.
-
-    Other sensors raise `InputError`.
-    """
-    found, gyros = list[int](), list[Gyroscope]()
-    for output in state.robot.outputs:
-        if isinstance(output, Gyroscope):
-            first = state.nx + 3 * len(gyros)
-            found += range(first, first + 3)
-            gyros.append(output)
-        elif type(output) in KINDS:
-            raise InputError(f"a {type(output).__name__} is measured in Python")
-        else:
-            found += state_indices(state, output)
-    return found, gyros
-
-
-class Sample(NamedTuple):
-    """Law u = u0 + C (z + jump) + D dy with dy = y - y0.
-
-    The next z, or dz/dt in continuous time, is A (z + jump) + B dy.
-    """
+class System(NamedTuple):
+    """A, B, C, D, dt and names; dt [s] is 0 if continuous, -1 if unknown, None if not given."""
 
     A: Array
     B: Array
     C: Array
     D: Array
-    u0: Array
-    y0: Array
-    jump: Array | float = 0.0
-
-
-class Compensation:
-    """Control law with a state z, advanced from sample to sample, or per stage if dt is 0."""
-
-    def __init__(self, size: int, at: Callable[[float], Sample], dt: float = 1.0) -> None:
-        self.at, self.dt = at, dt
-        self.estimate: Array = np.zeros(size)  # z at the next sample or stage
-        self.rates: list[Array] = [self.estimate]
-        self.stages = 0
-
-    def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
-        """Return the command of a sample; `measure(sample, u)` returns y."""
-        by = self.at(t)
-        z = self.estimate + by.jump
-        u: Array = by.u0 + by.C @ z
-        if by.D.any():  # acts on outputs that do not depend on u
-            u = u + by.D @ (measure(by, u) - by.y0)
-        after = by.A @ z + by.B @ (measure(by, u) - by.y0)
-        if self.dt:
-            self.estimate = after
-        else:
-            self.rates.append(after)
-        return u
-
-    def advance(self, weights: Array, last: bool) -> None:
-        """Integrate z to the next stage from weights of z at the step's start and of its rates."""
-        if not self.dt:
-            self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
-            if last:
-                self.rates, self.stages = [self.estimate], 0
-
-
-class Loop(Compensation):
-    """Policy that measures a robot's outputs relative to a reference, for a compensator."""
-
-    def __init__(
-        self, state: StateMap, dt: float, noise: Any, size: int, at: Any, there: Any
-    ) -> None:
-        super().__init__(size, at, dt)
-        self._noise, self._there = noise, there
-        self._at_rest: Array = np.zeros(state.robot.nv)
-        felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
-        self._aba, self._clock = Aba(state) if felt else None, Clock(dt)
-
-    def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
-        """Return the law of a sample, and the chart and state relative to which y is measured."""
-        measure, near = self._there(t)
-        return self.at(t), measure.state, near
-
-    def __call__(self, t: float, q: Array, v: Array) -> Array:
-        """Return the command at a sample or a stage."""
-        if self.dt:
-            self._clock.tick(t)
-        elif len(self.estimate) and len(self.rates) != self.stages + 1:
-            raise InputError(
-                "the states of a continuous controller are integrated by fflin.simulate; give it "
-                "the LinearController itself as the policy, or sample the controller"
-            )
-        measure, near = self._there(t)
-        state, x = measure.state, measure.state.read(q, v, near=near)
-        noise: Any = 0.0
-        if self._noise is not None:
-            size = len(self.at(t).y0)
-            noise = vector("noise(t)", self._noise(t), size, "one value for each output")
-
-        def measured(_: Sample, u: Array) -> Array:
-            a = self._at_rest
-            if aba := self._aba:
-                a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
-            return np.asarray(measure(x, q, v, a) + noise)
-
-        return self.step(t, measured)
+    dt: float | None = None
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
 
 
 @dataclass(eq=False, repr=False)
@@ -217,7 +125,7 @@ class LinearController(Feedback):
             )
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
-        by = fitted(system_of(self.system), lin)
+        by = _fitted(_system_of(self.system), lin)
         felt = lin.D.any(axis=1) & by.D.any(axis=0)
         if felt.any():
             raise InputError(
@@ -226,16 +134,12 @@ class LinearController(Feedback):
                 "inputs; set D to 0 for this output, for example with a low-pass filter"
             )
         dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
-        dt = lin.dt or dt if dt < 0.0 else dt
-        if dt < 0.0:
-            raise InputError("the controller is sampled, but has no sampling time; give its dt [s]")
-        if lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt:
-            times = (
-                f"sampled at dt = {each:g} s" if each else "continuous" for each in (dt, lin.dt)
-            )
+        dt = lin.dt or dt if dt < 0.0 else dt  # of a sampled system without a sampling time
+        if dt < 0.0 or (lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt):
             raise InputError(
-                "the controller is {}, the model is {}; give the continuous model, or sample both "
-                "with the same dt".format(*times)
+                f"the controller has dt = {'unknown' if dt < 0.0 else f'{dt:g} s'}, the model has "
+                f"dt = {lin.dt:g} s (0: continuous); give the controller the dt of the model, or "
+                "the continuous model and the controller's own dt"
             )
         self.system = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
         self.sign = 1.0  # `system` has it from here on
@@ -304,19 +208,16 @@ def growing(policy: object) -> tuple[str, ...]:
     said, by = list[str](), decider(policy)
     if not isinstance(by, LinearController):
         return ()
-    for what in ("linear loop", "controller by itself"):
-        poles = np.linalg.eigvals(by.loop if what == "linear loop" else by.system.A)
+    hint = "; if it was designed for negative feedback, set sign=-1 (--negative-feedback)"
+    for what, matrix, advice in (
+        ("linear loop", by.loop, hint),
+        ("controller by itself", by.system.A, ""),
+    ):
+        poles = np.linalg.eigvals(matrix)
         growth = np.abs(poles) - 1.0 if by.dt else poles.real
         if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
             pole, unit = complex(poles[growth.argmax()]), "" if by.dt else " 1/s"
-            said.append(f"the {what} is unstable, with a pole at {pole:.4g}{unit}")
-            poles = np.linalg.eigvals(LinearController(by.system, by.lin, sign=-1.0).loop)
-            if what == "linear loop" and ((np.abs(poles) < 1) if by.dt else (poles.real < 0)).all():
-                said[-1] += (
-                    "; the loop is stable with the opposite sign: "
-                    "set sign=-1 (--negative-feedback), "
-                )
-                said[-1] += "or remove this option if it is set"
+            said.append(f"the {what} is unstable, with a pole at {pole:.4g}{unit}{advice}")
     return tuple(said)
 
 
@@ -375,3 +276,130 @@ class OutputFeedback(LinearController):
             )
         super().__init__(compensator, lin, noise=noise)
         self.compensator = compensator
+
+
+def _system_of(given: Any) -> System:
+    """Return the system that is given in any form of `LinearController`."""
+    if isinstance(given, System):
+        return given
+    if isinstance(given, str | Path):
+        return _read(as_path(given))
+    if isinstance(given, tuple):
+        if len(given) not in (4, 5):
+            raise InputError(
+                f"system has {len(given)} parts, expected (A, B, C, D) or (A, B, C, D, dt)"
+            )
+        return _checked(*given)
+    if not hasattr(given, "A") and (hasattr(given, "to_ss") or hasattr(given, "ninputs")):
+        given = _realised(given)
+    if not all(hasattr(given, key) for key in "ABC"):
+        return _checked((), (), (), as_double("system", given))
+    inputs, outputs = (
+        getattr(given, f"{kind}_names", getattr(given, f"{kind}_labels", ()))
+        for kind in ("input", "output")
+    )
+    dt = getattr(given, "dt", None)
+    # SciPy's continuous systems have no names, and None for dt.
+    dt = 0.0 if dt is None and not inputs else dt
+    return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
+
+
+def _realised(given: Any) -> Any:
+    try:
+        if hasattr(given, "to_ss"):
+            return given.to_ss()
+        import control
+
+        return control.ss(given)
+    except Exception as error:  # each of the tools has its own
+        raise InputError(
+            f"the {type(given).__name__} cannot be converted to a state space: {reason(error)}; a "
+            "transfer function must be proper, with no more zeros than poles"
+        ) from None
+
+
+def _checked(
+    A: Any, B: Any, C: Any, D: Any, dt: Any = None, inputs: Any = (), outputs: Any = ()
+) -> System:
+    """Return a system whose sizes belong together; of D alone where A is empty."""
+    of = dict(zip("ABCD", (A, B, C, 0.0 if D is None else D), strict=True))
+    A, B, C, D = (np.atleast_2d(as_double(f"controller's {x}", of[x])) for x in of)
+    nz = len(A) if A.size else 0
+    ny, nu = (B.shape[-1], len(C)) if nz else (D.shape[-1], len(D))
+    if not nz:
+        A, B, C = np.zeros((0, 0)), np.zeros((0, ny)), np.zeros((nu, 0))
+    elif D.size == 1 and not D.any():
+        D = np.zeros((nu, ny))
+    shapes = (nz, nz), (nz, ny), (nu, nz), (nu, ny)
+    for key, each, shape in zip("ABCD", (A, B, C, D), shapes, strict=True):
+        if each.shape != shape or not np.isfinite(each).all():
+            raise InputError(
+                f"{key} of the controller has shape {each.shape}, expected {shape} with finite "
+                f"entries, for {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
+            )
+    if dt is not None:
+        # True is of a system that is sampled nobody knows how, -1 MATLAB's word for it.
+        dt = -1.0 if dt is True else number("controller's dt", dt)
+    return System(A, B, C, D, dt, tuple(map(str, inputs)), tuple(map(str, outputs)))
+
+
+def _read(path: Path) -> System:
+    check_ending(path, FORMATS)
+    with reading(path, "controller"):
+        found, _ = read_record(path)
+        if len(found) == 1 and isinstance(struct := next(iter(found.values())), dict):
+            found = struct  # of MATLAB
+        dt = found.get("dt", found.get("Ts"))
+        dt = None if dt is None else float(np.asarray(dt).item())
+        inputs, outputs = (
+            texts(found.get(f"{kind}_names", found.get(f"{kind.title()}Name", ())))
+            for kind in ("input", "output")
+        )
+    given = [key for key in "ABCD" if found.get(key) is not None]
+    if given != ["D"] and given[:3] != ["A", "B", "C"]:
+        raise FileError(
+            f"{path}: the file contains {listed(sorted(found)) or 'no arrays'}, expected A, B, C, "
+            "D (and Ts if sampled) or D alone; in MATLAB, save the controller K by "
+            "[A, B, C, D] = ssdata(K); Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
+        )
+    A, B, C = (found[key] if key in given else () for key in "ABC")
+    try:
+        return _checked(A, B, C, found.get("D"), dt, inputs, outputs)
+    except FflinError as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def _fitted(system: System, lin: LinearModel) -> System:
+    """Return a system over all outputs and inputs of a model, in their order, by its names."""
+    columns = _indices("input", system.inputs, system.D.shape[1], "output", lin.output_names)
+    rows = _indices("output", system.outputs, len(system.D), "input", lin.input_names)
+    nz, ny, nu = len(system.A), len(lin.output_names), len(lin.input_names)
+    B, C, D = np.zeros((nz, ny)), np.zeros((nu, nz)), np.zeros((nu, ny))
+    B[:, columns], C[rows], D[np.ix_(rows, columns)] = system.B, system.C, system.D
+    return System(system.A, B, C, D, system.dt, lin.output_names, lin.input_names)
+
+
+def _indices(
+    kind: str, names: tuple[str, ...], size: int, of: str, known: Sequence[str]
+) -> list[int]:
+    """Return the indices of a controller's signals among the signals of a model."""
+    named = not all(map(_NUMBERED.fullmatch, names))
+    if size != len(names if named else known):
+        raise InputError(
+            f"the controller has {size} {kind}s and {len(names) if named else 'no'} names, "
+            f"expected a name for each, or one {kind} for each {of} of the model: {listed(known)}"
+        )
+    if not named:
+        return list(range(size))
+    own, there = list(names), list(known)
+    if not {*own} <= {*there}:  # python-control has no dots in names
+        own, there = ([name.replace(".", "_") for name in each] for each in (own, there))
+    for name, key in zip(names, own, strict=True):
+        if key not in there:
+            text = unknown(f"{of} of the model", name, known)
+            raise InputError(f"{kind} of the controller: {text} (or leave out all names)")
+        if own.count(key) > 1:
+            raise InputError(
+                f"two {kind}s of the controller are named '{name}'; give them different names"
+            )
+    return [there.index(key) for key in own]

@@ -8,18 +8,20 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.analysis.mechanics import rate_matrix
 from fflin.analysis.reduction import regulated_part, selection
 from fflin.analysis.stabilizability import require_stabilizable, require_weighed
-from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
+from fflin.base.errors import (
+    EquilibriumError,
+    FflinWarning,
+    InputError,
+    StabilizabilityError,
+    listed,
+)
 from fflin.base.validation import Array, Values, dimension, instance
-from fflin.control.default_weights import rule_weights
 from fflin.control.gain import Gain, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve
-from fflin.control.weights import Weight, cost_weights, weight
+from fflin.control.weights import Weight, cost_weights, rule_weights, weight
 from fflin.linear.model import LinearModel
-
-_SHOWN_RESIDUALS = 6
 
 # A relative residual above _COARSE is worth a warning; above _USELESS the gain is wrong.
 _COARSE, _USELESS = 1e-8, 1e-3
@@ -147,9 +149,7 @@ def lqr(
     return make_gain(lin, part, solution, Q, R, cross, rule)
 
 
-def acceleration_lqr(
-    lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight, *, wheel_speeds: bool | None = None
-) -> Gain:
+def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Gain:
     r"""Return the linear quadratic regulator with weighted accelerations, in closed form.
 
     Let the accelerations :math:`a = L u` be the inputs, where L is the lower block of B. A model
@@ -160,8 +160,8 @@ def acceleration_lqr(
     .. math:: k_p = \sqrt{q_p/r_a},\quad k_d = \sqrt{q_v/r_a + 2 s k_p},\quad
               u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
 
-    and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. The speed of a reaction
-    wheel whose angle is not regulated is a single integrator with k_p = 0. The weight on u is
+    and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. Wheel speeds are not
+    regulated. The weight on u is
     :math:`L^T R_a L`. The gain is computed without the product :math:`L^T R_a L`, so that an
     ill-conditioned inertia does not reduce the accuracy of the gain.
 
@@ -175,8 +175,6 @@ def acceleration_lqr(
         Diagonal weights on the positions (q_b, r_b, q_m), the velocities and the accelerations.
         In a mapping {name: weight}, the names are positions for `Qp`, and velocities for `Qv` and
         `Ra`.
-    wheel_speeds : bool, optional
-        As in `lqr`.
 
     Returns
     -------
@@ -191,7 +189,7 @@ def acceleration_lqr(
         If a coordinate is not actuated.
     InputError
         If the model is sampled, its dynamics are not double integrators, or a weight is negative or
-        not diagonal. Qp, Ra, and Qv on wheel speeds must be positive.
+        not diagonal. Qp and Ra must be positive.
     ModelError
         If the robot's model was changed after the robot was made.
 
@@ -213,29 +211,38 @@ def acceleration_lqr(
             "lin is sampled, expected a continuous model; for a sampled regulator give the Q and R "
             "of the continuous gain to sampled_cost and lqr"
         )
-    whole, lin = lin, regulated_part(lin, wheel_speeds)
-    s, L = _integrators(lin)
-    double, half, m = s != 0.0, len(whole.A) // 2, len(s)
-    positions, velocities = lin.state_names[:-m], lin.state_names[-m:]
-    qp = _diagonal("Qp", Qp, whole.state_names[:half], positions, definite=True)
-    qv = _diagonal("Qv", Qv, whole.state_names[half:], velocities, definite=False)
-    ra = _diagonal("Ra", Ra, whole.state_names[half:], velocities, definite=True)
-    if not (double | (qv > 0.0)).all():
-        name = velocities[int((double | (qv > 0.0)).argmin())]
-        raise InputError(f"Qv is 0 for {name}, expected a positive weight on a wheel's speed")
-    to_positions = np.eye(m)[double]
+    whole, lin = lin, regulated_part(lin, wheel_speeds=False)
+    m, half = len(lin.A) // 2, len(whole.A) // 2
+    s, L = lin.A[:m, m:].diagonal(), lin.B[m:]
+    expected = np.zeros_like(lin.A)
+    expected[:m, m:] = np.diag(s)
+    if len(lin.A) != 2 * m or not np.array_equal(lin.A, expected) or lin.B[:m].any():
+        raise InputError(
+            "the model is not a set of double integrators, expected a model at rest without "
+            "gravity, orbit, springs or dampers; use lqr for this model"
+        )
+    sizes = np.abs(L).max(axis=1, keepdims=True)
+    if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < m:
+        require_stabilizable(lin)
+        raise StabilizabilityError(
+            "the inputs do not accelerate every coordinate independently; use lqr"
+        )
+    positions, velocities = whole.state_names[:half], whole.state_names[half:]
+    qp = _diagonal("Qp", Qp, positions, lin.state_names[:m], definite=True)
+    qv = _diagonal("Qv", Qv, velocities, lin.state_names[m:], definite=False)
+    ra = _diagonal("Ra", Ra, velocities, lin.state_names[m:], definite=True)
     Q = np.diag(np.concatenate((qp, qv)))
     with np.errstate(all="ignore"):
-        kp = to_positions.T @ np.sqrt(qp / ra[double])
+        kp = np.sqrt(qp / ra)
         kd = np.sqrt(qv / ra + 2.0 * s * kp)
         fast = -0.5 * (kd + np.sqrt((kd * kd - 4.0 * s * kp).astype(complex)))
-        poles = np.concatenate((fast, (s * kp / fast)[double]))
-        P11, P12 = np.diag((kp * ra * kd / s)[double]), to_positions * (ra * kp)
-        P = np.block([[P11, P12], [P12.T, np.diag(ra * kd)]])
-        inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
-        K = inverse @ np.hstack((to_positions.T * kp[double], np.diag(kd)))
+        poles = np.concatenate((fast, s * kp / fast))
+        P11, P12, P22 = (np.diag(x) for x in (kp * ra * kd / s, ra * kp, ra * kd))
+        P = np.block([[P11, P12], [P12, P22]])
+        inverse = np.linalg.inv(L) if L.shape == (m, m) else np.linalg.pinv(L)
+        K = inverse @ np.hstack((np.diag(kp), np.diag(kd)))
         try:
-            accelerated = np.vstack((np.zeros_like(to_positions), np.eye(m)))
+            accelerated = np.vstack((np.zeros((m, m)), np.eye(m)))
             residual = Riccati(lin.A, accelerated, Q, np.diag(ra), None, 0.0).trial(P).residual
             sound = bool((poles.real < 0.0).all() and np.isfinite(K).all())
         except np.linalg.LinAlgError:
@@ -249,27 +256,6 @@ def acceleration_lqr(
     return make_gain(whole, lin, solution, Q, 0.5 * R + 0.5 * R.T, None)
 
 
-def _integrators(lin: LinearModel) -> tuple[Array, Array]:
-    """Return s (m,), 0 for a velocity without its coordinate, and L (m, nu) of integrators."""
-    p = sum(name.startswith(("q_", "r_")) for name in lin.state_names)
-    s: Array = lin.A[:p, p:].sum(axis=0)
-    L, double = lin.B[p:], np.diag(s)[s != 0.0]
-    expected = np.zeros_like(lin.A)
-    expected[: len(double), p:] = double
-    if len(double) != p or not np.array_equal(lin.A, expected) or lin.B[:p].any():
-        raise InputError(
-            "the model is not a set of double integrators, expected a model at rest without "
-            "gravity, orbit, springs or dampers; use lqr for this model"
-        )
-    sizes = np.abs(L).max(axis=1, keepdims=True)
-    if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < len(s):
-        require_stabilizable(lin)
-        raise StabilizabilityError(
-            "the inputs do not accelerate every coordinate independently; use lqr"
-        )
-    return s, L
-
-
 def _diagonal(
     what: str, value: Weight, names: Sequence[str], kept: Sequence[str], *, definite: bool
 ) -> Array:
@@ -279,8 +265,7 @@ def _diagonal(
             f"{what} is a matrix, expected the diagonal of a weight; for a full weight matrix use "
             "lqr"
         )
-    whole = weight(what, value, names, definite=definite and len(kept) == len(names))
-    diagonal = whole.diagonal()[[names.index(name) for name in kept]]
+    diagonal = weight(what, value, names).diagonal()[[names.index(name) for name in kept]]
     return weight(what, diagonal, kept, definite=definite).diagonal()
 
 
@@ -290,22 +275,16 @@ def require_fixed_point(lin: LinearModel) -> None:
     if lin.is_equilibrium():
         return
     rate = lin.f0 if lin.drift is None else lin.drift
-    judged = [name not in lin.ignorable for name in lin.state_names]
-    rows = [i for i in np.argsort(-np.abs(rate)) if judged[i] and abs(rate[i]) > lin.bound(1e-9)]
-    shown = ", ".join(
+    shown = [
         f"d {lin.state_names[i]}/dt = {rate[i] / (lin.dt or 1.0):.6g}"
-        for i in rows[:_SHOWN_RESIDUALS]
-    )
-    more = f" and {len(rows) - _SHOWN_RESIDUALS} more" if len(rows) > _SHOWN_RESIDUALS else ""
-    raise EquilibriumError(
-        f"the point is not a fixed point: {shown}{more}; "
-        + (
-            "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
-            if lin.moving
-            else "linearise about a fixed point, with the q and u of fflin.equilibrium, or about "
-            "a steady motion with moving=True"
-        )
-    )
+        for i in np.argsort(-np.abs(rate))
+        if lin.state_names[i] not in lin.ignorable and abs(rate[i]) > lin.bound(1e-9)
+    ]
+    advice = "linearise about a fixed point, with the q and u of fflin.equilibrium, or about "
+    advice += "a steady motion with moving=True"
+    if lin.moving:
+        advice = "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
+    raise EquilibriumError(f"the point is not a fixed point: {listed(shown)}; {advice}")
 
 
 def _difference(a: Array, b: Array, c: Array) -> Array:
@@ -339,11 +318,9 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
         if solution.residual > _USELESS:
             raise np.linalg.LinAlgError("the weights are too badly scaled")
     except np.linalg.LinAlgError as error:
-        # The closed form is for double integrators alone.
-        forces = rate_matrix(lin)[len(lin.M) - len(lin.A) :].any()
         raise StabilizabilityError(
             f"no stabilising solution of the Riccati equation was found: {error}; scale the "
-            f"weights, for example with bryson{'' if forces else ', or use acceleration_lqr'}"
+            "weights, for example with bryson, or use acceleration_lqr for double integrators"
         ) from None
     if solution.residual > _COARSE:
         warnings.warn(

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError, listed
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
-from fflin.base.tables import folded
 from fflin.base.validation import Array, instance, number, whole
 from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
@@ -131,7 +130,7 @@ def mpc(
             "lin is sampled with another dt, or the model before sampling is not known; give the "
             "continuous model and dt="
         )
-    names, at, rows, ranges = _limits(source, limits)
+    names, at, rows = _limits(source, limits)
     if samples**2 * (len(at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
         raise InputError(
             f"horizon is {samples} samples with {len(at)} limits, which makes the program too "
@@ -141,7 +140,7 @@ def mpc(
     made, stages = designed(source, (Q, R, weights), Qf, samples, dt, names, rows)
     acting = at[at < len(lin.input_names)]
     of: Any = getattr(source.robot, "name", source.robot)
-    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, names, ranges, of))
+    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, names, of))
 
 
 class _Shown:
@@ -151,13 +150,6 @@ class _Shown:
         of = self.horizon
         said = f"'{of.robot}', {of.samples} samples of {of.dt:g} s, {len(of.limited)} limits"
         return f"{type(self).__name__}({said})"
-
-    def __str__(self) -> str:
-        same, of = dict[str, list[str]](), self.horizon
-        for k, (name, ends) in enumerate(zip(of.limited, of.ranges.T, strict=True)):
-            kind = "hard" if k < len(of.acting) else "soft"
-            same.setdefault(f"{kind}, {ends[0]:.6g} to {ends[1]:.6g}", []).append(name)
-        return folded((repr(self), *(f"{key}: {', '.join(at)}" for key, at in same.items())))
 
 
 @dataclass(eq=False, repr=False)
@@ -207,18 +199,13 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
         """Return the quadratic program at time t [s] and error e (nx,), by default zero."""
         return self.horizon.matrices(e, t)
 
-    def law(self) -> Callable[[float, Array], Array]:
-        """Return law(t, e) -> u: the inputs at an error e and a time of the run."""
-        plans = Receding(self.horizon)
-        return lambda t, e: self.commanded(t)[2] + plans.step(t, e)
-
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot with the trajectory's states and inputs."""
         return Receding(self.horizon, self.deviation(robot))
 
 
-def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any], Array]:
-    """Return the names of limited signals, their indices, a function for a stage, and ranges.
+def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any]]:
+    """Return the names of limited signals, their indices, and a function for a stage.
 
     The indices are among inputs, states and outputs. The function returns a stage's E, D, low and
     high for its output matrices and target.
@@ -228,15 +215,14 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
     beside = [name for name in outputs if name not in states]
     known = (*state_keys(robot.joint_names), *input_keys(of))
-    several, found = isinstance(limits, list | tuple), dict[str, Any]()
-    parts = list(limits) if several else [limits]
+    found, parts = dict[str, Any](), list(limits) if isinstance(limits, list | tuple) else [limits]
     for k, part in enumerate(parts):
-        keys = [*part] if isinstance(part, Mapping) and beside else []
-        own = [x for x in keys if stands_for_any(x, beside) and not stands_for_any(x, known)]
-        ranges = by_name("output", {key: range_of(key, part[key]) for key in own}, beside)
-        found |= {beside[i]: limit for i, limit in ranges.items()}
-        parts[k] = {key: part[key] for key in keys if key not in own} if own else part
-    acting = chosen_limits(robot, parts if several else parts[0])[0]
+        if isinstance(part, Mapping) and beside:
+            own = [x for x in part if stands_for_any(x, beside) and not stands_for_any(x, known)]
+            ranges = by_name("output", {key: range_of(key, part[key]) for key in own}, beside)
+            found |= {beside[i]: limit for i, limit in ranges.items()}
+            parts[k] = {key: limit for key, limit in part.items() if key not in own}
+    acting = chosen_limits(robot, parts if len(parts) > 1 else parts[0])[0]
     found |= {name: acting[name] for name in states if name in acting}
     of_inputs = np.array(input_limits(robot, acting))
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
@@ -254,7 +240,7 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
         of_d = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))[at]
         return of_e, of_d, (low - there)[at], (high - there)[at]
 
-    return tuple(names[i] for i in at), at, rows, np.array((low, high))[:, at]
+    return tuple(names[i] for i in at), at, rows
 
 
 def _about(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -13,14 +13,26 @@ from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing, letters_of, logarithmic
 from fflin.base.validation import Array, Values, instance, number, refuse_masked
 from fflin.control.gain import Gain
-from fflin.control.margins import Loop, input_loops
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
 _LINE = "#888888"
+
+_POINTS = 400
+
+# A smaller gain factor counts as zero: with an integrator, the gain is infinite at rest.
+_NOTHING = 1e-6
+
+
+class LoopMargins(NamedTuple):
+    """Phase margin [deg] of a loop, and the gain factors between which the loop is stable."""
+
+    phase: float
+    gain: tuple[float, float]
 
 
 def plot_poles(
@@ -86,7 +98,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     with drawing(path, 11.0, tall) as figure:
         w, response, loops = input_loops(gain)
         sizes, phases, poles = figure.subplots(3, 1)
-        _bode(sizes, phases, w, response, loops)
+        _bode(sizes, phases, w, response)
         names = (
             f"{name}: {min(loop.phase, 180.0):.0f} deg, {loop.gain[0]:.2g} to {loop.gain[1]:.3g}"
             for name, loop in zip(gain.input_names, loops, strict=True)
@@ -113,26 +125,63 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def _bode(sizes: Axes, phases: Axes, w: Array, response: Values, loops: Sequence[Loop]) -> None:
-    colors = cycle(len(loops))
+def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
+    """Return frequencies (k,) [rad/s], the loop gains (k, nu) of the inputs, and their margins."""
+    # With T = K (s E - A + B K)^-1 B the loop of input i is T_ii / (1 - T_ii), of a sampled model
+    # at s = e^(j w h).
+    fed = [gain.state_names.index(name) for name in gain.regulated or gain.state_names]
+    F, B, K, dt = gain.closed_loop[np.ix_(fed, fed)], gain.B[fed], gain.K[:, fed], gain.dt
+
+    def response(w: float) -> Values:
+        s = np.exp(1j * w * dt) if dt else 1j * w
+        T = np.einsum("ij,ji->i", K, np.linalg.solve(s * np.eye(len(F)) - F, B))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return T / (1.0 - T)
+
+    rates = np.abs(np.log(gain.poles[gain.poles != 0.0]) / dt if dt else gain.poles)
+    end = math.pi / dt if dt else 100.0 * float(rates.max())
+    grid = np.geomspace(min(float(rates.min()), end) / 100.0, end, _POINTS)
+    values = np.array([response(w) for w in grid])
+
+    def changes(
+        value: Callable[[Values], Array], i: int, among: NDArray[np.bool_]
+    ) -> list[complex]:
+        """Return the responses of loop i where a function of them changes its sign."""
+        from scipy.optimize import brentq
+
+        signs = np.signbit(value(values[:, i]))
+        at = np.flatnonzero((signs[1:] != signs[:-1]) & among[1:] & among[:-1])
+        found = (brentq(lambda w: value(response(w)[i]), *grid[k : k + 2], xtol=1e-12) for k in at)
+        return [complex(response(w)[i]) for w in found]
+
+    loops = []
+    # At the ends of the axis a loop is real, and its phase may be -180 deg there.
+    ends = [response(0.0)] + [values[-1]] * bool(dt)
+    for i in range(len(K)):
+        crossed = changes(lambda L: np.log(np.abs(L)), i, values[:, i] != 0.0)
+        turned = changes(np.imag, i, values[:, i].real < 0.0)
+        turned += [value[i] for value in ends if value[i].real < 0.0]
+        angles = [math.degrees(np.angle(value)) - 180.0 for value in crossed]
+        phase = min((abs(math.remainder(x, 360.0)) for x in angles), default=math.inf)
+        factors = [1.0 / abs(value) if value else math.inf for value in turned]
+        low = max((x for x in factors if _NOTHING < x < 1.0), default=0.0)
+        high = min((x for x in factors if x > 1.0), default=math.inf)
+        loops.append(LoopMargins(phase, (low, high)))
+    return grid, values, loops
+
+
+def _bode(sizes: Axes, phases: Axes, w: Array, response: Values) -> None:
+    colors = cycle(response.shape[1])
     sizes.set_prop_cycle(color=colors)
     sizes.loglog(w, np.abs(response), lw=1.0)
-    for color, values, loop in zip(colors, response.T, loops, strict=True):
+    for color, values in zip(colors, response.T, strict=True):
         angle = np.degrees(np.unwrap(np.angle(values)))
         angle -= 360.0 * math.ceil(angle[-1] / 360.0)
         phases.semilogx(w, angle, color=color, lw=1.0)
-        marked: dict[str, Any] = {"color": color, "ms": 3, "lw": 0.6, "markevery": [0]}
-        for at, _ in loop.crossings:
-            of = float(np.interp(math.log(at), np.log(w), angle))
-            sizes.plot([at], [1.0], "o", **marked)
-            phases.plot([at] * 2, [of, of - math.remainder(of - 180.0, 360.0)], "o-", **marked)
-        for at, size in loop.turns:
-            if w[0] <= at <= w[-1]:
-                sizes.plot([at, at], [size, 1.0], "s-", **marked)
     sizes.axhline(1.0, color=_LINE, lw=0.8)
     phases.axhline(-180.0, color=_LINE, lw=0.8)
     phases.locator_params("y", nbins=6, steps=[1, 1.5, 3, 4.5, 6, 9, 10])
-    sizes.set(title="loop gain (dot: gain 1, square: phase -180 deg)", ylabel="|L|")
+    sizes.set(title="loop gain", ylabel="|L|")
     phases.set(title="loop phase", ylabel="[deg]")
     for axes in (sizes, phases):
         axes.set(xlabel="frequency [rad/s]", xlim=(w[0], w[-1]))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
@@ -10,15 +10,18 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.names import group_of, input_keys
-from fflin.base.validation import Array, frozen, instance, shaped
+from fflin.base.validation import Array, frozen, instance, shaped, vector
 from fflin.control.channel import Law
+from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import states_of, unwound
+from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.limits import limits_of
+from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
@@ -236,6 +239,118 @@ class Clock:
                 f"{self._dt:g} s; leave out `sample`, or set `sample` to the expected value"
             )
         self._last = t
+
+
+def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
+    """Return the state index of each output, and the gyroscopes, which are numbered after states.
+
+    Other sensors raise `InputError`.
+    """
+    found, gyros = list[int](), list[Gyroscope]()
+    for output in state.robot.outputs:
+        if isinstance(output, Gyroscope):
+            first = state.nx + 3 * len(gyros)
+            found += range(first, first + 3)
+            gyros.append(output)
+        elif type(output) in KINDS:
+            raise InputError(f"a {type(output).__name__} is measured in Python")
+        else:
+            found += state_indices(state, output)
+    return found, gyros
+
+
+class Sample(NamedTuple):
+    """Law u = u0 + C (z + jump) + D dy with dy = y - y0.
+
+    The next z, or dz/dt in continuous time, is A (z + jump) + B dy.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    u0: Array
+    y0: Array
+    jump: Array | float = 0.0
+
+
+class Compensation:
+    """Control law with a state z, advanced from sample to sample, or per stage if dt is 0."""
+
+    def __init__(self, size: int, at: Callable[[float], Sample], dt: float = 1.0) -> None:
+        self.at, self.dt = at, dt
+        self.estimate: Array = np.zeros(size)  # z at the next sample or stage
+        self.rates: list[Array] = [self.estimate]
+        self.stages = 0
+
+    def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
+        """Return the command of a sample; `measure(sample, u)` returns y."""
+        by = self.at(t)
+        z = self.estimate + by.jump
+        u: Array = by.u0 + by.C @ z
+        if by.D.any():  # acts on outputs that do not depend on u
+            u = u + by.D @ (measure(by, u) - by.y0)
+        after = by.A @ z + by.B @ (measure(by, u) - by.y0)
+        if self.dt:
+            self.estimate = after
+        else:
+            self.rates.append(after)
+        return u
+
+    def advance(self, weights: Array, last: bool) -> None:
+        """Integrate z to the next stage from weights of z at the step's start and of its rates."""
+        if not self.dt:
+            self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
+            if last:
+                self.rates, self.stages = [self.estimate], 0
+
+
+class Loop(Compensation):
+    """Policy that measures a robot's outputs relative to a reference, for a compensator."""
+
+    def __init__(
+        self,
+        state: StateMap,
+        dt: float,
+        noise: Callable[[float], ArrayLike] | None,
+        size: int,
+        at: Callable[[float], Any],
+        there: Callable[[float], tuple[Measuring, Array]],
+    ) -> None:
+        super().__init__(size, at, dt)
+        self._noise, self._there = noise, there
+        self._at_rest: Array = np.zeros(state.robot.nv)
+        felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
+        self._aba, self._clock = Aba(state) if felt else None, Clock(dt)
+
+    def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
+        """Return the law of a sample, and the chart and state relative to which y is measured."""
+        measure, near = self._there(t)
+        return self.at(t), measure.state, near
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the command at a sample or a stage."""
+        if self.dt:
+            self._clock.tick(t)
+        elif len(self.estimate) and len(self.rates) != self.stages + 1:
+            raise InputError(
+                "the states of a continuous controller are integrated by fflin.simulate; give it "
+                "the LinearController itself as the policy, or sample the controller"
+            )
+        measure, near = self._there(t)
+        state, x = measure.state, measure.state.read(q, v, near=near)
+        noise: Any = 0.0
+        if self._noise is not None:
+            size = len(self.at(t).y0)
+            noise = vector("noise(t)", self._noise(t), size, "one value for each output")
+
+        def measured(_: Sample, u: Array) -> Array:
+            a = self._at_rest
+            if aba := self._aba:
+                a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
+            return np.asarray(measure(x, q, v, a) + noise)
+
+        return self.step(t, measured)
 
 
 def decider(policy: object) -> object:

@@ -16,8 +16,8 @@ from fflin.base.names import by_name
 from fflin.base.validation import Array, instance
 from fflin.control.gain_schedule import FilterSchedule, GainSchedule
 from fflin.control.kalman import kalman
-from fflin.control.linear_controller import LinearController, Loop, Sample
-from fflin.control.policies import Allocation, Feedback, Policy, decider
+from fflin.control.linear_controller import LinearController
+from fflin.control.policies import Allocation, Feedback, Loop, Policy, Sample, decider
 from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import moved_by, moving_error
@@ -151,23 +151,17 @@ class TrajectoryFeedback(Feedback):
         # The chart is centred at the start, whose attitude may be any rotation.
         chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame=self.frame)
         values = by_name("state", offset, (*chart.names, "roll", "pitch", "yaw"))
-        e, angles = np.zeros(chart.nx), np.zeros(3)
-        for index, value in values.items():
-            if index < chart.nx:
-                e[index] = value
-            else:
-                angles[index - chart.nx] = value
+        given = np.zeros(chart.nx + 3)
+        given[list(values)] = list(values.values())
+        e, angles = given[:-3], given[-3:]
+        if (e[:3].any() and angles.any()) or not np.linalg.norm(e[:3]) < 1.0:
+            raise InputError(
+                f"the offset has |q_b| = {np.linalg.norm(e[:3]):.3g} and roll, pitch, yaw = "
+                f"{angles} deg, expected only one of them, and |q_b| less than 1"
+            )
         if angles.any():
-            if e[:3].any():
-                raise InputError(
-                    "the offset has both q_b and an angle roll, pitch or yaw; give only one of them"
-                )
             turn = pin.Quaternion(pin.rpy.rpyToMatrix(*np.radians(angles))).coeffs()
             e[:3] = turn[:3] if turn[3] >= 0.0 else -turn[:3]
-        if not np.linalg.norm(e[:3]) < 1.0:
-            raise InputError(
-                f"|q_b| of the offset is {np.linalg.norm(e[:3]):.3g}, expected less than 1"
-            )
         return chart.to_pinocchio(moved_by(self.frame, chart.to_state(q, v)[None], e[None])[0])
 
     def gain(self, t: float) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,17 +13,17 @@ from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import DetectabilityError, EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, number
-from fflin.control.default_weights import pace_along, rule_weights
+from fflin.control.default_weights import pace_along
 from fflin.control.gain import Gain
 from fflin.control.gain_schedule import FilterSchedule, GainSchedule, Interpolant
 from fflin.control.kalman import disturbance, kalman
 from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
-from fflin.control.weights import Weight, cost_weights, sampled_cost, weight
+from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
 from fflin.dynamics.rnea import rotor_names
 from fflin.linear.equilibrium import equilibrium
-from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
+from fflin.linear.linear_trajectory import LinearTrajectory, Steps, along, transitions
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
@@ -122,10 +121,6 @@ def tvlqr(
         *given, _, rule = rule_weights(end, weights, pace=pace)
     Q, R, _ = cost_weights(traj, given[0], given[1], None)
     Qf = steady_regulator(end, Q, R, sample)[0] if steady else weight("Qf", Qf, names)
-    fields: dict[str, Any] = {key: getattr(traj, key) for key in ("q", "v", "u", "hold", "frame")}
-    fields |= {"state_names": names, "input_names": traj.input_names, "robot": traj.robot.name}
-    fields |= {"Q": Q, "R": R, "Qf": Qf, "weights": rule, "knots": traj.t}
-    fields |= {"verified": traj.verified, "dt": dt}
 
     def at(times: Array) -> riccati.Coefficients:
         A, B = traj.matrices_at(times)
@@ -141,8 +136,27 @@ def tvlqr(
             t, P = riccati.solve_back(at, traj.t, Qf)
             A, B = traj.matrices_at(t)
             K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
-            residual = Interpolant(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
-    return GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=residual, **fields)
+            residual = Interpolant(t, P, K, (A, B, Q, R), 0.0).residual(at)
+    return GainSchedule(
+        t=t,
+        K=K,
+        P=P,
+        A=A,
+        B=B,
+        Q=Q,
+        R=R,
+        Qf=Qf,
+        residual=residual,
+        robot=traj.robot.name,
+        dt=dt,
+        weights=rule,
+        knots=traj.t,
+        **{key: getattr(traj, key) for key in _OF_REGULATOR},
+    )
+
+
+_OF_REGULATOR = ("state_names", "input_names", "verified", "q", "v", "u", "hold", "frame")
+_OF_FILTER = ("state_names", "input_names", "output_names", "verified")
 
 
 def asks_steady(value: Any, name: str = "Qf", kind: str = "a weight") -> bool:
@@ -226,21 +240,19 @@ def tvkalman(
     V: Weight,
     G: ArrayLike | None = None,
     P0: Weight | str = "steady",
-    sample: float | None = None,
+    *,
+    sample: float,
 ) -> FilterSchedule:
-    r"""Return the time-varying Kalman filter along a trajectory.
+    r"""Return the time-varying Kalman filter of sampled outputs along a trajectory.
 
-    White noise of intensities W and V acts on the error and on the outputs, as in `kalman`. The
-    covariance P of the estimation error is integrated forward from P0,
+    White noise of intensity W acts on the error, and noise of covariance V on the outputs at each
+    sample. Between samples, :math:`\delta u` is held. The covariance P of the estimation error is
+    computed forward from P0 by (10.4) of docs/derivation.md:
 
-    .. math:: \dot P = A P + P A^T - P C^T V^{-1} C P + W,\qquad L = P C^T V^{-1}.
+    .. math:: P_{k+1} = \Phi (P - P C^T (C P C^T + V)^{-1} C P)_k \Phi^T + W_k,\qquad
+              L = \Phi P C^T (C P C^T + V)^{-1},
 
-    In reversed time, the equation is the Riccati equation of `tvlqr` with :math:`A, B, Q, R`
-    replaced by :math:`A^T, C^T, W, V`. The solution method is the same.
-
-    With `sample`, the filter is sampled (10.4): y is measured at the samples, and :math:`\delta
-    u` is held between samples. V is then the noise covariance per sample. W remains the intensity
-    of the continuous disturbance.
+    with the transition :math:`\Phi` of a sample and the disturbance :math:`W_k` integrated over it.
 
     Parameters
     ----------
@@ -249,7 +261,7 @@ def tvkalman(
     W : array_like (nx, nx) or (nx,), float, or mapping
         Intensity of the disturbance, positive semidefinite, as in `kalman`.
     V : array_like (ny, ny) or (ny,), float, or mapping
-        Intensity of the measurement noise, positive definite.
+        Covariance of the measurement noise at a sample, positive definite.
     G : array_like (nx, nw) or (N, nx, nw), optional
         Input matrix of the disturbance, linear between the knots; W is then (nw, nw). With
         ``G=traj.B``, the disturbance acts at the inputs, and the keys of a mapping W are names of
@@ -258,7 +270,7 @@ def tvkalman(
         Covariance at the start. "steady" is the covariance of `kalman` about the start point. The
         start point is the first configuration at rest, or in its initial motion if this motion is
         steady.
-    sample : float, optional
+    sample : float
         Sampling time [s], which must divide the duration.
 
     Returns
@@ -268,8 +280,8 @@ def tvkalman(
     Raises
     ------
     InputError
-        If a size or value is wrong, if P changes so fast that too many knots are needed, or if
-        the sampling time does not divide the duration.
+        If a size or value is wrong, if P overflows, or if the sampling time does not divide the
+        duration.
     UnknownNameError
         If a name does not exist.
     EquilibriumError, DetectabilityError
@@ -291,78 +303,62 @@ def tvkalman(
     (21, 18, 18)
     """
     require_continuous(traj)
-    dt = 0.0 if sample is None else number("sample", sample)
+    dt = number("sample", sample)
     V = weight("V", V, traj.output_names, definite=True)
     noise, columns = disturbance(traj, W, G)
-    through = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
+    columns = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
 
-    def at(times: Array) -> riccati.Coefficients:
-        pairs = zip(*(traj.between(t, traj.C, through) for t in times.tolist()), strict=True)
-        C, by = map(np.array, pairs)
-        intensity = by @ noise @ by.mT
-        spread = riccati.spread(C.mT, V)
-        A, _ = traj.matrices_at(times)
-        return riccati.Coefficients(A.mT, spread, 0.5 * (intensity + intensity.mT))
+    def intensity(t: float) -> Array:
+        (by,) = traj.between(t, columns)
+        spread = by @ noise @ by.T
+        return 0.5 * (spread + spread.T)
 
-    names: Any = ("state_names", "input_names", "output_names", "verified")
-    fields: dict[str, Any] = {key: getattr(traj, key) for key in names}
-    fields |= {"robot": traj.robot.name, "V": V, "dt": dt}
     if asks_steady(P0, "P0", "a covariance"):
-        P = _steady_filter(traj, at(traj.t[:1]).Q[0], V, dt)
+        P = _steady_filter(traj, intensity(float(traj.t[0])), V, dt)
     else:
         P = weight("P0", P0, traj.state_names)
+    held, at_samples, nx = list(transitions(traj, dt)), along(traj.resampled(dt)), len(P)
+    maps = np.array([whole for _, whole in held])
     with riccati.bounded_by("a smaller W or a larger V"):
-        if sample is not None:
-            return FilterSchedule(**fields, **_sampled_filter(traj, dt, at, V, P))
-        times, found = riccati.solve_back(lambda times: at(-times), -traj.t[::-1], P)
-    t, P = -times[::-1], found[::-1]
-    rows = zip(*(traj.between(x, traj.C, traj.D, traj.y) for x in t.tolist()), strict=True)
-    fields |= dict(zip("ABCDy", (*traj.matrices_at(t), *map(np.array, rows)), strict=True))
-    L = np.linalg.solve(V, fields["C"] @ P).mT
-    fields |= {"t": t, "L": L, "P": P, "W": at(t).Q}
-    made = FilterSchedule(residual=np.inf, **fields)
-    return replace(made, residual=made.interpolant.residual(at))
+        disturbed = [_disturbed(steps, intensity) for steps, _ in held]
+        stages = [
+            (block_diag(each, V), np.hstack((whole[:, :nx].T, C.T)))
+            for each, whole, C in zip(disturbed, maps, at_samples.C, strict=False)
+        ]
+        K, P, residual = riccati.samples_back(stages, P)
+    L = K.transpose(0, 2, 1)
+    return FilterSchedule(
+        t=at_samples.t,
+        L=np.concatenate((L, L[-1:])),
+        P=P,
+        A=maps[:, :, :nx],
+        B=maps[:, :, nx:],
+        **{key: getattr(at_samples, key) for key in "CDy"},
+        W=np.array(disturbed),
+        V=V,
+        residual=residual,
+        robot=traj.robot.name,
+        dt=dt,
+        **{key: getattr(traj, key) for key in _OF_FILTER},
+    )
 
 
 def _steady_filter(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Array:
     lin = steady_end(traj, 0)
-    if dt:
-        lin, W = lin.discretize(dt), held_cost(lin.A.T, W, dt)
     try:
-        return kalman(lin, W, V).P
+        return kalman(lin.discretize(dt), held_cost(lin.A.T, W, dt), V).P
     except (DetectabilityError, InputError) as error:
         raise type(error)(
             f"no steady filter exists at the start of the trajectory: {error}; or give P0"
         ) from None
 
 
-def _sampled_filter(
-    traj: LinearTrajectory,
-    dt: float,
-    at: Callable[[Array], riccati.Coefficients],
-    V: Array,
-    P: Array,
-) -> dict[str, Any]:
-    """Return what the schedule of a filter has whose measurements are sampled."""
-    at_samples, nx, disturbed = along(traj.resampled(dt)), len(P), list[Array]()
-    held = list(transitions(traj, dt))
-
-    def stages() -> Iterator[tuple[Array, Array]]:
-        for C, (steps, whole) in zip(at_samples.C, held, strict=False):
-            W = np.zeros((nx, nx))
-            first, second = (at(times).Q for times in steps.nodes.T)
-            mixed = HEAVY * first + LIGHT * second
-            added = held_cost(steps.F[:, :nx, :nx].mT, mixed, steps.h)
-            for step, each in zip(steps.maps[:, :, :nx], added, strict=True):
-                W = step @ W @ step.T + each
-            disturbed.append(W)
-            yield block_diag(W, V), np.hstack((whole[:, :nx].T, C.T))
-
-    K, P, residual = riccati.samples_back(stages(), P)
-    L, maps = K.transpose(0, 2, 1), np.array([whole for _, whole in held])
-    return {
-        **{"t": at_samples.t, "L": np.concatenate((L, L[-1:])), "P": P},
-        **{"A": maps[:, :, :nx], "B": maps[:, :, nx:], "W": np.array(disturbed)},
-        **{key: getattr(at_samples, key) for key in "CDy"},
-        "residual": residual,
-    }
+def _disturbed(steps: Steps, intensity: Callable[[float], Array]) -> Array:
+    """Return the covariance (nx, nx) that a disturbance adds within a sample."""
+    nx = len(steps.maps[0])
+    first, second = (np.array([intensity(t) for t in times]) for times in steps.nodes.T.tolist())
+    added = held_cost(steps.F[:, :nx, :nx].mT, HEAVY * first + LIGHT * second, steps.h)
+    W = np.zeros((nx, nx))
+    for step, each in zip(steps.maps[:, :, :nx], added, strict=True):
+        W = step @ W @ step.T + each
+    return W

@@ -1,16 +1,24 @@
-"""Weights of a quadratic cost, given as matrices, diagonals, numbers or names."""
+"""Weights of a quadratic cost: given as matrices, diagonals, numbers or names, or by a rule."""
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.base.errors import FflinWarning, InputError, listed
+from fflin.analysis.ranks import Noisy, null_space
+from fflin.analysis.reduction import (
+    ignorable_wheels,
+    regulated_part,
+    rigid_forces,
+    selection,
+    without,
+)
+from fflin.base.errors import InputError, listed, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import Array, dimension, instance, number, positive, shaped, vector
+from fflin.control.default_weights import AT_A_POINT, Pace, default_weights
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
@@ -20,8 +28,8 @@ Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 # What rounding may leave of symmetry and of semidefiniteness, relative to the largest entry.
 _ROUNDING = 1e-9
 
-# A weight that is given and this many times apart from that of the rule is on another scale.
-_APART = 1e4
+# The speeds of wheels come back at this fraction of the bandwidth.
+_SPEEDS = 0.1
 
 
 def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) -> Array:
@@ -70,37 +78,27 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     instance("lin", lin, LinearModel | LinearTrajectory, "a LinearModel or a LinearTrajectory")
     if not isinstance(largest, Mapping) or not largest:
         raise InputError(f"largest is {largest!r}, expected {{name: largest acceptable value}}")
-    sides = {name: is_input("state or input", name, lin) for name in largest}
-    if len(set(sides.values())) > 1:
-        one = {side: name for name, side in sides.items()}
+    keys = (*lin.state_names, *input_keys(lin))
+    found = {index for name in largest for index in matching("state or input", name, keys)}
+    if len({index < len(lin.state_names) for index in found}) > 1:
         raise InputError(
-            f"'{one[True]}' is an input and '{one[False]}' a state; call bryson once for the "
-            "states and once for the inputs"
+            f"largest has states and inputs ({', '.join(map(repr, largest))}); call bryson once "
+            "for the states and once for the inputs"
         )
-    of_inputs = all(sides.values())
+    of_inputs = min(found) >= len(lin.state_names)
     names = input_keys(lin) if of_inputs else lin.state_names
-    values = {}
-    for name, value in largest.items():
-        size = number(f"largest value of '{name}'", value)
-        values[name] = inverse_square(f"largest value of '{name}'", size)
+    values = {
+        name: inverse_square(what, number(what, value))
+        for name, value in largest.items()
+        if (what := f"largest value of '{name}'")
+    }
     return _diagonal("largest", values, names, complete=of_inputs)
-
-
-def is_input(kind: str, key: str, lin: LinearModel | LinearTrajectory) -> bool:
-    """Whether a name, group or pattern is of inputs and not of states."""
-    found = matching(kind, key, (*lin.state_names, *input_keys(lin)))
-    sides = {index >= len(lin.state_names) for index in found}
-    if len(sides) > 1:
-        raise InputError(f"{kind} '{key}' matches states and inputs; give a name of one kind")
-    return sides.pop()
 
 
 def inverse_square(what: str, size: float) -> float:
     """Return 1/size^2, or raise `InputError` if it is not a positive finite number."""
-    if size <= 0.0:
-        raise InputError(f"{what} is {size:g}, expected a positive number")
     if not 1e-150 <= size <= 1e150:
-        raise InputError(f"{what} is {size:g}, expected a number between 1e-150 and 1e150")
+        raise InputError(f"{what} is {size:g}, expected a positive number, 1e-150 to 1e150")
     return size**-2
 
 
@@ -262,43 +260,119 @@ def _negative(what: str, value: float, where: str, definite: bool) -> InputError
     )
 
 
-class GivenWeight(NamedTuple):
+def rule_weights(
+    lin: LinearModel,
+    name: str | None,
+    given: Mapping[str, Any] | None = None,
+    *,
+    wheel_speeds: bool | None = None,
+    pace: Pace = AT_A_POINT,
+) -> tuple[Array, Array, Array | None, str]:
+    """Return Q, R and N of a model by a rule, changed by `given` weights, and the rule in words."""
+    # The cost of a sampled model is the continuous one under the hold, where it is known what it
+    # was sampled from. The rule is by default what the robot has in its `weights`, else "urdf".
+    source = lin.generator or lin
+    layers = [(given, False)] if given else []
+    if name is None and lin.weights:
+        layers.insert(0, (lin.weights, True))
+        name = lin.weights.get("rule")
+    terms: Array = np.zeros(sum(lin.B.shape))
+    if name is None or name == "urdf":
+        pace = pace._replace(hold=lin.dt or pace.hold)
+        Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
+    elif name == "identity":
+        nx, nu = lin.B.shape
+        Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
+    else:
+        raise unknown("rule of weights", name, ("urdf", "identity"))
+    given_weights: dict[int, _Given] = {}
+    named: dict[str, None] = {}
+    for layer, of_robot in layers:
+        weights, names = _weights_of(lin, layer, of_robot)
+        given_weights |= weights
+        named |= dict.fromkeys(names)
+    if named:
+        Q, R = _reweighed(lin, Q, R, terms, given_weights)
+        rule = f"{', '.join(named)} as given, the others {rule}"
+        rule += " (with this rule alone)" if terms.any() else ""
+    if source.dt == lin.dt:
+        return Q, R, None, rule
+    return (*sampled_cost(source, lin.dt, Q, R), rule)
+
+
+def _of_regulated(
+    lin: LinearModel, pace: Pace, wheel_speeds: bool | None
+) -> tuple[Array, Array, str, Array]:
+    """Return Q (nx, nx), R, the rule and costs, for a model that may have wheels.
+
+    The costs (nx + nu,) are those of the largest value of each state and input, 0 if the rule has
+    none.
+    """
+    part = regulated_part(lin, wheel_speeds)
+    if part is lin:
+        Q, R, rule, _, (of_positions, of_inputs) = default_weights(lin, pace)
+        return Q, R, rule, np.concatenate((np.tile(of_positions, 2), of_inputs))
+    wheels, _ = ignorable_wheels(lin)
+    body = regulated_part(without(lin, wheels))
+    at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
+    names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
+    most = np.array([lin.limits[name] for name in names])
+    # A wheel that is at its limit already is counted as one at rest, and named in the report.
+    room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
+    found = default_weights(body, pace, dict(zip(names, room, strict=True)))
+    Q, R, rule, bandwidth, (of_positions, of_inputs) = found
+    if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
+        rule += f"; already at or beyond the URDF limit at the operating point: {listed(beyond)}"
+    S = selection(body.state_names, lin.state_names)
+    Q = S.T @ Q @ S
+    terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
+    if speeds := [name for name in part.state_names if name not in body.state_names]:
+        S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
+        # Inputs R^-1/2 Z n that turn no body change the speeds at X n.
+        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
+        X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
+        Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
+        rule = f"{rule}; wheel speeds at {slow:.3g} rad/s"
+    return Q, R, rule, terms
+
+
+class _Given(NamedTuple):
     """Given weight, and whether it was given as a largest value."""
 
     value: float
     largest: bool
 
 
-def weights_of(
+def _weights_of(
     lin: LinearModel, given: Mapping[str, Any], of_robot: bool
-) -> tuple[dict[int, GivenWeight], list[str]]:
+) -> tuple[dict[int, _Given], list[str]]:
     """Return what is given by index among the states and then the inputs, and the names."""
-    parts = {part: dict(given.get(part, {})) for part in ("q", "r", "bryson")}
-    if of_robot:  # a reduced model has not all that a robot's weights name
-        names = (*lin.state_names, *input_keys(lin))
-        for part, values in parts.items():
-            parts[part] = {key: x for key, x in values.items() if stands_for_any(key, names)}
-    q, r = (
-        {key: GivenWeight(number(f"weight of '{key}'", x), False) for key, x in parts[part].items()}
-        for part in ("q", "r")
-    )
-    for name, size in parts["bryson"].items():
-        side = r if is_input("state or input", name, lin) else q
-        if name in side:
+    states, inputs = lin.state_names, input_keys(lin)
+    found, named = dict[int, _Given](), list[str]()
+    every = (*states, *inputs)
+    kinds = ("q", "state", states), ("r", "input", inputs), ("bryson", "state or input", every)
+    for part, kind, known in kinds:
+        values = given.get(part, {})
+        if of_robot:  # a reduced model has not all that a robot's weights name
+            values = {key: x for key, x in values.items() if stands_for_any(key, known)}
+        values = {key: number(f"{part} of '{key}'", x) for key, x in values.items()}
+        if part == "bryson":
+            what = "largest value of '{}' (--bryson)"
+            values = {key: inverse_square(what.format(key), x) for key, x in values.items()}
+        first = len(states) if part == "r" else 0
+        at = {first + i: x for i, x in by_name(kind, values, known).items()}
+        if both := found.keys() & at.keys():
             raise InputError(
-                f"'{name}' has both a weight and a largest value (bryson); give only one of them"
+                f"'{every[min(both)]}' has both a weight and a largest value "
+                "(bryson); give only one of them"
             )
-        side[name] = GivenWeight(
-            inverse_square(f"largest value of '{name}' (--bryson)", size), True
-        )
-    of_inputs = by_name("input", r, input_keys(lin))
-    nx = len(lin.x0)
-    shifted = {nx + index: each for index, each in of_inputs.items()}
-    return by_name("state", q, lin.state_names) | shifted, [*q, *r]
+        found |= {i: _Given(x, part == "bryson") for i, x in at.items()}
+        named += values
+    return found, named
 
 
-def reweighed(
-    lin: LinearModel, Q: Array, R: Array, terms: Array, given: Mapping[int, GivenWeight]
+def _reweighed(
+    lin: LinearModel, Q: Array, R: Array, terms: Array, given: Mapping[int, _Given]
 ) -> tuple[Array, Array]:
     """Return Q and R, scaled to the largest values that are given, with what is given in them.
 
@@ -307,22 +381,8 @@ def reweighed(
     """
     costs = [terms[index] for index, each in given.items() if each.largest and terms[index]]
     scale = math.exp(-np.log(costs).mean()) if costs else 1.0
-    Q, R, nx, apart = scale * Q, scale * R, len(Q), dict[str, str]()
-    names = (*lin.state_names, *input_keys(lin))
-    for index, (value, largest) in given.items():
+    Q, R, nx = scale * Q, scale * R, len(Q)
+    for index, (value, _) in given.items():
         matrix, at = (Q, index) if index < nx else (R, index - nx)
-        own = float(matrix[at, at])
-        if terms.any() and not largest and value > 0.0 and own > 0.0:
-            ratio = value / own
-            if not 1.0 / _APART < ratio < _APART:
-                apart[names[index]] = f"{names[index]} is {value:.3g}, the rule gives {own:.3g}"
         matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
-    if apart:
-        warnings.warn(
-            f"the weights given differ in scale from the rule's weights: {listed(apart.values())}; "
-            "one of the two groups will dominate the cost, so give largest acceptable values "
-            "(bryson) instead of weights",
-            FflinWarning,
-            stacklevel=4,
-        )
     return Q, R

@@ -2,7 +2,6 @@
 
 import warnings
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pinocchio as pin
@@ -29,10 +28,6 @@ _WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 # The same with the moments about the base's origin, where Pinocchio's articulated bodies are
 # added up, bounds their rounding; up to here they are taken, beyond it a factor of M.
 _QUICK_COUPLING = 1e-11 / _EPS
-
-# The same for each coordinate alone, from where on it has next to no inertia of its own: of robots
-# that are described well it is below 1e6.
-LARGEST_SHARE = 1e9
 
 STROKE = 1.0  # [m] that a sliding joint is taken to be out at most, for those moments
 
@@ -65,8 +60,8 @@ class Inertia:
         self._inverse_diagonal = self._inverse.diagonal()
         # By a dense factor where v is no permutation of nu.
         self._constrained = state.S is not None
-        self._bounds = bounds_of(robot)
-        self._in_order = np.zeros(0) if self._bounds is None else state.velocities(self._bounds)
+        simple = not (robot.followers or robot.modes)
+        self._bounds = inertia_bounds(robot.model) if simple else None
         self._slides = [
             joint.idx_q for joint in robot.joints if joint.prismatic and joint.kind != "modal"
         ]
@@ -103,37 +98,14 @@ class Inertia:
             coupling = upper.diagonal().dot(inverse.diagonal())
         # Written so that NaN, from a pivot that is zero, fails too.
         if not self.least_coupling < coupling < _WARNING_COUPLING:
-            self._judge(coupling, self._state.project(upper.T), out)
-        elif self._bounds is not None and not self._in_order.dot(out.diagonal()) < LARGEST_SHARE:
-            self._name_the_lightest(1.0 / out.diagonal())
+            self._judge(coupling, self._state.project(upper.T))
 
-    def _name_the_lightest(self, inertias: Array) -> None:
-        name, allowed = self._state.robot.name, self._in_order
-        worst = int((inertias / allowed).argmin())
-        warnings.warn(
-            f"the mass matrix of '{name}': {coordinate_names(self._state.robot)[worst]} has an "
-            "inertia of only "
-            f"{inertias[worst]:.1e} in SI units; the mass and position of its links suggest up to "
-            f"{allowed[worst]:.1e}. As a result, B has entries of {1.0 / inertias[worst]:.1e}. "
-            "Give the links their inertia, check that joint positions are in metres, or lock the "
-            "joint",
-            FflinWarning,
-            stacklevel=6,
-        )
-
-    def _judge(self, coupling: float, M: Array, inverse: Array) -> None:
+    def _judge(self, coupling: float, M: Array) -> None:
         """Refuse a singular M, or warn of an ill-conditioned M, by coordinate names."""
         name, scale = self._state.robot.name, np.sqrt(np.maximum(M.diagonal(), 0.0))
         scale[scale == 0.0] = 1.0
         lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # or NaN
-        if lost:
-            mode = np.linalg.eigh(M / scale / scale[:, None])[1][:, 0]
-        else:  # the same by powers of the inverse, at a tenth of the price
-            stretched = inverse * scale * scale[:, None]
-            mode = stretched[int(stretched.diagonal().argmax())]
-            for _ in range(20):
-                mode = stretched @ mode
-                mode /= np.linalg.norm(mode)
+        mode = np.linalg.eigh(M / scale / scale[:, None])[1][:, 0]
         names = coordinate_names(self._state.robot)
         involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
         if lost:
@@ -158,17 +130,6 @@ def _invert_dense(M: Array, out: Array) -> None:
     upper = np.full_like(M, np.nan) if failed else dpotri(factor)[0]  # zero below its diagonal
     np.add(upper, upper.T, out=out)
     out.flat[:: len(M) + 1] *= 0.5
-
-
-# Robots do not change, so each is bounded once.
-_BOUNDS: WeakKeyDictionary[Robot, Array | None] = WeakKeyDictionary()
-
-
-def bounds_of(robot: Robot) -> Array | None:
-    """Return `inertia_bounds` of a robot; None also if it has mimic joints or modes."""
-    if robot not in _BOUNDS:
-        _BOUNDS[robot] = None if robot.followers or robot.modes else inertia_bounds(robot.model)
-    return _BOUNDS[robot]
 
 
 def inertia_bounds(model: pin.Model) -> Array | None:

@@ -111,8 +111,6 @@ class StateMap:
         # Entry of v for a unit of each velocity of the state: 1, but for modal amplitudes.
         self._scale = np.array([1.0] * 6 + [joint.scale for joint in joints])
         self._scaled = bool((self._scale != 1.0).any())
-        self._scales = self._scale[:, None] * self._scale
-        self._mimics = bool(robot.followers)
         # v = S nu; where no joint mimics another and none is scaled S is the permutation above.
         self.S: Array | None = None
         if robot.followers or self._scaled:
@@ -300,32 +298,23 @@ class StateMap:
     def lift(self, forces: Array) -> Array:
         """Return tau (nv, ...) from generalised forces (6 + n, ...) in base axes."""
         tau = np.zeros((self.robot.nv, *forces.shape[1:]))
-        tau[self._order] = forces
-        if self._scaled:
-            tau[self._order] = (forces.T / self._scale).T
+        tau[self._order] = (forces.T / self._scale).T
         return tau
 
     def forces(self, tau: Array) -> Array:
         """Return the generalised forces S^T tau (6 + n, ...) in base axes, from tau (nv, ...)."""
-        if self._mimics:
-            return np.asarray(self.S).T @ tau
-        own = tau.take(self._order, axis=0)
-        return (own.T * self._scale).T if self._scaled else own
+        return tau.take(self._order, axis=0) if self.S is None else self.S.T @ tau
 
     def columns(self, matrix: Array) -> Array:
         """Return ``matrix S``: columns (..., nv) converted from Pinocchio's v to state order."""
-        if self._mimics:
-            return matrix @ np.asarray(self.S)
-        own = matrix.take(self._order, axis=1)
-        return own * self._scale if self._scaled else own
+        return matrix.take(self._order, axis=1) if self.S is None else matrix @ self.S
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
         """Return ``S^T matrix S`` (7.3): a matrix (nv, nv) converted from v to state order."""
-        if self._mimics and self.S is not None:
+        if self.S is not None:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
-        own = matrix.take(self._flat, out=out, mode="clip")
-        return np.multiply(own, self._scales, out=own) if self._scaled else own
+        return matrix.take(self._flat, out=out, mode="clip")
 
     def to_frame(self, chart: Chart, vectors: Array) -> Array:
         """Transform velocities or wrenches (.., 6 + n, k) from base to frame axes: F of (4.6)."""

@@ -17,8 +17,8 @@ from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.kalman import Compensator
-from fflin.control.linear_controller import Compensation, LinearController, Sample
-from fflin.control.policies import Gridded, StateFeedback
+from fflin.control.linear_controller import LinearController
+from fflin.control.policies import Compensation, Gridded, Sample, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
@@ -51,6 +51,8 @@ class Law:
     """Properties common to all exported laws."""
 
     title: str
+    names: tuple[str, ...]  # of the states or outputs
+    units: tuple[str, ...]
     frame: Any
     dt: float
     input_names: tuple[str, ...]
@@ -75,16 +77,6 @@ class StateLaw(Law):
     x0: Array  # (rows, nx)
     K: Array  # (rows or points of the grid, nu, nx)
     axes: dict[str, Array] = field(default_factory=dict)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the states."""
-        return self.state.names
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Units of the states."""
-        return self.state.units
 
     @property
     def follows(self) -> bool:
@@ -145,8 +137,6 @@ class OutputLaw(Law):
     """Law u = u0 + C z + D (y - y0), after which z becomes A z + B (y - y0)."""
 
     terms: Sample
-    names: tuple[str, ...]  # of the outputs
-    units: tuple[str, ...]
 
     @property
     def continuous(self) -> list[bool]:
@@ -236,6 +226,8 @@ def law_of(given: Any, robot: Any, limits: Any) -> StateLaw | OutputLaw:
         **_common(given, robot, limits, lin.input_names, lin.input_units),
         frame=state.frame,
         dt=given.dt if isinstance(given, Gain) else lin.dt,
+        names=state.names,
+        units=state.units,
         u0=lin.u0[None],
         lin=lin,
         state=state,
@@ -327,6 +319,8 @@ def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: Any) -> Stat
         **_common(policy, robot, limits, actuation.names, actuation.units),
         frame=state.frame,
         dt=dt,
+        names=state.names,
+        units=state.units,
         u0=np.array([u for _, _, u, _ in points]),
         state=state,
         policy=policy.bind(robot),

@@ -33,7 +33,6 @@ from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.rnea import (
     Inertia,
-    bounds_of,
 )
 from fflin.dynamics.state import StateMap
 from fflin.kernel import inertia, rnea
@@ -179,14 +178,9 @@ def differentiate(work, tree, layout, loads):
 
 @inlined
 def _invert(work, robot):
-    """Write M^-1, and the values that show its accuracy."""
-    tree, size = robot.tree, len(robot.tree.row)
-    inertia.invert_factor(work, tree)
-    inertia.multiply(work, tree, robot.judged)
-    total = splat(work, 0.0)
-    for row in range(size):
-        total = total + robot.bounds[row] * load(work, tree.square + row * (size + 1))
-    store(work, robot.judged + 1, total)
+    """Write M^-1, and the sum of couplings that shows its accuracy."""
+    inertia.invert_factor(work, robot.tree)
+    inertia.multiply(work, robot.tree, robot.judged)
 
 
 @inlined
@@ -282,30 +276,27 @@ class Packed(namedtuple("Packed", "q nu force u")):
     """Eight points, lane beside lane."""
 
 
-class Derived(namedtuple("Derived", "tree layout loads row bounds slopes by_u judged size")):
+class Derived(namedtuple("Derived", "tree layout loads row slopes by_u judged size")):
     """A robot as `derive` reads it, and where its results begin in the work space; its size.
 
-    `row` is the coordinate that each input pushes, -1 for one that is carried, and `bounds` those
-    of `inertia_bounds`, 0 where they are not known.
+    `row` is the coordinate that each input pushes, -1 for one that is carried.
     """
 
 
 class RowAccelerations:
     """Accelerations of rows of points, their slopes and M^-1, by the compiled kernel.
 
-    Of every point are judged the sum of the couplings M_ii (M^-1)_ii, and that of (M^-1)_ii over
-    what mass and place of the links would allow; see `Inertia`.
+    Every point is judged by the sum of the couplings M_ii (M^-1)_ii; see `Inertia`.
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
         robot, nv, fixed = state.robot, state.nx // 2, actuation.fixed
-        loads, bounds = loads_of(robot, actuation, tree), bounds_of(robot)
+        loads = loads_of(robot, actuation, tree)
         layout, nu = layout_of(tree, len(loads.input)), fixed.shape[1]
-        ends = np.cumsum((layout.size, nv * state.nx, nv * nu, 2))
+        ends = np.cumsum((layout.size, nv * state.nx, nv * nu, 1))
         self._robot = Derived(
             *(tree, layout, loads),
             np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1).astype(np.intp),
-            np.zeros(nv) if bounds is None else state.velocities(bounds),
             *map(int, ends),
         )
         self.state, self._actuation = state, actuation
@@ -313,14 +304,14 @@ class RowAccelerations:
         self._least_coupling = 0.999 * nv
 
     def write_inverse(self, q: Array, by_u: Array) -> Array:
-        """Write the slopes over u (N, 6 + n, nu); return what is judged (N, 2)."""
+        """Write the slopes over u (N, 6 + n, nu); return what is judged (N,)."""
         none = np.empty((0, 0))
         return self._derive((q, none, none, none), none, none, by_u, moves=False)
 
     def write(
         self, q: Array, nu: Array, q_m: Array, u: Array, A: Array, by_u: Array
     ) -> tuple[Array, Array]:
-        """Write the derivatives of accelerations; return c (N, 6 + n) and what is judged (N, 2).
+        """Write the derivatives of accelerations; return c (N, 6 + n) and what is judged (N,).
 
         The slopes of `AccelerationDerivatives` are the lower halves of A (N, nx, nx). Both arrays
         are C-contiguous; nu and u are in base axes.
@@ -334,8 +325,8 @@ class RowAccelerations:
     def sound(self, q: Array, judged: Array) -> Mask:
         """Return where (N,) M is far from singular and the kernel's sines are exact."""
         # NaN, from a pivot that is zero, compares false.
-        coupling, q_m = judged[:, 0], q[:, 7:]
-        good = (self._least_coupling < coupling) & (coupling < Inertia.warning_coupling)
+        q_m = q[:, 7:]
+        good = (self._least_coupling < judged) & (judged < Inertia.warning_coupling)
         if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:
             return good
         return good & (np.abs(q_m) < _FARTHEST).all(axis=1)
@@ -343,7 +334,7 @@ class RowAccelerations:
     def _derive(
         self, points: tuple[Array, ...], c: Array, A: Array, by_u: Array, *, moves: bool
     ) -> Array:
-        count, judged = len(points[0]), np.empty((len(points[0]), 2))
+        count, judged = len(points[0]), np.empty((len(points[0]), 1))
         kernel("derivatives", "derive")(
             self._robot,
             tuple(map(_writable, points)),
@@ -352,7 +343,7 @@ class RowAccelerations:
             work_space(self._robot.size),
             moves,
         )
-        return judged
+        return judged[:, 0]
 
 
 def _writable(rows: Array) -> Array:

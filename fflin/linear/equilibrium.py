@@ -237,23 +237,21 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
         for name, unit, rate in zip(lin.state_names, lin.state_units, drift.tolist(), strict=True)
         if rate and name.startswith("q_m.") and name not in lin.ignorable
     ]
+    orbiting, (turns, moves) = lin.frame in ORBITAL, np.abs(drift[:6]).reshape(2, 3).max(axis=1)
     if moving:
-        raise EquilibriumError(
-            f"the motion of '{lin.robot}' is not steady under any input: joints move, "
-            f"{listed(moving)}. Only rotors may move: joints whose link is symmetric about the "
-            "axis and carries nothing. Set the other joint rates to 0"
+        reason = (
+            f"joints move, {listed(moving)}. Only rotors may move: joints whose link is symmetric "
+            "about the axis and carries nothing. Set the other joint rates to 0"
         )
-    if lin.frame in ORBITAL:
-        if np.abs(drift[:6]).max() > TOLERANCE:
-            raise EquilibriumError(
-                f"the motion of '{lin.robot}' is not steady under any input: its base moves in the "
-                "orbit's frame; leave out the velocity of the base"
-            )
-    elif "q_b.x" not in lin.ignorable and np.abs(drift[:3]).max() > TOLERANCE:
-        raise EquilibriumError(
-            f"the motion of '{lin.robot}' is not steady under any input: under gravity its base "
-            "may rotate about the vertical only; change its angular velocity"
+    elif orbiting and max(turns, moves) > TOLERANCE:
+        reason = "its base moves in the orbit's frame; leave out the velocity of the base"
+    elif not orbiting and "q_b.x" not in lin.ignorable and turns > TOLERANCE:
+        reason = (
+            "under gravity its base may rotate about the vertical only; change its angular velocity"
         )
+    else:
+        return
+    raise EquilibriumError(f"the motion of '{lin.robot}' is not steady under any input: {reason}")
 
 
 def _rounding(robot: Robot, lin: LinearModel, M: Array) -> Array:

@@ -6,7 +6,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, instance, vector
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
@@ -18,8 +18,6 @@ from fflin.robot.robot import Robot
 
 # Names and units, in their order.
 Signals: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
-
-_SHOWN = 4
 
 
 def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
@@ -53,9 +51,8 @@ def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signal
     mine, others = (dict(zip(*each, strict=True)) for each in (own, there))
     lacking, beside = ([n for n in a if n not in b] for a, b in ((mine, others), (others, mine)))
     if names := lacking or beside:
-        shown = ", ".join([*names[:_SHOWN], *["..."] * bool(names[_SHOWN:])])
-        lacks_or_adds = "lacks" if lacking else "also has"
-        said = f"{lacks_or_adds} the {kind}{'s' * bool(names[1:])} {shown}"
+        said = "lacks" if lacking else "also has"
+        said += f" the {kind}{'s' * bool(names[1:])} {listed(names)}"
     elif other := [name for name in mine if mine[name] != others[name]]:
         said = f"has its {kind} {other[0]} in {others[other[0]]}, not {mine[other[0]]}"
     elif own != there:
@@ -64,22 +61,16 @@ def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signal
         return
     subject = made.partition(" was ")[0]
     raise InputError(
-        f"{made}, but {_given(made, robot)} {said}; make {subject} again for the given robot, or "
-        "use Robot.replace to give the robot the same joints, inputs and outputs"
+        f"{made}, but the given robot '{robot.name}' {said}; make {subject} again for the given "
+        "robot, or use Robot.replace to give the robot the same joints, inputs and outputs"
     )
-
-
-def _given(made: str, robot: Robot) -> str:
-    """Name the given robot; its name alone does not tell it from a robot of the same name."""
-    same = f"'{robot.name}'" in made
-    return "the given robot of the same name" if same else f"the given robot '{robot.name}'"
 
 
 def require_turns(made: str, size: int, robot: Robot) -> None:
     """Raise `InputError` if a configuration has another size than the robot's."""
     if size != robot.nq:
         raise InputError(
-            f"{made}, but {_given(made, robot)} has other continuous joints, so that its "
+            f"{made}, but the given robot '{robot.name}' has other continuous joints, so that its "
             f"configuration has {robot.nq} entries instead of {size}; make "
             f"{made.partition(' was ')[0]} again for the given robot"
         )

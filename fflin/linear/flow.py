@@ -109,10 +109,8 @@ class Flow:
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v and u (base axes) at a time, from cubics with the robot's own rates."""
-        k, s = interval_of(self._t, t)
-        powers, (turns, speeds) = np.array((1.0, s, s * s, s**3)), self.cubics
-        q: Array = pin.integrate(self._model, self._q[k], powers.dot(turns[k]))
-        return q, powers.dot(speeds[k]), self._in_base_axes(q, self._input(k, s))
+        q, v, u = self.points(np.array([t]))
+        return q[0], v[0], u[0]
 
     def points(self, times: Array) -> tuple[Array, Array, Array]:
         """Return q, v and u (k, ..) at times (k,), as `at` does at one time."""

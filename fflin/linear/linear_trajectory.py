@@ -110,19 +110,15 @@ class LinearTrajectory(Trajectory):
 
     def matrices(self, t: float) -> tuple[Array, Array]:
         """Return A (nx, nx) and B (nx, nu) about the point at time t [s], also between knots."""
-        t = self._within(t)
-        k, fraction = interval_of(self.t, t)
-        if self.dt or fraction in (0.0, 1.0):
-            k += int(fraction) if not self.dt else 0
-            return self.A[k], self.B[k]
-        lin = self._linearizer(*self.flow.at(t))
-        return lin.A, lin.B
+        A, B = self.matrices_at(np.array([self._within(t)]))
+        return A[0], B[0]
 
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
         """Return A (k, nx, nx) and B (k, nx, nu) at the times (k,), see `matrices`."""
         placements = [interval_of(self.t, t) for t in times.tolist()]
-        knot = np.array([k + (share == 1.0) for k, share in placements])
-        inside = np.array([0.0 < share < 1.0 for _, share in placements])
+        sampled = bool(self.dt)
+        knot = np.array([k + (share == 1.0 and not sampled) for k, share in placements])
+        inside = np.array([0.0 < share < 1.0 and not sampled for _, share in placements])
         A, B = self.A[knot], self.B[knot]
         if inside.any():
             found = self._linearizer.along(*self.flow.points(times[inside]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from math import hypot
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -173,9 +172,6 @@ def own_reference(robot: Robot, lin: LinearModel) -> Array:
     return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))
 
 
-# With velocities and inputs below this nothing overflows on the way to `LARGEST`.
-_MODERATE = 1e50
-
 _STANDING: Chart = Standing()
 
 
@@ -276,8 +272,6 @@ class Linearizer:
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
-        given = np.concatenate((robot.gravity, *robot.springs))
-        self._moderate = hypot(*given.tolist()) < _MODERATE
         self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
         # What stands for rest and no input.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
@@ -299,10 +293,7 @@ class Linearizer:
         with self._lock:
             if known:
                 return self._at_rest(q)
-            if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
-                return self._anywhere(q, v, u)
-            # An overflow is refused below, so NumPy need not warn of it. Not always done, since
-            # every call of NumPy costs more in here.
+            # An overflow is refused below, so NumPy need not warn of it.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
 

@@ -131,10 +131,9 @@ class Trajectory(Design):
         super().__post_init__()
 
     def __repr__(self) -> str:
-        how = "held" if self.hold == "previous" else "linear"
         return (
             f"{type(self).__name__}('{self.robot.name}', {len(self.t)} knots, {self.t[0]:g} to "
-            f"{self.t[-1]:g} s, inputs {how}, frame='{self.frame}')"
+            f"{self.t[-1]:g} s, hold='{self.hold}', frame='{self.frame}')"
         )
 
     def __str__(self) -> str:
@@ -190,7 +189,7 @@ class Trajectory(Design):
         times = self.samples(dt)
         if times[-1] < self.t[-1]:
             times = np.append(times, self.t[-1])
-        q, v, _ = map(np.array, zip(*map(self.flow.at, times), strict=True))
+        q, v, _ = self.flow.points(times)
         u = np.array([self.flow.input(t) for t in times])
         kept = {"hold": self.hold, "frame": self.frame, "verified": self.verified}
         return Trajectory(self.robot, times, q, v, u, **kept)  # type: ignore[arg-type]
@@ -226,15 +225,12 @@ class Trajectory(Design):
         missed = self.flow.residual
         k = int(missed.argmax())
         where = f"'{self.robot.name}': from t = {self.t[k]:g} to {self.t[k + 1]:g} s"
-        if missed[k] == np.inf:
-            return (
-                f"t, q, v, u are not a motion of {where} the integration overflows; expected "
-                "finite rates; check the units of times, velocities and inputs"
-            )
         if missed[k] > _MOTION:
+            error = f"the error is {missed[k]:.2g} of the largest rate, and "
+            if missed[k] == np.inf:
+                error = "the integration overflows, and the errors of "
             return (
-                f"t, q, v, u are not a motion of {where} the error is {missed[k]:.2g} of the "
-                f"largest rate, and {(missed > _MOTION).sum()} of "
+                f"t, q, v, u are not a motion of {where} {error}{(missed > _MOTION).sum()} of "
                 f"{len(missed)} intervals exceed {_MOTION:g}; {_CAUSES}"
             )
         rates = np.linalg.norm(self.v[:, 3:6], axis=1)

@@ -91,12 +91,8 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 
 def find_inputs(inputs: str | Path) -> Path:
     """Find a file of inputs by the name of the bundled one's robot, else by its path."""
-    if not isinstance(inputs, str | os.PathLike) or "\0" in str(inputs):
-        raise InputError(f"{inputs!r} is not a path; give the path of a TOML file of inputs")
-    if not str(inputs):
-        raise InputError("the path of the inputs is empty; give the path of a TOML file")
+    path = as_path(inputs)
     bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
-    path = Path(inputs)
     if str(inputs) in bundled:
         return bundled[str(inputs)]
     if path.name == str(inputs) and not path.suffix and not os.path.lexists(path):

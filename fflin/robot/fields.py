@@ -56,16 +56,10 @@ def checked_inputs(
     value = [one for item in value for one in _spread(item, find, joints, passive)]
     if not value:
         raise InputError("all inputs are torques of passive joints; add another input")
-    # Thrusters and wheels differ by their names, other inputs by what they are but for limits.
-    identities: list[str | Input] = [name for name, _ in named_wheels(value)]
-    for item in value:
-        if isinstance(item, kinds.Thruster):
-            identities += [item.name] if item.name else []
-        elif not isinstance(item, kinds.WrenchInput):
-            identities.append(replace(item, min=None, max=None))
-    for each in identities:
-        if identities.count(each) > 1:
-            raise InputError(f"input {each} is given twice; remove one of the two")
+    names = [name for item, own in named_inputs(value) for name in own]
+    for each in names:
+        if names.count(each) > 1:
+            raise InputError(f"input '{each}' is given twice; remove one of the two")
     return tuple(value)
 
 
@@ -213,11 +207,8 @@ def _weights(value: object, scope: Scope) -> dict[str, Any]:
             if entry < 0.0 or (part != "q" and not entry):
                 least = "0 or more" if part == "q" else "more than 0"
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
-    for key in weights["bryson"]:
-        if key in weights["q"] or key in weights["r"]:
-            raise InputError(
-                f"'{key}' has both a weight and a largest value; give only one of the two"
-            )
+    for key in weights["bryson"].keys() & (weights["q"].keys() | weights["r"].keys()):
+        raise InputError(f"'{key}' has both a weight and a largest value; give only one of the two")
     return {part: value for part, value in weights.items() if value}
 
 

@@ -190,14 +190,11 @@ class Thruster(WrenchInput):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ranges[0][0] < 0.0:
+        pulses = truth("thruster on_off", self.on_off)
+        if self.ranges[0][0] < 0.0 or (pulses and (self.max is None or self.min)):
             raise InputError(
-                f"thruster min is {self.min}, expected 0 or more: a thruster never pulls"
-            )
-        if truth("thruster on_off", self.on_off) and (self.max is None or self.min):
-            raise InputError(
-                "thruster on_off is set, but max is missing or min is not 0; give max, the force "
-                "of a pulse, and leave min out"
+                f"thruster min is {self.min} and max is {self.max}, expected a min of 0 or more, "
+                "and with on_off a max, the force of a pulse, and no min"
             )
         if (impulse := self.least_impulse) is not None:
             self._set("least_impulse", positive("thruster least_impulse", impulse, "N s"))
@@ -274,22 +271,17 @@ class ReactionWheel(WrenchInput):
         self._set("axis", unit_vector("wheel axis", self.axis, "the direction it turns about"))
         self._set("momentum", number("wheel momentum", self.momentum))
         if self.max_speed is not None:
-            speed = positive("wheel max_speed", self.max_speed, "rad/s")
-            self._set("max_speed", speed)
-            if self.inertia is None:
-                raise InputError(
-                    f"wheel max_speed is {speed:g} rad/s, but the wheel has no inertia and so no "
-                    "speed in the state; give its inertia too"
-                )
+            self._set("max_speed", positive("wheel max_speed", self.max_speed, "rad/s"))
+        given = self.max_speed if self.inertia is None else self.momentum
+        if given:
+            raise InputError(
+                f"wheel has inertia {self.inertia}, momentum {self.momentum:g} and max_speed "
+                f"{self.max_speed}; give either an inertia, whose speed is a state, or a momentum"
+            )
         if self.inertia is None:
             return
         hint = "; leave it out to model the wheel by its momentum alone"
         inertia = positive("wheel inertia", self.inertia, "kg m^2", hint)
-        if self.momentum:
-            raise InputError(
-                "wheel momentum is given together with an inertia, which makes its speed a state; "
-                "leave momentum out and give the speed in the velocity v of the point"
-            )
         self._set("inertia", inertia)
 
     @property

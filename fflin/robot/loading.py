@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, InputError, ModelError
+from fflin.base.errors import FflinWarning, ModelError
 from fflin.base.validation import instance, is_rotation
-from fflin.base.writing import remember
-from fflin.robot.catalog import RobotFile, find_mesh, find_robot, folders
+from fflin.robot.catalog import RobotFile, find_robot, folders
 from fflin.robot.fields import MERGED
 from fflin.robot.joints import ROOT, Follower, joint_of, require_room
-from fflin.robot.mass_properties import LinkMass, massless_note
+from fflin.robot.mass_properties import LinkMass, given_body, massless_note
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.links import is_impossible
@@ -134,8 +133,6 @@ def _load(
     description = read_urdf(found.path)
     loaded = _robot(description.model, found.name, lock, description.mimics)
     dirs = (*package_dirs, *found.package_dirs)
-    # Meshes are read when the robot is drawn, and no output may take their place before.
-    remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in description.meshes)))
     damping = {name: description.damping.get(name, 0.0) for name in loaded.joint_names}
     # That of mimic joints counts with that of their leaders: the power is the same.
     for joint, leader, multiplier, _ in loaded.followers:
@@ -287,13 +284,6 @@ def body_alone(inertia: pin.Inertia, name: str) -> Robot:
     return from_model(model, name=name)
 
 
-def inertia_of(value: Any) -> pin.Inertia:
+def inertia_of(value: pin.Inertia) -> pin.Inertia:
     """Return the inertia of a body that has mass, or raise `InputError`."""
-    second = 0.5 * np.trace(value.inertia) * np.eye(3) - value.inertia
-    least, size = np.linalg.eigvalsh(second)[0], np.trace(value.inertia)
-    if not value.mass > 0.0 or least < -1e-9 * size:
-        raise InputError(
-            f"payload of {value.mass:g} kg has an inertia that is not physically realisable; give "
-            "a mass above 0, and principal moments none of which exceeds the sum of the other two"
-        )
-    return value
+    return given_body("payload", value, value)

@@ -19,7 +19,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError, SingularInertiaError, listed, require_known
 from fflin.base.names import by_name
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, as_double, number, positive, vector, whole
+from fflin.base.validation import Array, number, positive, shaped, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.urdf.links import TRIANGLE_SLACK, Link, is_impossible
@@ -49,25 +49,23 @@ def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
         if frame.type == pin.FrameType.BODY and frame.name not in index_of:
             links.setdefault(frame.parentJoint, []).append(frame.name)
     several = {name: index for index, many in links.items() if many[1:] for name in many}
-    index_of |= several | {many[0]: index for index, many in links.items()}
-    names, done, new = list(index_of), dict[int, Any](), dict[int, pin.Inertia]()
+    index_of |= {many[0]: index for index, many in links.items() if not many[1:]}
+    names, done, new = [*index_of, *several], dict[int, Any](), dict[int, pin.Inertia]()
     for place, value in by_name("body", given, names).items():
-        name, index = names[place], index_of[names[place]]
+        name = names[place]
+        index = {**several, **index_of}[name]
         body = "base" if index == ROOT else model.names[index]
-        if name in several:
+        if name in several or done.setdefault(index, value) is not value:
             raise InputError(
-                f"'{name}' is one of several links of the body '{body}': "
-                f"{listed(links[index])}; give the properties of the whole body '{body}'"
+                f"'{name}' is part of the body '{body}' with the links "
+                f"{listed(links.get(index, [name]))}; give the properties of the whole body "
+                f"'{body}' once"
             )
-        if done.setdefault(index, value) is not value:
-            raise InputError(
-                f"the body '{body}' is given twice, once under the name '{name}'; give it once"
-            )
-        new[index] = _given(name, value, model.inertias[index])
+        new[index] = given_body(name, value, model.inertias[index])
     return new
 
 
-def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
+def given_body(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
     """Return a body that is given in part or as a whole."""
     of = f"of '{name}'"
     if isinstance(value, pin.Inertia):
@@ -82,23 +80,17 @@ def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
     com = vector(f"com {of}", value.get("com", old.lever), 3, "a point in the body's frame")
     if "inertia" not in value:
         return pin.Inertia(mass, com, old.inertia * (mass / old.mass if old.mass else 1.0))
-    inertia = as_double(f"inertia {of}", value["inertia"])
-    if inertia.shape != (3, 3) or not np.isfinite(inertia).all():
-        raise InputError(
-            f"inertia {of} has shape {inertia.shape}, expected (3, 3) finite numbers [kg m^2] "
-            "about the centre of mass"
-        )
-    if np.abs(inertia - inertia.T).max() > _SYMMETRIC * np.abs(inertia).max():
-        raise InputError(f"inertia {of} is not symmetric; give a symmetric matrix (3, 3)")
+    hint = " [kg m^2] about the centre of mass"
+    inertia = shaped(f"inertia {of}", value["inertia"], (3, 3), hint)
+    symmetric = np.abs(inertia - inertia.T).max() <= _SYMMETRIC * np.abs(inertia).max()
     inertia = 0.5 * (inertia + inertia.T)
-    least, middle, largest = np.linalg.eigvalsh(inertia).tolist()
-    moments = f"inertia {of} has principal moments {least:.3g}, {middle:.3g}, {largest:.3g} kg m^2"
-    if is_impossible(mass, (least, middle, largest)):
-        raise InputError(f"{moments}; expected values of 0 or more")
-    if largest - middle - least > TRIANGLE_SLACK * largest:
+    least, middle, largest = moments = np.linalg.eigvalsh(inertia).tolist()
+    unequal = largest - middle - least > TRIANGLE_SLACK * largest
+    if not symmetric or is_impossible(mass, moments) or unequal:
         raise InputError(
-            f"{moments}, which is not physically realisable; none may exceed the sum of the "
-            "other two"
+            f"inertia {of} has principal moments {least:.3g}, {middle:.3g}, {largest:.3g} kg m^2 "
+            "and is not physically realisable; expected a symmetric matrix with moments of 0 or "
+            "more, none of which exceeds the sum of the other two"
         )
     return pin.Inertia(mass, com, inertia)
 

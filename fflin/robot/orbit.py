@@ -23,9 +23,8 @@ BODIES = {
     "saturn": (3.793120749e16, 60268000.0),
 }
 
-# Altitudes [m] below the first are doubtful, of bodies without air below the second; those of low
-# earth orbits, whose radius may be given.
-_AIR, _BARE, _LOW_ORBITS = 80e3, {"moon": 1e3, "mercury": 1e3}, (150e3, 1000e3)
+# A lower altitude [m] over the earth is probably in km.
+_LOWEST = 80e3
 
 _FOLLOWS: Any = None  # from the others
 
@@ -50,8 +49,8 @@ class CircularOrbit:
     Parameters
     ----------
     altitude : float, optional
-        Height above the surface [m]. An `FflinWarning` is issued if the value looks like an
-        altitude in km or an orbit radius.
+        Height above the surface [m]. An `FflinWarning` is issued for less than 80 km over the
+        earth, which is probably a value in km.
     mean_motion : float, optional
         Mean motion n [rad/s], instead of the altitude.
     body : str
@@ -106,10 +105,9 @@ class CircularOrbit:
             require_known("central body", [self.body], BODIES)
         given = [value for value in (self.altitude, self.mean_motion) if value is not None]
         if len(given) != 1:
-            said = "both are" if given else "neither is"
             raise InputError(
-                f"an orbit needs an altitude [m] or a mean motion [rad/s], but {said} given; give "
-                "exactly one of the two"
+                f"an orbit has altitude {self.altitude} [m] and mean_motion {self.mean_motion} "
+                "[rad/s]; give exactly one of the two"
             )
         size = self.mu, self.body_radius
         mu, ground = (
@@ -125,21 +123,19 @@ class CircularOrbit:
             altitude = (mu / n) ** (1.0 / 3.0) / n ** (1.0 / 3.0) - ground
         if not 0.0 < altitude < 1e15:
             raise InputError(
-                f"an altitude of {altitude:g} m over {self.body} is "
-                f"{'too high for an orbit' if altitude > 0.0 else 'at or below the surface'}; give "
-                "an altitude above 0, or a mean motion below "
-                f"{math.sqrt(mu / ground) / ground:.4g} rad/s"
+                f"an altitude of {altitude:g} m over {self.body} is no orbit; give an altitude "
+                "above 0, or a smaller mean motion"
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
-            above, said = altitude - ground, ""
-            if altitude < _BARE.get(self.body, _AIR):
-                said = "altitudes are in metres; write 400 km as 400e3"
-            elif self.body == "earth" and _LOW_ORBITS[0] <= above <= _LOW_ORBITS[1]:
-                said = f"if you mean the orbit's radius, the altitude is {above:.8g} m"
-            if said and self.mu is None:  # not of an asteroid, nor of an orbit that was saved
-                said = f"an altitude of {altitude:.8g} m over {self.body}: {said}"
-                warnings.warn(said, FflinWarning, stacklevel=3)
+            # Not for an orbit that was saved, nor for another body called earth.
+            if self.body == "earth" and self.mu is None and altitude < _LOWEST:
+                warnings.warn(
+                    f"an altitude of {altitude:.8g} m over earth: altitudes are in metres; write "
+                    "400 km as 400e3",
+                    FflinWarning,
+                    stacklevel=3,
+                )
         known = {"altitude": altitude, "mean_motion": n, "mu": mu, "body_radius": ground}
         for name, value in known.items():
             object.__setattr__(self, name, value)

@@ -287,16 +287,10 @@ def parse_output(text: str) -> tuple[Output, ...]:
     kind = kinds[word][0]
     if rest and issubclass(kind, JointOutput):
         return (kind((rest,)),)
-    if not issubclass(kind, FrameOutput):
-        if colon:
-            raise InputError(
-                f"output '{text}' names a frame, but the output {word} has no frame; write {word}"
-            )
-        return (kind(),)
-    wanted = [item.name for item in fields(kind)]
-    names = rest.split(":", len(wanted) - 1)
+    wanted = [item.name for item in fields(kind)] if issubclass(kind, FrameOutput) else []
+    names = rest.split(":", len(wanted) - 1) if colon else []
     if len(names) != len(wanted) or not all(names):
-        form = ":".join((word, "NAME", *(name.upper() for name in wanted[1:])))
-        missing = "no frame" if len(wanted) == 1 else "only one of its two frames"
-        raise InputError(f"output '{text}' names {missing}; write {form}")
+        places = ("NAME", *(name.upper() for name in wanted[1:]))
+        form = ":".join((word, *places[: len(wanted)]))
+        raise InputError(f"output '{text}' names other frames than it has; write {form}")
     return tuple(kind(*names) for kind in kinds[word])

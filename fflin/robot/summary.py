@@ -4,7 +4,7 @@ import json
 import math
 import re
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from string import Template
 from textwrap import fill
 from typing import Any
@@ -19,7 +19,6 @@ from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 _LIMITS = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
-_STATE = {"rpy": "[deg]", "position": "[m]", "joints": "[rad | m]", "velocity": "[rad/s | m/s]"}
 
 _LOOKS = {
     "reaction_wheel": re.compile(r"(?<![a-z])(rw|(fly|reaction_?)?wheel)(?![a-z])", re.IGNORECASE),
@@ -91,7 +90,6 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
         *[at_point] * bool(at_point),
         grid(rows, "ll"),
         *[_LIMITS] * limited,
-        *_appendages(robot),
         *_settings(robot),
     ]
     parts.append(f"frames\n{_indented(', '.join(dict.fromkeys(frames)), '  ')}")
@@ -109,34 +107,12 @@ def _masses(robot: Robot) -> list[float]:
     return masses
 
 
-def _appendages(robot: Robot) -> list[str]:
-    """Show flexible appendages and slosh, with their modes if the link is clamped."""
-    rows = [["appendage", "on frame", "mode", "Hz", "damping ratio", "stiffness"]]
-    for item in robot.appendages:
-        for name in item.modes:
-            index = robot.joint_names.index(name)
-            joint = robot.joints[index]
-            stiffness, damping, _ = (each[index].item() for each in robot.springs)
-            cells = [".", ".", "."]
-            if stiffness:
-                omega, ratio = joint.oscillation(stiffness, damping)
-                unit = {"m": "N/m", "rad": "N m/rad"}.get(joint.unit, "1/s^2")
-                cells = [f"{0.5 * omega / math.pi:.6g}", f"{ratio:.4g}", f"{stiffness:.6g} {unit}"]
-            rows.append([item.title, item.frame, name, *cells])
-    return [grid(rows, "lll")] * bool(robot.appendages)
-
-
 def _settings(robot: Robot) -> list[str]:
     """Show settings in addition to the URDF, except inputs and orbit."""
     outputs = [":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ()))) for y in robot.outputs]
-    modes = {joint.name for joint in robot.modes}
-    stiffness, damping = (
-        {name: value for name, value in given.items() if name not in modes}
-        for given in (robot.stiffness, robot.damping)
-    )
     shown = {
-        "stiffness [N m/rad | N/m]": stiffness,
-        "damping [N m s/rad | N s/m]": damping,
+        "stiffness [N m/rad | N/m | 1/s^2]": robot.stiffness,
+        "damping [N m s/rad | N s/m | 1/s]": robot.damping,
         "spring rest positions [rad | m]": robot.rest,
         "passive joints": robot.passive,
         "locked joints": robot.locked,
@@ -145,12 +121,13 @@ def _settings(robot: Robot) -> list[str]:
         "limits": {key: f"{low:g} to {high:g}" for key, (low, high) in robot.limits.items()},
         **{f"weights, {part}": value for part, value in robot.weights.items()},
         **{
-            f"{name}, {part} {_STATE[part]}": value
+            f"{name}, {part}": value
             for name in ("point", "target", "start")
             for part, value in getattr(robot, name).items()
         },
     }
     lines = [f"{title}: {_said(value)}" for title, value in shown.items() if value]
+    lines += [f"{x.title} on frame {x.frame}: modes {', '.join(x.modes)}" for x in robot.appendages]
     return [folded(lines)] * bool(lines)
 
 
@@ -193,15 +170,19 @@ def draft(robot: Robot, urdf: str) -> str:
         name: f"{high:.6g}" if low == -high else f"[{low:.6g}, {high:.6g}]"
         for name, (low, high) in limits_of(robot).items()
     }
+    found = (_candidate(robot, index) for index in sorted(range(model.nframes), key=_order(model)))
+    candidates, joint = [*found], _text(robot.joint_names[0] if robot.n else "joint_1")
+    spun = [_text(name) for _, name in candidates if name]
     template = Template(files("fflin.robot").joinpath("assets", "robot.toml").read_text("utf-8"))
     return template.substitute(
         name=_text(robot.name)[1:-1],
         joints=counted(robot.n, "joint"),
         mass=f"{robot.mass:.6g}",
         urdf=_text(urdf),
-        joint=_text(robot.joint_names[0] if robot.n else "joint_1"),
+        joint=joint,
         passive=passive if names else "",
-        candidates="".join(_candidate(robot, index) for index in range(model.nframes)),
+        candidates="".join(text for text, _ in candidates),
+        lock=", ".join(spun) or joint,
         damping=_lines("", {name: f"{value:.6g}" for name, value in damping.items()}),
         stiffness=_lines("", {name: f"{size * _SWING**2:.6g}" for name, size in inertia.items()}),
         limits=_lines("# ", limits),
@@ -212,34 +193,56 @@ def _lines(mark: str, values: Mapping[str, str]) -> str:
     return "".join(f"{mark}{_text(name)} = {value}\n" for name, value in values.items())
 
 
-def _candidate(robot: Robot, index: int) -> str:
-    """Return the input that a link's name suggests, in comments; empty if it suggests none."""
+def _order(model: pin.Model) -> Callable[[int], list[tuple[float, str]]]:
+    """Return a key that sorts frames by name, with the numbers in names by value."""
+
+    def key(index: int) -> list[tuple[float, str]]:
+        parts = re.split(r"([0-9]+)", model.frames[index].name)
+        return [(float(x), "") if x.isdecimal() else (-1.0, x) for x in parts]
+
+    return key
+
+
+def _candidate(robot: Robot, index: int) -> tuple[str, str]:
+    """Return the input that a link's name suggests, in comments, and the joint of a wheel."""
     model, frame = robot.model, robot.model.frames[index]
     kind = next((kind for kind, look in _LOOKS.items() if look.search(frame.name)), "")
     if not kind or frame.type != pin.FrameType.BODY or frame.parentJoint < ROOT:
-        return ""
+        return "", ""
     data = robot.create_data()
     pin.forwardKinematics(model, data, robot.neutral())
     placement = pin.updateFramePlacement(model, data, index)
-    axis, name, inertia = np.array([0.0, 0.0, 1.0]), frame.name, ""
+    axis, name, limits = np.array([0.0, 0.0, 1.0]), frame.name, "# max = 1.0  # [N]\n"
+    own = ""
     if kind == "reaction_wheel":
         name += "_rotor"  # which may be a joint's, whose name no frame has
+        limits = "# max = 1.0  # [N m]\n"
         joint = model.joints[frame.parentJoint]
         if joint.nv == 1 and model.frames[frame.parentFrame].type == pin.FrameType.JOINT:
             data = joint.createData()
             joint.calc(data, robot.neutral())
             axis = np.asarray(data.S).reshape(6)[3:]
             size = axis @ model.inertias[frame.parentJoint].inertia @ axis
-            inertia = f"# inertia = {size:.6g}  # [kg m^2], if its joint is locked\n"
+            own = model.names[frame.parentJoint]
+            effort, speed = (
+                f"{x:.6g}" if 0.0 < x < 1e100 else "1.0"
+                for x in (model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v])
+            )
+            limits = (
+                f"# inertia = {size:.6g}  # [kg m^2]\n# max = {effort}  # [N m]\n"
+                f"# max_speed = {speed}  # [rad/s]\n"
+            )
     key = "axis" if kind == "reaction_wheel" else "direction"
     at, along = _vector(placement.translation), _vector(placement.rotation @ axis)
-    position = "" if inertia or key == "axis" else "# position = [0, 0, 0]  # [m], in that frame\n"
+    position = "" if key == "axis" else "# position = [0, 0, 0]  # [m], in that frame\n"
     said = f"# Link {_text(frame.name)} at {at} [m], {key} {along}, both in base axes:"
-    return (
-        f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n"
+    lock = f"# To use this wheel, lock joint {_text(own)} above.\n" if own else ""
+    text = (
+        f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n{lock}"
         f'# [[input]]\n# type = "{kind}"\n# name = {_text(name)}\n# frame = {_text(frame.name)}\n'
-        f"{position}# {key} = {_vector(axis)}\n{inertia}"
+        f"{position}# {key} = {_vector(axis)}\n{limits}"
     )
+    return text, own
 
 
 def _vector(values: np.ndarray) -> str:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from fflin.base.errors import InputError
 from fflin.base.process import Progress
 from fflin.base.validation import Array, vector
-from fflin.control.linear_controller import LinearController, OutputFeedback, measured_at
-from fflin.control.policies import Allocation, Gridded, StateFeedback
+from fflin.control.linear_controller import LinearController, OutputFeedback
+from fflin.control.policies import Allocation, Gridded, StateFeedback, measured_at
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.kernel import loop
 from fflin.kernel.arguments import laid_out, words_of

@@ -10,8 +10,8 @@ import pinocchio as pin
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
 from fflin.control.channel import channel_of
-from fflin.control.linear_controller import LinearController, measured_at
-from fflin.control.policies import Allocation, Gridded, StateFeedback
+from fflin.control.linear_controller import LinearController
+from fflin.control.policies import Allocation, Gridded, StateFeedback, measured_at
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies

@@ -14,7 +14,6 @@ from fflin.base.names import group_of
 from fflin.base.validation import Array, instance, truth, vector
 from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
 from fflin.control.linear_controller import growing
-from fflin.control.plants import notes_of
 from fflin.control.policies import axes_of, bound, fed_back, feedback_of
 from fflin.control.tracking import (
     Reference,
@@ -221,7 +220,7 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
         target=goal,
         reference=follows,
         steered=fed_back(policy),
-        notes=lambda: (*growing(policy), *notes_of(policy, robot), *times.notes),
+        notes=lambda: (*growing(policy), *times.notes),
         predictor=foresees,
     )
     return plan, plant

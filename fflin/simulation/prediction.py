@@ -8,7 +8,8 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance
 from fflin.control.channel import Channel
-from fflin.control.linear_controller import Compensation, LinearController
+from fflin.control.linear_controller import LinearController
+from fflin.control.policies import Compensation
 from fflin.linear.model import LinearModel
 from fflin.simulation.plant import Plant
 

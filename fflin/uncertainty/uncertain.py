@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.tables import grid
 from fflin.base.validation import Array, instance, number, numbers, untied, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
@@ -57,16 +56,6 @@ class Uncertain:
     def __repr__(self) -> str:
         return f"Uncertain('{self.robot.name}', {len(self.ranges)} parameters)"
 
-    def __str__(self) -> str:
-        rows: list[tuple[str, ...]] = [("parameter", "unit", "value", "least", "largest", "")]
-        for name, unit, middle, half, ranges in self.blocks:
-            tied = len(ranges) > 1
-            now = "" if tied else f"{ranges[0].parameter.value:.6g}"
-            ends = (f"{x:.6g}" for x in (middle - half, middle + half))
-            more = f"{len(ranges)} tied" if tied else ""
-            rows.append((name, "." if unit == "1" else unit, now, *ends, more))
-        return f"{self!r}\n\n{grid(rows, 'llrrrl')}"
-
     @property
     def ranges(self) -> tuple[Range, ...]:
         """Ranges of the parameters, block by block: `middle` and half width `half` of each."""
@@ -98,12 +87,10 @@ class Uncertain:
         pulled = [rest[each.parameter.spring] for each in self.ranges if each.parameter.spring >= 0]
         pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
         if any(pulled):
-            pulls = "gravity" if any(robot.gravity) else "a spring that is not at its rest position"
-            pulls = "an orbit" if robot.orbit else pulls
             raise InputError(
-                f"because of {'stored momentum' if robot.stored_momentum else pulls}, the point is "
-                "an equilibrium only for some values of the parameters; remove this effect from "
-                "the robot, or linearise each robot of samples(n)"
+                "gravity, an orbit, stored momentum or a spring that is not at its rest position "
+                "makes the point an equilibrium only for some values of the parameters; remove "
+                "this effect from the robot, or linearise each robot of samples(n)"
             )
         return _lft(self, lin)
 

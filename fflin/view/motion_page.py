@@ -14,7 +14,6 @@ from fflin.dynamics.state import StateMap
 from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
 from fflin.view.equipment import thrusters
-from fflin.view.overlays import cloud_of, tubes
 from fflin.view.page import (
     Recorder,
     build_page,
@@ -35,8 +34,6 @@ from fflin.view.playback import (
 from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
 
 if TYPE_CHECKING:
-    from fflin.campaign.campaign import Campaign
-    from fflin.campaign.funnel import Funnel
     from fflin.dynamics.state import Frame
     from fflin.simulation.motion import Motion
 
@@ -61,8 +58,6 @@ def motion_page(
     follow: bool | None,
     target: Array | None,
     tool: str | None,
-    cloud: Campaign | None = None,
-    funnel: Funnel | None = None,
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and what could not be drawn; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
@@ -116,17 +111,13 @@ def motion_page(
         points = frame_points(drawing, film, size, follow=True)
     info |= panel(robot, motion, shown, goal)
     info |= marks(robot, film, tool, size, goals[:1] if motion.phases else goals)
-    if cloud is not None:
-        info["cloud"] = cloud_of(robot, cloud, tool)
-    colors = (TOOL_COLOR, COM_COLOR)
     info |= {
-        "tubes": tubes(robot, funnel, tool, size, colors) if funnel is not None else [],
         "mode": "motion",
         "t": packed(t),
         "speed": speed,
         "follow": follow,
         "points": rounded(points, size),
-        "target": _distance(drawing, film.poses, goals) > 0.02 * size,
+        "target": len(goals) > 0,
         "linear": motion.linear is not None,
         "phases": [*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
         "held": list(held),
@@ -164,15 +155,6 @@ def _points(film: Playback, size: float, goal: Moving, held: Iterable[Moving]) -
     for drawing, rows in (goal, *held):
         points += [corner_points(drawing, poses) for poses in rows[:: _step(rows)]]
     return np.concatenate(points)
-
-
-def _distance(drawing: Drawing, poses: Array, goals: Array) -> float:
-    """Return how far the target is from the robot at most [m], along any axis and at any time."""
-    step, largest = _step(poses), 0.0
-    for pose, goal in zip(poses[::step], [*goals[::step]] * len(poses), strict=False):
-        apart = corner_points(drawing, pose) - corner_points(drawing, goal)
-        largest = max(largest, float(np.abs(apart).max()))
-    return largest
 
 
 def _step(rows: Array) -> int:

@@ -19,7 +19,7 @@ from fflin.robot.joints import ROOT, find_frame, find_joint, frame_index
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.plant import Plant
-from fflin.view.bending import bendings
+from fflin.view.shapes import bendings
 
 # Steps of the way on which a payload came: at most so long [s], and so much of its swing [rad].
 _STEP, _SWING = 0.05, 0.3

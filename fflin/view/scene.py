@@ -15,9 +15,8 @@ import umsgpack
 from fflin.base.validation import Array
 from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
-from fflin.view.bending import bendings
 from fflin.view.meshes import Indices, Mesh, load_mesh
-from fflin.view.shapes import PLAIN, Shape, shapes
+from fflin.view.shapes import PLAIN, Shape, bendings, shapes
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # of what meshcat imports, not of ours

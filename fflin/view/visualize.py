@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from fflin.analysis.modes import Modes
-    from fflin.campaign.campaign import Campaign
-    from fflin.campaign.funnel import Funnel
     from fflin.simulation.motion import Motion
     from fflin.view.live import Live
 
@@ -51,8 +49,6 @@ def visualize(
     follow: bool | None = None,
     target: Array | None = None,
     tool: str | None = None,
-    cloud: Campaign | None = None,
-    funnel: Funnel | None = None,
     q: Array | None = None,
     port: int = 0,
     frame: str | None = None,
@@ -79,9 +75,9 @@ def visualize(
     robot : Robot
         Robot to show.
     motion : Motion or Modes, optional
-        Motion from `simulate`, or modes from `modes`. The page lists modes by name and frequency,
-        and animates one of them. Without a motion or modes, a live page shows the robot with a
-        slider for each joint.
+        Motion from `simulate` or `Campaign.replay`, or modes from `modes`. The page lists modes by
+        name and frequency, and animates one of them. Without a motion or modes, a live page shows
+        the robot with a slider for each joint.
     html : path, optional
         File to write; a temporary one by default.
     png, gif : path, optional
@@ -108,13 +104,6 @@ def visualize(
         target, the page shows the change from the start, and no translucent robot.
     tool : str, optional
         Frame whose trail is drawn; by default "tool", or the last link of the longest chain.
-    cloud : Campaign, optional
-        Campaign from `monte_carlo`. Thin lines show the paths of base and tool in up to 240 runs.
-        If the motion is a run from `Campaign.replay`, the robot is drawn with the dispersed
-        bodies of this run.
-    funnel : Funnel, optional
-        Funnel along the trajectory that the motion follows. A tube shows the positions of base and
-        tool inside the funnel.
     q : array_like (nq,), optional
         Initial configuration of a live robot; by default its `start`, or neutral.
     port : int
@@ -189,13 +178,13 @@ def visualize(
 
         page, notes = mode_page(robot, motion, scene=scene, tool=tool)
     else:
-        robot = _check_motion(robot, motion, cloud)
+        robot = _robot_of(robot, motion)
         fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
         from fflin.view.motion_page import motion_page
 
         goal = None if target is None else _configuration(robot, "target", target)
         how = {"scene": scene, "fps": fps, "speed": speed, "follow": follow, "target": goal}
-        page, notes = motion_page(robot, motion, **how, tool=tool, cloud=cloud, funnel=funnel)
+        page, notes = motion_page(robot, motion, **how, tool=tool)
         contents = _pictures(page, outputs, motion, speed, times)
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
@@ -257,15 +246,14 @@ def _speed(speed: float | None, default: float) -> float:
     return speed
 
 
-def _check_motion(robot: Robot, motion: Motion, cloud: Campaign | None) -> Robot:
-    """Return the robot that a motion is of."""
+def _robot_of(robot: Robot, motion: Motion) -> Robot:
+    """Return the robot of a motion; a run of a campaign may have other bodies."""
     from fflin.simulation.motion import require_motion
 
     require_motion(motion)
-    if cloud is not None:
-        from fflin.view.overlays import drawn_robot
-
-        robot = drawn_robot(robot, cloud, motion)
+    own = motion._robot
+    if own and own.name == robot.name and list(own.model.names) == list(robot.model.names):
+        robot = own
     sizes = motion.q.shape[1], motion.u.shape[1]
     expected = robot.nq, len(Actuation(StateMap(robot)).names)
     if sizes != expected or motion.urdf_sha256 != robot.urdf_sha256:

@@ -110,14 +110,9 @@ def test_other_inputs_are_protected_too(urdf, tmp_path, capsys, monkeypatch):
     command = ("linearize", urdf, "--inputs", "in.json", "-o", "in.json")
     code, _, error = run(*command)
     assert code == 2 and "input file" in error
-    robot = fflin.load(urdf)
-    np.savez("q.npz", q=np.tile(robot.neutral(), (3, 1)))
-    for name in ("q.npz", "q.h5"):
-        if name == "q.h5":
-            os.link("q.npz", name)
-        command = ("sweep", urdf, "--configurations", "q.npz", "-o", name)
-        code, _, error = run(*command)
-        assert code == 2 and "input file" in error and error.count("\n") == 1
+    os.link("in.json", "q.h5")
+    code, _, error = run("sweep", urdf, "--random", 3, "--inputs", "in.json", "-o", "q.h5")
+    assert code == 2 and "input file" in error and error.count("\n") == 1
 
 
 def test_a_session_may_save_over_what_it_has_read(urdf, tmp_path, capsys, monkeypatch):

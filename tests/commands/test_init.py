@@ -84,16 +84,20 @@ def test_all_that_init_suggests_can_be_taken(tmp_path):
     assert says(text, '"RCS_1"', "[-1, 0, 0]", "[1, 0, 0]")
     taken = re.sub(r"(?m)^# (?=\[|[a-z_]+ = |\"[\w. ]+\" = )", "", text)
     # The wheel takes the place of its joint, which no other line may then speak of.
-    taken = taken.replace('lock = ["hinge 1"]', 'lock = ["spin"]')
+    assert says(text, 'To use this wheel, lock joint "spin" above.')
+    (tmp_path / "free.toml").write_text(taken.replace('lock = ["spin"]', ""))
+    with pytest.raises(fflin.InputError, match="lock 'spin' if it is the wheel's"):
+        fflin.load(tmp_path / "free.toml")
     taken = re.sub(r'(?m)^"\w+\.spin".*\n', "", taken)
     (tmp_path / "all.toml").write_text(taken)
     robot = fflin.load(tmp_path / "all.toml")
     assert robot.locked == ("spin=0.0",) and robot.passive == ("hinge 1",)
+    spin = {"max": 2.0, "max_speed": 500.0}  # the limits of its joint
     assert robot.inputs == (
         fflin.BaseTorque(max=1.0),
         fflin.BaseForce(max=1.0),
-        fflin.Thruster("RCS_1", (0, 0, 0), (0, 0, 1), "RCS_1"),
-        fflin.ReactionWheel((1, 0, 0), "rw_x", inertia=0.7, name="rw_x_rotor"),
+        fflin.Thruster("RCS_1", (0, 0, 0), (0, 0, 1), "RCS_1", max=1.0),
+        fflin.ReactionWheel((1, 0, 0), "rw_x", inertia=0.7, name="rw_x_rotor", **spin),
     )
     assert robot.outputs == (fflin.CenterOfMass(),) and robot.gravity[2] == -9.81
     assert robot.weights == {"rule": "urdf", "bryson": {"q_b": 0.05}}
@@ -103,6 +107,18 @@ def test_all_that_init_suggests_can_be_taken(tmp_path):
     inertia = 0.4  # about y, through the panel's centre
     assert robot.stiffness["hinge 1"] == pytest.approx(inertia * np.pi**2, rel=1e-5)
     assert robot.damping["hinge 1"] == 0.3
+
+
+def test_inputs_come_in_the_order_of_their_numbers(tmp_path):
+    nozzles = "".join(
+        f'<link name="thruster_{k}"/><joint name="n{k}" type="fixed"><parent link="base"/>'
+        f'<child link="thruster_{k}"/></joint>'
+        for k in range(1, 13)
+    )
+    (tmp_path / "own.urdf").write_text(OWN.replace("</robot>", f"{nozzles}</robot>"))
+    assert run("init", "own.urdf", cwd=tmp_path)[0] == 0
+    found = re.findall('# name = "thruster_([0-9]+)"', (tmp_path / "own.toml").read_text())
+    assert found == [str(k) for k in range(1, 13)]
 
 
 def test_joints_that_all_have_no_effort_keep_their_motors(tmp_path):

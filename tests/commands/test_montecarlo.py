@@ -65,7 +65,6 @@ def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots)
         (("--runs", "3", "-o", "x.csv"), "x.csv"),
         (("--runs", "3", "--goal", "attitude < 1 m"), "deg"),
         (("--runs", "3", "--until", "nosuch < 1"), "'nosuch'"),
-        (("--runs", "3", "--workers", "2", "--dask", "x"), "workers"),
         (("--runs", "3", "--plot", "x.gif"), "x.gif"),
         (("--runs", "3", "-o", "x.h5", "--plot", "x.h5"), "x.h5"),
         (("--runs", "3", "--width", "2"), "width"),

@@ -15,7 +15,6 @@ from fflin.control.authority import (
     point_report,
     thruster_properties,
     thruster_report,
-    unreachable,
     wheel_momenta,
     wheel_properties,
     wheel_report,
@@ -98,10 +97,6 @@ def test_a_box_of_thrusters_has_the_force_and_torque_of_its_pairs():
     assert "not push every way" in thrusters_at(few, few.neutral(), np.zeros(3))
     free = robot.replace(inputs=[fflin.Thruster("base", x.position, x.direction) for x in nozzles])
     assert "limit" in thrusters_at(free, free.neutral(), np.zeros(3))
-    W = np.array([nozzle.wrench for nozzle in nozzles]).T[[3, 4, 5, 0, 1, 2]]
-    assert unreachable(W) == {"torque": [], "force": []}
-    assert unreachable(W[:, :4])["force"] == ["+y", "-y", "+z", "-z"]
-    assert unreachable(W[:, [0, 2]])["force"] == ["-x", "+y", "-y", "+z", "-z"]
 
 
 def test_wheels_add_up_in_base_axes():

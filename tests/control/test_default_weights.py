@@ -10,8 +10,9 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.control.default_weights import BANDWIDTH, _damping, rule_weights
+from fflin.control.default_weights import BANDWIDTH, _damping
 from fflin.control.gain import one_sided
+from fflin.control.weights import rule_weights
 from fflin.dynamics.state import StateMap
 from fflin.robot.catalog import find_robot
 from tests.support.messages import says
@@ -432,7 +433,7 @@ def test_panels_on_springs_come_to_rest_as_the_base_does(stiffness, inputs):
     assert decay == pytest.approx(gain.margin, rel=5e-3)
     least = 0.95 if inputs == "motors" or stiffness > 1.0 else 0.3
     assert gain.margin > least * np.sqrt(0.5) * 0.0754
-    assert ("slowed by springs" in gain.weights) == (least < 0.9)
+    assert ("decaying more slowly" in gain.weights) == (least < 0.9)
 
 
 LEGGED = (
@@ -516,10 +517,8 @@ def test_largest_values_of_all_are_brysons_rule_and_of_some_are_on_its_scale(loo
     assert norms[0] < norms[1] < norms[2]
 
 
-def test_weights_of_another_scale_than_the_rules_are_warned_of(loops):
+def test_a_given_weight_replaces_the_weight_of_the_rule(loops):
     _, lin, gain = loops("ets_vii")
-    with pytest.warns(fflin.FflinWarning, match="differ in scale"):
-        rule_weights(lin, None, {"q": {"q_b": 1e6 * gain.Q[0, 0]}})
     own = {"q": {"q_b.x": 2.0 * gain.Q[0, 0]}}
     Q, R, _, _ = rule_weights(lin, None, own)
     assert Q[0, 0] == 2.0 * gain.Q[0, 0] and (gain.R == R).all()

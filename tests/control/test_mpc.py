@@ -184,23 +184,6 @@ def test_what_cannot_be_kept_is_passed_by_the_least(servicer):
     assert says(ahead.notes[0], "1 plans of 12 samples of 0.1 s", "qdot_m.joint")
 
 
-def test_what_the_robot_passes_is_said_though_no_plan_does(servicer):
-    """Far from the point the inertia is another, and rates pass their limit."""
-    robot, lin = servicer
-    rates = np.flatnonzero([name.startswith("qdot_m") for name in lin.state_names])
-    for far, passes in ((0.3, False), (1.0, True)):
-        policy = fflin.mpc(lin, dt=0.1, limits={"qdot_m": 0.1})
-        x0 = np.zeros(30)
-        x0[6:15] = far * (-1.0) ** np.arange(9)
-        motion = fflin.simulate(robot, policy, x0=x0, duration=20.0, dt=0.02)
-        sampled = np.abs(motion.x[5::5, rates])
-        over = (sampled > 0.1 + 2e-4).any(axis=1)
-        assert over.any() == passes == ("robot" in motion.notes[0])
-        if passes:
-            assert f"{over[:-1].sum()} samples" in motion.notes[0]
-            assert f" by {sampled[:-1].max() - 0.1:.2g} at " in motion.notes[0]
-
-
 def test_slews_that_break_the_regulator_are_held(servicer):
     """The base turns hard while the joints are weak: under the regulator arm and panels swing
     beyond their travels, and it has not settled after a minute; the controller turns no harder than
@@ -411,33 +394,20 @@ def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp
         fflin.simulate(robot, policy, duration=1.0)
 
 
-def test_it_prints_what_is_limited(servicer, planned):
+def test_it_prints_how_much_is_limited(servicer):
     robot, lin = servicer
     model = fflin.linearize(robot.replace(outputs=[fflin.FramePose("tool")]))
     limits = ["urdf", {"tau_b": 60.0, "q_b": 0.2, model.output_names[0]: (-9.0, 9.5)}]
     policy = fflin.mpc(model, dt=0.25, limits=limits)
     assert repr(policy) == "Mpc('servicer_7dof', 20 samples of 0.25 s, 34 limits)"
-    first, *lines = str(policy).splitlines()
-    assert first == repr(policy) and all(len(line) <= 80 for line in lines) and len(lines) < 20
-    assert "hard, -60 to 60: tau_b.x, tau_b.y, tau_b.z" in lines
-    assert f"soft, -9 to 9.5: {model.output_names[0]}" in lines
-    text = " ".join(" ".join(lines).split())
-    assert "soft, -0.2 to 0.2: q_b.x, q_b.y, q_b.z, qdot_m.joint_1, qdot_m.joint_2," in text
-    named = {name.rstrip(",") for name in text.split() if "." in name and name[0].isalpha()}
-    assert named == set(policy.horizon.limited)
     assert str(fflin.mpc(lin, dt=0.25, limits=None)).endswith("0 limits)")
 
 
 @pytest.mark.exhaustive
-def test_it_prints_what_is_limited_along_a_trajectory(planned):
+def test_it_prints_how_much_is_limited_along_a_trajectory(planned):
     along = planned[-1]
     follows = fflin.mpc(along, dt=0.25, horizon=4, limits={"tau_b": 80.0, "q_b": 0.2})
     head = f"TrajectoryMpc('{along.robot.name}', 4 samples of 0.25 s, 6 limits)"
-    assert str(follows).splitlines() == [
-        head,
-        "hard, -80 to 80: tau_b.x, tau_b.y, tau_b.z",
-        "soft, -0.2 to 0.2: q_b.x, q_b.y, q_b.z",
-    ]
     assert repr(follows) == head
 
 

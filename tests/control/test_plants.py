@@ -1,15 +1,10 @@
-"""Controllers of the nominal robot on another: run where the names agree, and said."""
-
-import re
-from dataclasses import replace
+"""Controllers of the nominal robot on another: run where the names agree."""
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.control.plants import notes_of
-from fflin.simulation.report import motion_report
 from tests.support.messages import says
 from tests.support.motions import displaced, motion
 from tests.support.weights import unit_weights
@@ -23,16 +18,8 @@ def nominal():
     return robot, fflin.linearize(robot)
 
 
-def told(result):
-    (note,) = result.notes
-    start = "the robot differs from 'ets_vii' of the controller's design: accelerations due to "
-    assert note.startswith(start + "inputs differ by up to ") and note.endswith(" %")
-    assert note in motion_report(result).replace("\n  ", " ")
-    return float(note.split()[-2])
-
-
 @pytest.mark.parametrize("dt", [0.0, 0.1])
-def test_a_feedback_of_the_nominal_robot_runs_on_another_and_says_so(nominal, dt):
+def test_a_feedback_of_the_nominal_robot_runs_on_another(nominal, dt):
     robot, lin = nominal
     other = robot.perturbed(**SPREAD, seed=4)
     lin = lin.discretize(dt) if dt else lin
@@ -44,91 +31,7 @@ def test_a_feedback_of_the_nominal_robot_runs_on_another_and_says_so(nominal, dt
     plain = policy.bind(robot)
     same = fflin.simulate(other, plain, x0=x0, duration=40.0, sample=dt or None, dt=run.t[1])
     np.testing.assert_allclose(run.x, same.x, atol=1e-12)
-    assert not same.notes and run.urdf_sha256 == other.urdf_sha256
-    assert 1.0 < told(run) < 40.0
-    assert not fflin.simulate(robot, policy, x0=x0, duration=0.1).notes
-
-
-def test_what_the_note_says_is_the_relative_change_of_what_inputs_cause(nominal):
-    # Twice the density everywhere: every input causes half of the acceleration.
-    robot, lin = nominal
-    bodies = {
-        name: {"mass": 2.0 * robot.model.inertias[index].mass}
-        for index, name in enumerate(robot.model.names)
-        if index > 1
-    } | {"base": {"mass": 2.0 * robot.model.inertias[1].mass}}
-    heavy = robot.with_mass_properties(bodies)
-    K = np.zeros(lin.B.T.shape)
-    for plant, model, percent in ((heavy, lin, 50.0), (robot, fflin.linearize(heavy), 100.0)):
-        run = fflin.simulate(plant, fflin.StateFeedback(model, K), duration=0.02)
-        assert told(run) == percent
-
-
-def test_a_lock_at_another_value_is_another_robot():
-    here, there = (fflin.load("ets_vii", lock={"joint_3": value}) for value in (0.0, 0.8))
-    lin = fflin.linearize(here)
-    policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
-    assert told(fflin.simulate(there, policy, duration=0.02)) > 1.0
-
-
-def changed_servicer(**change):
-    wheel = fflin.ReactionWheel((0, 1, 0), inertia=0.05, name="wheel")
-    inputs = [*fflin.load_inputs("servicer_7dof"), wheel]
-    for i, each in enumerate(inputs):
-        if isinstance(each, fflin.ReactionWheel) and "wheel" in change:
-            inputs[i] = replace(each, inertia=change["wheel"] * each.inertia)
-        if isinstance(each, fflin.Thruster) and "thruster" in change:
-            inputs[i] = replace(each, position=np.add(each.position, change["thruster"]))
-    fields = {"stiffness": {"panel_left": 20.0}, "damping": {"panel_left": 0.5}} | {
-        key: value for key, value in change.items() if key not in ("wheel", "thruster")
-    }
-    return fflin.load("servicer_7dof", inputs=inputs, **fields)
-
-
-@pytest.mark.parametrize("dt", [0.0, 0.05])
-@pytest.mark.parametrize(
-    ("change", "what", "percent"),
-    [
-        ({"wheel": 10.0}, "inputs", None),
-        ({"thruster": (0.0, 0.2, 0.0)}, "inputs", None),
-        ({"stiffness": {"panel_left": 40.0}}, "states", 100.0),
-        ({"damping": {"panel_left": 1.0}}, "states", 100.0),
-        ({"damping": {"panel_right": 0.2}}, "states", 100.0),
-        ({"gravity": (0.0, 0.0, -1.6)}, "states", 100.0),
-    ],
-)
-def test_what_is_said_of_a_robot_beside_its_urdf_makes_another(change, what, percent, dt):
-    lin = fflin.linearize(changed_servicer())
-    lin = lin.discretize(dt) if dt else lin
-    policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
-    (note,) = notes_of(policy, changed_servicer(**change))
-    far = float(re.search(f"due to {what} differ by up to (.+?) %", note)[1])
-    assert far > 1.0
-    assert dt or percent is None or far == pytest.approx(percent, rel=0.1)
-    assert notes_of(policy, changed_servicer()) == ()
-
-
-def test_reduced_models_are_held_against_the_same():
-    arm = fflin.load("ets_vii", stiffness=5.0)
-    robot = arm.replace(inputs=[fflin.JointTorque(name) for name in arm.joint_names])
-    part = fflin.momentum_reduction(fflin.linearize(robot))
-    later = fflin.momentum_reduction(fflin.linearize(robot).discretize(0.1))
-    for lin in (part, part.discretize(0.1), later):
-        policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
-        assert notes_of(policy, robot) == ()
-        (note,) = notes_of(policy, robot.replace(stiffness=10.0))
-        assert "states" in note
-        assert float(re.findall(r"([\d.]+) %", note)[-1]) == pytest.approx(100.0, rel=0.3)
-
-
-def test_an_allocation_has_the_wheels_of_the_robot():
-    robot = changed_servicer()
-    wheels = [each for each in robot.inputs if isinstance(each, fflin.ReactionWheel)]
-    design = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce(), *wheels])
-    lin = fflin.linearize(design)
-    law = fflin.Allocation(fflin.StateFeedback(lin, np.zeros(lin.B.T.shape)), design)
-    assert notes_of(law, changed_servicer(thruster=(0.0, 0.2, 0.0))) == ()
-    assert "inputs" in notes_of(law, changed_servicer(wheel=10.0))[0]
+    assert run.urdf_sha256 == other.urdf_sha256
 
 
 def test_measured_feedback_runs_on_another_robot(nominal):
@@ -138,7 +41,7 @@ def test_measured_feedback_runs_on_another_robot(nominal):
     law = fflin.lqg(fflin.lqr(sampled, *weights), fflin.kalman(sampled, 1.0, 1.0))
     policy = fflin.OutputFeedback(sampled, law)
     run = fflin.simulate(robot.perturbed(**SPREAD), policy, x0=displaced(sampled), duration=60.0)
-    assert told(run) > 1.0 and run.attitude_error[-1] < 1.0
+    assert run.attitude_error[-1] < 1.0
 
 
 @pytest.mark.exhaustive
@@ -149,10 +52,8 @@ def test_schedules_and_allocations_run_on_another_robot():
     policy = fflin.TrajectoryFeedback(along, fflin.tvlqr(along, 1.0, 1e-3, 1.0))
     other = robot.perturbed(**SPREAD, seed=1)
     run = fflin.simulate(other, policy, q0=q[0], v0=v[0], duration=0.4, dt=0.005, frame="local")
-    assert told(run) > 1.0
     # Exact at the start, off by what the masses are off.
     exact = fflin.simulate(robot, policy, q0=q[0], v0=v[0], duration=0.4, dt=0.005, frame="local")
-    assert not exact.notes
     np.testing.assert_allclose(run.u[0], exact.u[0], atol=1e-9)
     assert np.abs(run.u[-1] - exact.u[-1]).max() > 1e-3
 
@@ -161,7 +62,6 @@ def test_schedules_and_allocations_run_on_another_robot():
     apart = fflin.simulate(other, law, x0=displaced(lin), duration=0.2, dt=0.05, sample=0.05)
     plain = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     same = fflin.simulate(other, plain, x0=displaced(lin), duration=0.2, dt=0.05, sample=0.05)
-    assert told(apart) == told(same)
     np.testing.assert_allclose(apart.x, same.x, atol=1e-9)
 
 
@@ -248,26 +148,3 @@ def test_measurements_of_other_names_are_refused(nominal):
     other = robot.replace(outputs=[fflin.JointPositions(robot.joint_names)])
     with pytest.raises(fflin.InputError, match=r"q_b\.x, q_b\.y"):
         fflin.simulate(other, fflin.OutputFeedback(sampled, law), duration=0.1)
-
-
-@pytest.mark.parametrize("dt", [0.0, 0.2])
-def test_in_orbit_what_is_next_to_nothing_does_not_count(dt):
-    """At the one's equilibrium f0 is rounding, and a nearly round payload hardly feels its turn."""
-    design = fflin.load("servicer_7dof", lock=["panel_*"], orbit=700e3)
-    q = fflin.configuration(design, {"joint_2": 0.6, "joint_4": -1.2, "joint_6": 0.4})
-    inertia = np.diag([0.35, 0.35, 0.2])
-    held, heavier, half = (
-        fflin.capture(design, "tool", pin.Inertia(m, np.array([0, 0, 0.9]), m * inertia), q=q).robot
-        for m in (500.0, 545.0, 250.0)
-    )
-    lin = fflin.linearize(held, q, u=fflin.equilibrium(held, q).u)
-    lin = lin.discretize(dt) if dt else lin
-    policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
-
-    def far(robot):
-        (note,) = notes_of(policy, robot)
-        return float(re.search("due to states differ by up to (.+?) %", note)[1])
-
-    assert notes_of(policy, held) == ()
-    assert 1.0 < far(heavier) < 9.0 < far(half)
-    assert far(held.replace(stiffness=1.0)) > 90.0

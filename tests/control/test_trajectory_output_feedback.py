@@ -187,12 +187,9 @@ def test_what_does_not_fit_is_refused(loop):
     make = fflin.TrajectoryOutputFeedback
     with pytest.raises(fflin.InputError, match="FilterSchedule"):
         make(along, gains, np.eye(3))
-    whole = fflin.tvkalman(along, 1.0, 1.0, P0=1.0)
-    with pytest.raises(fflin.InputError, match=r"0\.1 s"):
-        make(along, gains, whole)
     continuous = fflin.tvlqr(along, 1.0, 1.0, 1.0)
-    with pytest.raises(fflin.InputError, match="0 s"):
-        make(along, continuous, whole)
+    with pytest.raises(fflin.InputError, match=r"0 s.*0\.1 s"):
+        make(along, continuous, seen)
     with pytest.raises(fflin.InputError, match="trajectory"):
         make(along, gains, replace(seen, A=2.0 * seen.A))
     policy = make(along, gains, seen)

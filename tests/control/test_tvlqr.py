@@ -74,7 +74,7 @@ def test_double_integrators_have_the_closed_form():
         # Within the 1e-7 that interpolation is held to.
         assert schedule.cost_to_go(t) == pytest.approx(expected, abs=3e-7 * np.abs(expected).max())
         K = np.linalg.solve(R, lin.B.T @ expected)
-        assert schedule(t) == pytest.approx(K, abs=1e-6 * np.abs(K).max())
+        assert schedule.gain(t) == pytest.approx(K, abs=1e-6 * np.abs(K).max())
     assert schedule.P[0] == pytest.approx(
         np.linalg.inv(
             (np.eye(12) - 5 * lin.A) @ np.linalg.inv(Qf) @ (np.eye(12) - 5 * lin.A).T
@@ -354,7 +354,7 @@ def test_models_between_knots_are_computed_in_batches(moving, monkeypatch, sampl
         monkeypatch.setattr(fflin.Linearizer, name, counted)
     Q, R = weights(moving)
     fflin.tvlqr(moving, Q, R, 1.0, sample=sample)
-    assert 2 <= len(calls) < 20
+    assert 2 <= len(calls) < len(moving.t)
 
 
 def test_asking_for_a_gain_solves_nothing(moving, monkeypatch):

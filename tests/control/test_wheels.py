@@ -316,12 +316,12 @@ def test_four_wheels_turn_against_each_other_on_request():
 def test_what_is_not_regulated_is_said(tmp_path):
     lin = fflin.linearize(wheeled(ORTHOGONAL))
     gain = fflin.lqr(lin)
-    assert says(str(gain), "not regulated: r_b, v_b", "wheel angles", "wheel speeds", "conserved")
+    assert says(str(gain), "not regulated: r_b.x, r_b.y, r_b.z, q_m.wheel_1")
     free = str(fflin.lqr(fflin.linearize(wheeled(PYRAMID))))
     assert says(free, "wheel_speeds=True")
     one = wheeled(ORTHOGONAL, others=[Thruster("base", (0, 0, 0), (1, 0, 0))])
     part = fflin.lqr(fflin.linearize(one))
-    assert says(str(part), "not regulated: r_b.y, r_b.z, v_b.y, v_b.z")
+    assert says(str(part), "not regulated: r_b.y, r_b.z, q_m.wheel_1")
     assert "not regulated" not in str(fflin.lqr(fflin.linearize(body())))
     for ending in ("npz", "mat", "json"):
         gain.save(tmp_path / f"g.{ending}")
@@ -337,14 +337,14 @@ def test_what_is_not_regulated_is_said(tmp_path):
 
 def test_what_cannot_be_held_is_refused():
     for count, words in (
-        (1, "attitude y/z"),
-        (2, "attitude z"),
+        (1, "angular momentum y/z"),
+        (2, "angular momentum z"),
     ):
         with pytest.raises(fflin.StabilizabilityError, match=f"{words}"):
             fflin.lqr(fflin.linearize(wheeled(ORTHOGONAL[:count])))
     arm = fflin.load("ets_vii")
     idle = arm.replace(inputs=[JointTorque("joint_1"), *wheels(ORTHOGONAL, 1.0)])
-    with pytest.raises(fflin.StabilizabilityError, match="joint_2, joint_3"):
+    with pytest.raises(fflin.StabilizabilityError, match=r"momentum of joint_2, .* joint_3"):
         fflin.lqr(fflin.linearize(idle))
 
 
@@ -352,7 +352,7 @@ def test_damping_of_wheels_is_said_to_be_why_nothing_is_held():
     """Their speeds stay in the model with it, and the momentum of all that no input changes."""
     names = [f"wheel_{k}" for k in (1, 2, 3)]
     lin = fflin.linearize(wheeled(ORTHOGONAL).replace(damping=dict.fromkeys(names, 1e-7)))
-    words = "damping of wheel_1, wheel_2, wheel_3 keeps .*remove"
+    words = "remove the damping of the wheels"
     reduced = fflin.momentum_reduction(lin)
     for model in (lin, lin.discretize(0.1), reduced):
         for weights in ((), (1.0, 1.0)):
@@ -386,23 +386,17 @@ def test_a_body_that_turns_is_held_too():
 
 def test_the_closed_form_holds_too():
     """The regulator on accelerations is the one of the same cost by the Riccati equation."""
-    for others, options, count in (
-        ([], {}, 6),
-        ([BaseTorque(), BaseForce()], {}, 15),
-        ([BaseTorque(), BaseForce()], {"wheel_speeds": False}, 12),
-    ):
+    for others, count in (([], 6), ([BaseTorque(), BaseForce()], 12)):
         robot = wheeled(AXES[:3], others=others)
         lin = fflin.linearize(robot)
-        gain = fflin.acceleration_lqr(lin, 3.0, {"qdot_m": 0.2, "omega_b": 1.0}, 2.0, **options)
+        gain = fflin.acceleration_lqr(lin, 3.0, {"omega_b": 1.0}, 2.0)
         assert len(gain.regulated) == count == len(gain.poles) and gain.residual < 1e-13
         if count == 12:  # more inputs than accelerations: R is singular
             continue
-        same = fflin.lqr(lin, gain.Q, gain.R, **options)
+        same = fflin.lqr(lin, gain.Q, gain.R)
         assert same.regulated == gain.regulated
         assert gain.K == pytest.approx(same.K, abs=1e-7 * np.abs(gain.K).max())
         assert gain.P == pytest.approx(same.P, abs=1e-7 * np.abs(gain.P).max())
-    with pytest.raises(fflin.InputError, match=r"qdot_m\.wheel_1"):
-        fflin.acceleration_lqr(fflin.linearize(robot), 1.0, {"omega_b": 1.0}, 1.0)
 
 
 def test_a_filter_estimates_what_is_regulated():

@@ -137,23 +137,6 @@ def test_nearly_singular_m_is_warned_of_with_the_error_to_expect():
     assert 1e-9 < error.max() < 1e-6
 
 
-def test_a_link_of_next_to_no_inertia_is_named():
-    """Its M is well conditioned once scaled, and B holds; only it is that of no robot."""
-    heavy = pin.Inertia(1.0, np.array([0.1, 0.0, 0.0]), 0.01 * np.eye(3))
-    point = pin.Inertia(5.0, np.array([3e-6, 0.0, 0.0]), np.zeros((3, 3)))
-    robot = chain(heavy, point)
-    said = r"joint 'joint_1' has an inertia of only 1.2e-11 .* B has entries of 8.3e\+10"
-    with pytest.warns(fflin.FflinWarning, match=said):
-        lin = fflin.linearize(robot)
-    assert lin.B.max() == pytest.approx(8.3e10, rel=1e-2)
-    assert lin.certificate.condition < 1e3 < 1e9 < np.linalg.cond(lin.M)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        fflin.linearize(
-            chain(heavy, pin.Inertia(5.0, np.array([1e-3, 0.0, 0.0]), np.zeros((3, 3))))
-        )
-
-
 @pytest.mark.parametrize(
     "robot",
     [

@@ -1,6 +1,7 @@
 """Modes of flexible appendages and slosh in reports: of motions, campaigns, robots and modes."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -121,16 +122,12 @@ def test_a_summary_lists_the_appendages():
     from fflin.robot.summary import robot_info
 
     text = robot_info(full())
-    assert row(text, "boom       base             boom_mode_2") == [
-        *("0.8", "0.005", "25.2662", "1/s^2"),
-    ]
-    assert row(text, "tank       base             tank_x")[2:] == ["47.3741", "N/m"]
-    assert row(text, "swing      base             swing_x") == [".", ".", "."]
+    assert "boom on frame base: modes boom_mode_1, boom_mode_2" in " ".join(text.split())
+    assert re.search(r"boom_mode_2 = 25\.2662", text)
     # The modes are neither joints nor bodies nor frames of the user's.
     rigid = robot_info(servicer()[0])
     assert row(text, "(base)")[1] == row(rigid, "(base)")[1]
     assert f"{servicer()[0].n + 1} joints, 10 modes" in text
-    assert text.count("boom_mode_2") == 1
 
 
 def test_default_weights_leave_modes_to_their_damping_and_name_them():
@@ -144,16 +141,16 @@ def test_default_weights_leave_modes_to_their_damping_and_name_them():
     ]
     assert decays[1] == pytest.approx(decays[0], rel=0.01)
     said = " ".join(str(flexible).split())
-    assert "decaying by their own damping only: " in said and "kg^0.5 m of the joints" not in said
-    assert "boom_mode_2" in said[said.index("decaying by their own damping") :]
+    assert "decaying more slowly: " in said and "kg^0.5 m of the joints" not in said
+    assert "boom_mode_2" in said[said.index("decaying more slowly") :]
 
 
 def test_a_pendulum_without_gravity_is_named():
-    with pytest.raises(fflin.StabilizabilityError, match=r"'swing_x'.*is a pendulum"):
+    with pytest.raises(fflin.StabilizabilityError, match=r"swing_x.*add inputs"):
         fflin.lqr(fflin.linearize(full().replace(gravity=(0, 0, 0))))
     tank = fflin.Slosh.cylinder("base", 0.1, 0.1, 1000.0, 0.04, name="tank")
     alone = fflin.load("planar_detumble", lock=["*"], appendages=[tank])
-    with pytest.raises(fflin.StabilizabilityError, match=r"'tank_x', 'tank_y' is a pendulum"):
+    with pytest.raises(fflin.StabilizabilityError, match=r"momentum of tank_x, .*a spring"):
         fflin.lqr(fflin.linearize(alone))
 
 

@@ -188,7 +188,7 @@ def test_results_of_the_one_are_not_taken_for_the_others(tmp_path):
         ({"base": {"inertia": np.triu(np.ones((3, 3)))}}, "symmetric"),
         ({"base": {"inertia": np.diag([1.0, 1.0, 3.0])}}, "sum"),
         ({"base": {"inertia": np.diag([1.0, 1.0, 2.1])}}, "sum"),
-        ({"base": {"inertia": np.diag([1.0, 1.0, -1.0])}}, "expected values of 0 or more"),
+        ({"base": {"inertia": np.diag([1.0, 1.0, -1.0])}}, "moments of 0 or more"),
         ({"base": {"masses": 1.0}}, "'masses'"),
         ({"base": 3.0}, "float"),
         ({"base": pin.Inertia.Zero()}, "mass .*0 kg"),

@@ -34,10 +34,10 @@ def test_other_bodies():
     ("given", "said"),
     [
         ({}, "altitude"),
-        ({"altitude": 7e5, "mean_motion": 1e-3}, "both"),
-        ({"altitude": -1.0}, "surface"),
-        ({"altitude": 0.0}, "surface"),
-        ({"mean_motion": 2e-3}, "0.001239"),
+        ({"altitude": 7e5, "mean_motion": 1e-3}, "exactly one"),
+        ({"altitude": -1.0}, "-1 m .*no orbit"),
+        ({"altitude": 0.0}, " 0 m .*no orbit"),
+        ({"mean_motion": 2e-3}, "smaller mean motion"),
         ({"mean_motion": 1e-300}, "mean.motion|orbit"),
         ({"mean_motion": -1e-3}, "mean_motion"),
         ({"altitude": math.nan}, "altitude"),
@@ -59,9 +59,7 @@ METRES = r"an altitude of 400 m over earth: altitudes are in metres; write 400 k
     ("altitude", "body", "said"),
     [
         (400, "earth", METRES),
-        (79e3, "venus", "79000 m"),
-        (100, "moon", "100 m"),
-        (6778e3, "earth", "6778000 m.*399863 m"),
+        (79e3, "earth", "79000 m"),
     ],
 )
 def test_a_doubtful_altitude_is_warned_of(altitude, body, said):

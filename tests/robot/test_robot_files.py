@@ -198,7 +198,7 @@ CASES = {
     URDF + "[[inputs]]\ntype = 'base_force'": ":2: 'inputs'",
     URDF + INPUT + "'base_forces'": ":3: 'base_forces'",
     "urdf = 3": ":1: robot",
-    URDF + (INPUT + "'base_force'\n") * 2: ":2: BaseForce()",
+    URDF + (INPUT + "'base_force'\n") * 2: ":2: 'F_b.x'",
     "#\nurdf = 'nosuch'": ":2: 'nosuch'",
     "#\nurdf = 'no/such.urdf'": "sat.toml no/such.urdf'",
     "urdf = 'sat.toml'": "sat.toml URDF",

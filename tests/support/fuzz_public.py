@@ -206,10 +206,10 @@ def sound(folder):
         | {"robot": robot, "hold": None, "frame": "local"},
         "TrajectoryFeedback": {"trajectory": along, "schedule": schedule},
         "TrajectoryOutputFeedback": {
-            **{"trajectory": along, "filter": fflin.tvkalman(along, 1.0, 1.0, None, 1.0, 0.01)},
+            **{"trajectory": along, "filter": fflin.tvkalman(along, 1.0, 1.0, P0=1.0, sample=0.01)},
             **{"schedule": fflin.tvlqr(along, 1.0, 1.0, 1.0, 0.01), "noise": None},
         },
-        "tvkalman": {"traj": along, "W": 1.0, "V": 1.0, "G": along.B, "P0": 1.0, "sample": None},
+        "tvkalman": {"traj": along, "W": 1.0, "V": 1.0, "G": along.B, "P0": 1.0, "sample": 0.01},
         "tvlqr": {"traj": along, "Qf": 1.0, "sample": None, "weights": None} | weights,
         "uncertain": {"robot": robot, "ranges": {"base.mass": 0.1, "link_1.com.x": (0.1, 0.2)}},
         "validity": {

@@ -413,13 +413,13 @@ refuse("a chain of 10,000 links", chain(10_000, "fixed"), "10000", "1000")
 refuse("1,000 joints", chain(999, "continuous"), "998 joints", "GiB")
 refuse("317 joints", chain(318, "continuous"), "317 joints", "GiB")
 accept("a chain of 900 links", chain(900, "fixed"))
-warn(
+refuse(
     "a world that the base floats in",
     robot(link("world", ""), link("a"), link("b"), joint("j", "a", "b")).replace(
         "</robot>", joint("free", "world", "a", "floating", "") + "</robot>"
     ),
-    "'world'",
     "'free'",
+    "lock",
 )
 refuse(
     "a world that two bases float in",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.uncertainty import singular_value, worst
+from fflin.uncertainty import worst
 from fflin.uncertainty.worst import Gain, Loops
 
 FOUR = {
@@ -160,8 +160,8 @@ def test_what_exceeds_a_bound_is_told_from_what_does_not(servicer):
 def test_the_bound_by_scaling_is_that_of_textbooks():
     # Packard and Doyle, Automatica 29(1), 1993: of diagonal blocks the bound by D Z D^-1.
     def scaled(Z):
-        d = singular_value.perron(Z)
-        return d * Z / d.mT, singular_value.held(Z[None], (d[:, 0], 0.0 * d[:, 0]))
+        d = worst.perron(Z)
+        return d * Z / d.mT, worst.bound_of(Z[None], (d[:, 0], 0.0 * d[:, 0]))
 
     assert scaled(np.array([[1.0, 4.0], [0.25, 1.0]]))[1] == pytest.approx(2.0, rel=1e-6)
     for Z in np.random.default_rng(0).normal(size=(20, 5, 5)) + 0j:
@@ -186,8 +186,8 @@ def test_slycot_gives_the_structured_singular_value_of_its_own_example():
     # Real numbers and full blocks, as `worst` asks it: what it returns makes its bound.
     blocks = np.array(blocks)
     bound = slycot.ab13md(Z, blocks, np.where(blocks == 1, 1, 2))[0]
-    by = singular_value._scalings(Z, blocks)[-1]
-    assert singular_value.held(Z[None], by) == pytest.approx(bound, rel=1e-6)
+    by = worst._scalings(Z, blocks)[-1]
+    assert worst.bound_of(Z[None], by) == pytest.approx(bound, rel=1e-6)
     assert bound <= 41.74753408 * (1.0 + 1e-6)
 
 
@@ -250,7 +250,7 @@ def test_a_pole_that_crosses_the_axis_between_frequencies_of_the_grid_is_not_mis
         return (-1j * w / np.polyval(polynomial, 1j * w))[:, None, None]
 
     rates = np.abs(np.roots(polynomial))
-    bound = singular_value.largest_bound(response, np.zeros((1, 1)), rates, np.array([1]))
+    bound = worst.largest_bound(response, np.zeros((1, 1)), rates, np.array([1]))
     assert bound >= 1.0
 
 

@@ -22,7 +22,6 @@ import fflin
 from fflin.robot.robot import ROOT
 from tests.support.browser import Watched
 from tests.support.messages import any_wording
-from tests.support.motions import beside, swung
 from tests.support.patience import STALL, finishing, wait_until
 
 
@@ -276,30 +275,6 @@ def test_nothing_is_left_when_its_process_is_killed(ending):
         socket.create_connection(("127.0.0.1", port), 1.0).close()
     with pytest.raises(ProcessLookupError):  # nobody of its session is left
         os.killpg(process.pid, 0)
-
-
-@pytest.mark.browser
-def test_the_page_shows_the_ghost_of_what_is_followed(robots, browser):
-    robot = robots["planar_detumble"]
-    traj = swung(robot, 2.0).trajectory()
-    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj))
-    run = fflin.simulate(robot, schedule, q0=beside(robot, traj, 0.05)[0], v0=traj.v[0])
-    with (
-        fflin.visualize(robot, open=False, speed=1e3) as live,
-        Watched(browser, live.url) as watched,
-    ):
-        with pytest.raises(fflin.InputError, match="trajectory"):
-            live.follow(lambda t, q, v: None)
-        watched.wait("fflin.state !== null")
-        live.follow(schedule)(run.t[40], run.q[40])
-        watched.wait("fflin.state.ghost !== undefined")
-        state = fflin.StateMap(robot, frame="local")
-        for node, q in (("robot", run.q[40]), ("target", state.to_pinocchio(run.target[40])[0])):
-            data = robot.model.createData()
-            pin.forwardKinematics(robot.model, data, q)
-            for name, at in zip(list(robot.model.names)[ROOT:], data.oMi[ROOT:], strict=True):
-                pose = pin.XYZQUATToSE3(np.array(watched.pose(["meshcat", node, name])))
-                np.testing.assert_allclose(pose.homogeneous, at.homogeneous, atol=1e-6)
 
 
 @pytest.mark.browser

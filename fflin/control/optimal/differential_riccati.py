@@ -114,57 +114,34 @@ def _units(A: Array, S: Array, Q: Array) -> Array:
     return unit
 
 
-# Part i of 2^level equal parts of the interval after knot k: (k, level, i).
-_Part = tuple[int, int, int]
+class _Interval(NamedTuple):
+    """Interval between two times, with its passages and the coefficients at both ends."""
+
+    start: float
+    end: float
+    whole: Passage
+    early: Passage  # through the first half
+    late: Passage
+    at_start: Coefficients
+    at_end: Coefficients
 
 
-class _Mesh:
-    """Passages and coefficients of parts of the intervals between knots, from last to first."""
-
-    def __init__(self, at: Callable[[Array], Coefficients], knots: Array) -> None:
-        self._at, self._knots = at, knots.tolist()
-        self._passages = dict[_Part, Passage]()
-        self._coefficients = dict[float, Coefficients]()
-
-    def time(self, k: int, level: int, i: int) -> float:
-        """Return the start of a part."""
-        a, b = self._knots[k : k + 2]
-        return b if i == 2**level else a + (b - a) * (i / 2**level)
-
-    def passage(self, k: int, level: int, i: int) -> Passage:
-        """Return the passage of a part; those of the parts before it are computed as well."""
-        part = k, level, i
-        if part not in self._passages:
-            parts = [(k, level, j) for j in range(i, max(i - _BATCH, -1), -1)]
-            while k and len(parts) < _BATCH:
-                k -= 1
-                parts += [(k, level, j) for j in range(2**level - 1, -1, -1)]
-            self._compute(parts[:_BATCH])
-        return self._passages[part]
-
-    def coefficients(self, t: float) -> Coefficients:
-        """Return the coefficients at a time."""
-        if t not in self._coefficients:
-            self._coefficients[t] = Coefficients(*(x[0] for x in self._at(np.array([t]))))
-        return self._coefficients[t]
-
-    def _compute(self, parts: list[_Part]) -> None:
-        for known in (self._passages, self._coefficients):
-            if len(known) > 16 * _BATCH:
-                known.clear()
-        start = np.array([self.time(*part) for part in parts])
-        h = np.array([self.time(k, level, i + 1) for k, level, i in parts]) - start
-        new = [t for t in start.tolist() if t not in self._coefficients]
-        nodes = [start + c * h for c in GAUSS]
-        found = self._at(np.concatenate((*nodes, new)))
-        count = len(parts)
-        early, late = (
-            Coefficients(*(x[s] for x in found)) for s in (slice(count), slice(count, 2 * count))
-        )
-        rows = zip(*(x[2 * count :] for x in found), strict=True)
-        self._coefficients |= {t: Coefficients(*row) for t, row in zip(new, rows, strict=True)}
-        rows = zip(*passage(early, late, h), strict=True)
-        self._passages |= {part: Passage(*row) for part, row in zip(parts, rows, strict=True)}
+def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Interval]:
+    """Return the intervals between knots (k + 1,)."""
+    a, b, count = knots[:-1], knots[1:], len(knots) - 1
+    middle = 0.5 * (a + b)
+    start = np.concatenate((a, a, middle))
+    h = np.concatenate((b, middle, b)) - start
+    found = at(np.concatenate((start + GAUSS[0] * h, start + GAUSS[1] * h, knots)))
+    early, late, ends = zip(*(np.split(x, (3 * count, 6 * count)) for x in found), strict=True)
+    mapped = passage(Coefficients(*early), Coefficients(*late), h)
+    through = [Passage(*x) for x in zip(*mapped, strict=True)]
+    of_knots = [Coefficients(*x) for x in zip(*ends, strict=True)]
+    passages = zip(through[:count], through[count : 2 * count], through[2 * count :], strict=True)
+    return [
+        _Interval(float(knots[k]), float(knots[k + 1]), *three, of_knots[k], of_knots[k + 1])
+        for k, three in enumerate(passages)
+    ]
 
 
 def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
@@ -172,38 +149,30 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
 
     `at` returns the coefficients (k, nx, nx) at times (k,).
     """
-    mesh, level = _Mesh(at, knots), 0
     times, values = [float(knots[-1])], [P]
-    for k in range(len(knots) - 2, -1, -1):
-        # The parts left to do, the latest last.
-        pending = [(level, i) for i in range(2**level)]
-        errors = dict[int, float]()
+    for last in range(len(knots) - 1, 0, -_BATCH):
+        # The intervals left to do, the latest last.
+        pending = _intervals(at, knots[max(last - _BATCH, 0) : last + 1])
         while pending:
-            level, i = pending.pop()
-            start, end, P = mesh.time(k, level, i), times[-1], values[-1]
+            interval, P = pending.pop(), values[-1]
+            start, end, middle = *interval[:2], 0.5 * (interval.start + interval.end)
             error = math.inf
             # Over a long step, the mixed coefficients can be indefinite; shorter steps follow.
             with suppress(np.linalg.LinAlgError):
-                single = mesh.passage(k, level, i).back(P)
-                half = mesh.passage(k, level + 1, 2 * i + 1).back(P)
-                double = mesh.passage(k, level + 1, 2 * i).back(half)
+                single, half = interval.whole.back(P), interval.late.back(P)
+                double = interval.early.back(half)
                 # The cubic with these values and derivatives, midway.
-                bend = mesh.coefficients(start).rate(double) - mesh.coefficients(end).rate(P)
+                bend = interval.at_start.rate(double) - interval.at_end.rate(P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
                 # Halves are more accurate by sixteen times, of which four are kept in reserve.
                 error = 0.25 * max(_apart(double, single), _apart(half, between))
             if error <= _ACCURACY:
-                times += [mesh.time(k, level + 1, 2 * i + 1), start]
+                times += [middle, start]
                 values += [half, double]
-                errors[level] = max(error, errors.get(level, 0.0))
-            elif len(times) > _KNOTS_LIMIT or level > 40:
+            elif len(times) > _KNOTS_LIMIT or not start < middle < end:
                 raise np.linalg.LinAlgError("P changes too fast")
             else:
-                pending += [(level + 1, 2 * i), (level + 1, 2 * i + 1)]
-        # The interval before it begins with parts as long as the longest of this one.
-        level = min(errors)
-        if level and errors[level] < _ACCURACY / 64.0:
-            level -= 1
+                pending += _intervals(at, np.array((start, middle, end)))
     return np.array(times[::-1]), np.array(values[::-1])
 
 

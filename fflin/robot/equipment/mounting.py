@@ -165,13 +165,15 @@ def mounted_wheels(
         spinning = pin.Inertia(0.0, np.zeros(3), float(wheel.inertia) * np.outer(axis, axis))
         rest = difference(bodies[joint], spinning)
         moments = np.linalg.eigvalsh(rest.inertia).tolist()
-        if is_impossible(rest.mass, moments):
+        about = float(axis @ bodies[joint].inertia @ axis)
+        # Nothing but rounding is left where a wheel's own link carries it.
+        if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
             of = "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
-            about = float(axis @ bodies[joint].inertia @ axis)
+            lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
             raise InputError(
-                f"wheel '{name}' of {wheel.inertia:g} kg m^2 has a larger inertia than the link "
-                f"that carries it: {of} has {about:.3g} kg m^2 about its axis; the URDF's inertia "
-                "must include the wheels, so correct the URDF or the wheel"
+                f"wheel '{name}' of {wheel.inertia:g} kg m^2 does not have less inertia than the "
+                f"link that carries it: {of} has {about:.3g} kg m^2 about its axis; the URDF's "
+                f"inertia must include the wheels, so correct the URDF or the wheel{lock}"
             )
         bodies[joint] = rest
         placement = pin.SE3(turned_to(axis), np.zeros(3))

@@ -3,7 +3,6 @@
 import math
 import sys
 from collections.abc import Callable
-from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple, TypeVar
 
 from fflin.base.errors import unknown
@@ -222,7 +221,6 @@ def read_description(root: Element) -> Urdf:
         raise root.error("<robot> has no <link>; add one")
     joints = _by_name(read_joint, root.find_all("joint"))
     _check_tree(root, links, joints)
-    _drop_world(links, joints)
     return Urdf(root.attributes.get("name", "").strip(), links, joints)
 
 
@@ -279,37 +277,21 @@ def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointEl
             f"the links form {len(roots)} separate trees, with roots {enumerated(roots)}; connect "
             "them by joints"
         )
-    depths = dict.fromkeys(roots, 1)
-    try:
-        for name in TopologicalSorter(
-            {x.child: [x.parent] for x in joints.values()}
-        ).static_order():
-            if name in above:
-                depths[name] = depths[above[name].parent] + 1
-    except CycleError as error:
-        loop = [above[name] for name in error.args[1][:0:-1]]
+    children: dict[str, list[str]] = {}
+    for joint in joints.values():
+        children.setdefault(joint.parent, []).append(joint.child)
+    depth, level, reached = 0, roots, set[str]()
+    while level:
+        depth += 1
+        reached.update(level)
+        level = [child for name in level for child in children.get(name, ())]
+    if loop := [joint for name, joint in above.items() if name not in reached]:
         raise loop[0].element.error(
             f"{named('joint', [joint.name for joint in loop])} form a closed loop without a root; "
             "correct a parent or child in it"
-        ) from None
-    deepest = max(depths, key=depths.__getitem__)
-    if depths[deepest] > _DEPTH_LIMIT:
-        raise root.error(
-            f"link {quoted(deepest)} is {depths[deepest]} links deep in the tree, expected at most "
-            f"{_DEPTH_LIMIT}; merge links that are fixed to each other"
         )
-
-
-def _drop_world(links: dict[str, Link], joints: dict[str, JointElement]) -> None:
-    """Drop a root that stands for the world: without mass and inertia, its one joint floating."""
-    children = {joint.child for joint in joints.values()}
-    root = next(link for name, link in links.items() if name not in children)
-    hanging = [joint for joint in joints.values() if joint.parent == root.name]
-    if len(hanging) != 1 or hanging[0].type != "floating" or root.mass or any(root.inertia):
-        return
-    first = hanging[0]
-    first.element.note(
-        f"floating joint {quoted(first.name)} and its massless link {quoted(root.name)} are left "
-        f"out: the base, link {quoted(first.child)}, is free-floating without them"
-    )
-    del links[root.name], joints[first.name]
+    if depth > _DEPTH_LIMIT:
+        raise root.error(
+            f"the tree is {depth} links deep, expected at most {_DEPTH_LIMIT}; merge links that "
+            "are fixed to each other"
+        )

@@ -57,7 +57,6 @@ class Description(NamedTuple):
     sha256: str  # of the file as it was read, without files that a xacro includes
     mimics: dict[str, Mimic]  # of the joints that follow another, with independent leaders
     damping: dict[str, float]  # {joint: value} where not zero [N m s/rad | N s/m]
-    meshes: tuple[str, ...]  # mesh files as it names them; they are not read
     links: dict[str, Link]  # those that weigh something
     joints: tuple[str, ...]  # all, as they stand in it
     notes: tuple[str, ...]  # warnings, one line each
@@ -86,13 +85,11 @@ def describe(document: bytes, path: Path) -> Description:
     notes += inertia_notes(urdf.links.values(), model, path.stem)
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
     damping = {joint.name: joint.damping for joint in moving if joint.damping}
-    meshes = [e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh"]
     return Description(
         model,
         hashlib.sha256(document).hexdigest(),
         mimics,
         damping,
-        meshes=tuple(dict.fromkeys(meshes)),
         links={name: link for name, link in urdf.links.items() if link.mass},
         joints=tuple(urdf.joints),
         notes=tuple(notes),

@@ -76,7 +76,6 @@ function makeLive({ viewer, camera, turn }, info) {
   const apply = (state) => {
     state.poses.forEach((pose, k) => place(nodes[k], pose));
     // What is followed is drawn when it is first asked for.
-    (state.ghost || []).forEach((pose, k) => place(viewer.scene_tree.find([info.bodies[k][0], "target", info.bodies[k][2]]).object, pose));
     state.joints.forEach((x, k) => sliders[k](x));
     if (state.coupling) showHeat(state.coupling);
     document.querySelector("header p").textContent = state.time === null ? info.subtitle : `t = ${state.time.toFixed(2)} s`;

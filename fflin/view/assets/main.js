@@ -32,11 +32,9 @@ function legendOf(info) {
       { label: kind === "wheel" ? "wheels" : "thrusters", colour, paths: info[`${kind}s`].map(({ path }, k) => [...path, `${kind} ${k}`]) })),
     ...info.arrows.map(({ kind, colour }) => entry(`${kind} on the base`, colour, "wrench", kind)),
   ];
-  entries.push(...(info.cloud ?? []).map(({ name, label, colour }) => entry(label, colour, "cloud", name)));
   const rest = info.rest === null ? "" : `, at rest from ${Number(info.rest.toPrecision(4))} s`;
   const dashed = info.followed.length > 0;
   if (info.target) entries.push({ ...entry(dashed ? `reference${rest}` : "target", GHOST, "target"), dashed });
-  info.tubes.forEach(({ name, colour }) => entries.push(entry(`funnel of the ${name}`, colour, "funnel", name)));
   entries.push(...info.held.map((name) => entry(name, HELD, "held", name)));
   if (info.linear) entries.push(entry("linear model", "#ff7fc8", "linear"));
   // In the panel thrusters are named in their plot; a strip of pictures has none.
@@ -97,8 +95,7 @@ function main() {
   }
 
   info.t = floats(info.t);
-  for (const each of [...info.trails, ...info.followed, ...(info.cloud ?? [])]) each.points = floats(each.points);
-  for (const each of info.tubes) for (const key of ["centres", "axes"]) each[key] = floats(each[key]);
+  for (const each of [...info.trails, ...info.followed]) each.points = floats(each.points);
   for (const each of [...info.arrows, ...info.plumes, ...info.readouts]) each.values = floats(each.values);
   for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference"]) line[key] = floats(line[key]);
   paint(info.plots);

@@ -71,26 +71,6 @@ function trail({ name, points, colour, radius, dashed }) {
   return group;
 }
 
-// Thin lines along many paths, whose points follow one another.
-function cloud({ name, points, counts, colour }) {
-  const pairs = [];
-  let first = 0;
-  for (const count of counts) {
-    for (let k = first; k + 1 < first + count; k++) pairs.push(k, k + 1);
-    first += count;
-  }
-  const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(points, 3));
-  geometry.setIndex(pairs);
-  const material = new THREE.LineBasicMaterial({
-    color: new THREE.Color(colour).convertSRGBToLinear(), toneMapped: false,
-    transparent: true, opacity: 0.3, depthWrite: false, depthTest: name !== "base", // inside the body
-  });
-  const lines = new THREE.LineSegments(geometry, material);
-  lines.renderOrder = name === "base" ? 4 : 0;
-  return lines;
-}
-
 function forceArrow({ colour, values, most, longest, size }) {
   const group = arrow(colour, 0.010 * size, seenThrough(colour));
   group.show = (i) => {
@@ -172,42 +152,6 @@ function plume({ position, direction, values, most, size, colour }) {
   return group;
 }
 
-// All ellipsoids of a path as one translucent body: first its depth, then the surface that is seen.
-function tube({ name, colour, centres, axes }) {
-  const group = new THREE.Group(), count = centres.length / 3;
-  const at = (k) => new THREE.Matrix4().set(
-    ...[0, 1, 2].flatMap((row) => [0, 3, 6].map((c) => axes[9 * k + c + row]).concat(centres[3 * k + row])), 0, 0, 0, 1);
-  for (const seen of [false, true]) {
-    const material = new THREE.ShaderMaterial({
-      transparent: true, colorWrite: seen, depthWrite: !seen, depthFunc: seen ? THREE.EqualDepth : THREE.LessEqualDepth,
-      uniforms: { tint: { value: new THREE.Color(colour) } },
-      vertexShader: `
-        varying vec3 n; varying vec3 eye;
-        void main() {
-          mat3 M = mat3(instanceMatrix);
-          vec3 squares = vec3(dot(M[0], M[0]), dot(M[1], M[1]), dot(M[2], M[2]));
-          vec4 p = modelViewMatrix * (instanceMatrix * vec4(position, 1.0));
-          n = normalMatrix * (M * (normal / squares)); eye = -p.xyz;
-          gl_Position = projectionMatrix * p;
-        }`,
-      fragmentShader: `
-        varying vec3 n; varying vec3 eye; uniform vec3 tint;
-        void main() {
-          float rim = 1.0 - abs(dot(normalize(n), normalize(eye)));
-          gl_FragColor = vec4(mix(tint, vec3(1.0), 0.15 + 0.25 * rim), 0.14 + 0.56 * rim * rim);
-        }`,
-    });
-    const bodies = new THREE.InstancedMesh(new THREE.SphereGeometry(1, 28, 18), material, count);
-    for (let k = 0; k < count; k++) bodies.setMatrixAt(k, at(k));
-    bodies.frustumCulled = false;
-    const inside = name === "base"; // the body
-    bodies.renderOrder = 10 + 2 * inside + seen; // after all that is seen through it
-    if (inside && !seen) bodies.onBeforeRender = (renderer) => { renderer.state.buffers.depth.setMask(true); renderer.clearDepth(); };
-    group.add(bodies);
-  }
-  return group;
-}
-
 // Put all marks into the scene. Returns what shows frame i of them.
 function makeMarks(viewer, info) {
   const shows = [];
@@ -217,8 +161,6 @@ function makeMarks(viewer, info) {
   };
   info.trails.forEach((each) => add(["meshcat", "trails", each.name], trail(each)));
   info.followed.forEach((each, k) => add(["meshcat", "target", `path ${k}`], trail({ ...each, colour: GHOST, dashed: true })));
-  (info.cloud ?? []).forEach((each) => add(["meshcat", "cloud", each.name], cloud(each)));
-  info.tubes.forEach((each) => add(["meshcat", "funnel", each.name], tube(each)));
   const wrench = viewer.scene_tree.find(["meshcat", "wrench"]).object;
   const base = viewer.scene_tree.find(info.base).object;
   for (const each of info.arrows) {

@@ -117,14 +117,6 @@ def test_without_a_limit_there_is_none(kind):
     assert model.effortLimit[6] > 1e300 and model.velocityLimit[6] > 1e300
 
 
-def test_a_massless_root_with_one_floating_joint_is_the_world():
-    ends = (joint("free", "world", "a", "floating", '<origin xyz="1 0 0"/>'), joint("j", "a", "b"))
-    found = read(robot(link("world", ""), link("a"), link("b"), *ends))
-    assert list(found.model.names) == ["universe", "root_joint", "j"]
-    np.testing.assert_array_equal(found.model.inertias[1].lever, 0.0)
-    assert not found.model.existFrame("world")
-
-
 def test_half_a_limit_is_kept():
     model = read(arm(inside=AXIS + '<limit lower="-2" upper="3" effort="4"/>')).model
     assert (model.lowerPositionLimit[7], model.upperPositionLimit[7]) == (-2.0, 3.0)
