@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinError, listed
+from fflin.base.errors import FflinError
 from fflin.base.validation import Array
 from fflin.base.writing import shown
 from fflin.robot.catalog import find_mesh
@@ -126,7 +126,8 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
     if unreadable:
         notes.append(f"{robot.name}: {named('mesh file', unreadable)} cannot be read and not drawn")
     if odd:
-        notes.append(f"{path.name}: <visual> in line {listed(odd)} is malformed and not drawn")
+        lines = ", ".join(odd[:6]) + ", ..." * (len(odd) > 6)
+        notes.append(f"{path.name}: <visual> in line {lines} is malformed and not drawn")
 
 
 def _document(path: Path) -> Element:
