@@ -8,7 +8,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
@@ -108,18 +107,11 @@ def _tree(robot: Robot) -> Tree | None:
         target.append(row[coordinate[body]])
         share.append(factor[body])
     size = 6 + robot.n
-    common = _common(paths)
+    # Coordinates that the paths of any two have in common.
+    common = np.array([[len({*one} & {*other}) for other in paths] for one in paths])
     entries = int(sum(map(len, paths)))
-    sizes = (
-        bodies * PLACE,
-        bodies * INERTIA,
-        bodies * INERTIA,
-        entries,
-        entries,
-        size,
-        size * size,
-    )
-    starts = [int(x) for x in np.cumsum([0, *sizes])]
+    parts = bodies * PLACE, bodies * INERTIA, bodies * INERTIA
+    sizes = *parts, entries, entries, size, size * size
     return Tree(
         parent,
         fixed.ravel(),
@@ -139,7 +131,7 @@ def _tree(robot: Robot) -> Tree | None:
         np.array([index for path in paths for index in path]),
         common,
         entries,
-        *starts,
+        *np.cumsum([0, *sizes]).tolist(),
     )
 
 
@@ -208,17 +200,6 @@ def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
     return paths
 
 
-def _common(paths: list[list[int]]) -> NDArray[np.intp]:
-    """Return how many coordinates the paths of any two have in common."""
-    common = np.zeros((len(paths), len(paths)), dtype=np.intp)
-    for index, path in enumerate(paths):
-        if len(path) > 1:
-            # No path of an earlier coordinate has this one in it.
-            common[index, :index] = common[:index, index] = common[path[-2], :index]
-        common[index, index] = len(path)
-    return common
-
-
 def work_space(size: int) -> Array:
     """Return an array (size, LANES) with nothing in it yet."""
     space = np.empty((size + 1) * LANES)
@@ -255,8 +236,6 @@ def loads_of(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
 def layout_of(tree: Tree, carried: int) -> Layout:
     """Return the work space for a tree with so many inputs that are carried."""
     size, bodies = len(tree.row), len(tree.parent)
-    sizes = (
-        *(bodies * MOTION, bodies * LOAD, size, size, size * carried),
-        *(size * 2 * size, size * 6),
-    )
-    return Layout(*(tree.size + int(x) for x in np.cumsum([0, *sizes])))
+    bodily = bodies * MOTION, bodies * LOAD
+    sizes = *bodily, size, size, size * carried, size * 2 * size, size * 6
+    return Layout(*(tree.size + np.cumsum([0, *sizes])).tolist())

@@ -173,20 +173,20 @@ def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law |
 def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan, Plant]:
     """Return the checked plan of `simulate` with these options, and the robot that moves."""
     policy = followed(policy, robot)
-    times = times_of(
-        policy,
-        options.duration,
-        options.dt,
-        options.every,
-        options.sample,
-        options.delay,
-    )
+    times = times_of(policy, options)
     policy = followed(policy, robot, held=times.sample * times.dt)
     lin, _ = feedback_of(policy)
     follows = reference_of(policy)
     state = _state_of(robot, policy, options.frame, options.reference)
     plant = Plant(state, options.disturbance)
     foresees = predictor(plant, policy, options.linear)
+    method = integrator(options.method)
+    if times.fastest * times.dt > method.reach:
+        raise InputError(
+            f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
+            f"{times.fastest:.4g} 1/s; take at most {method.reach / times.fastest:.2g} s, or "
+            "give `sample`"
+        )
     q, v = start_of(state, options.x0, options.q0, options.v0, follows)
     if plant.field:
         plant.field.require_near(q)
@@ -209,7 +209,7 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
         limits=within,
         wheels=[robot.joint(name).idx_v for name in within.wheel_names],
         known=known,
-        method=_integrator_of(options.method, times),
+        method=method,
         project=truth("project", options.project) and robot.orbit is None,
         turning=_turning(robot),
         chart=None if lin is None else state,
@@ -271,18 +271,6 @@ def _initial_inputs(policy: Any, plant: Plant, limits: Saturation) -> Array:
     names, units = actuation.names, actuation.units
     warn_beyond(robot.name, where, names, units, inputs, limits.low, limits.high)
     return initial
-
-
-def _integrator_of(method: str, times: Times) -> type[Integrator]:
-    """Return a method, or raise `InputError` if the loop needs smaller steps than it has."""
-    integrates = integrator(method)
-    if times.fastest * times.dt > integrates.reach:
-        raise InputError(
-            f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
-            f"{times.fastest:.4g} 1/s; take at most {integrates.reach / times.fastest:.2g} s, or "
-            "give `sample`"
-        )
-    return integrates
 
 
 def _checked_functions(events: Sequence[Event], callback: Callback | None) -> tuple[Event, ...]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 _OF_JOINTS = ("q_m", "qdot_m")
-_MOST_IN_A_PANEL = 6
+_MOST_IN_A_PANEL, _ACROSS = 6, 3
 _PALE: dict[str, Any] = {"lw": 3.6, "alpha": 0.3}  # of a reference, below what follows it
 _DASHED: dict[str, Any] = {"ls": "--", "lw": 1.0}  # of a prediction, on top
 _GROUPS = {
@@ -111,19 +111,16 @@ def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None
     """Draw a motion, see `plot_motion`."""
     states, panels = _selected(motion, show)
     what, errors = _errors(motion)
-    across = 3 if len(states) > 4 else 4
-    heights = [3.0, 1.2][: 1 + bool(errors)] * math.ceil(len(states) / across) or [0.01]
-    # With the drift, in as few rows of up to four as there can be.
-    rows = math.ceil((len(panels) + 1) / 4)
-    with drawing(path, 11.0, 0.3 + 3.0 * rows + 0.9 * sum(heights)) as figure:
-        above, below = figure.add_gridspec(2, 1, height_ratios=[sum(heights), 3.0 * rows])
-        spaces = {"hspace": 0.06, "wspace": 0.06}
-        grid = above.subgridspec(len(heights), across, height_ratios=heights, **spaces)
-        spots = below.subgridspec(rows, math.ceil((len(panels) + 1) / rows), **spaces)
+    per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of states and of their errors below
+    heights = per_row * math.ceil(len(states) / _ACROSS)
+    above = len(heights)
+    heights += [3.0] * math.ceil((len(panels) + 1) / _ACROSS)  # with the drift
+    with drawing(path, 11.0, 0.3 + sum(heights)) as figure:
+        grid = figure.add_gridspec(len(heights), _ACROSS, height_ratios=heights, hspace=0.06)
         joints: dict[str, Line2D] = {}
         for place, (group, found) in enumerate(states.items()):
-            row, column = divmod(place, across)
-            axes = figure.add_subplot(grid[row * (1 + bool(errors)), column])
+            row, column = divmod(place, _ACROSS)
+            axes = figure.add_subplot(grid[row * len(per_row), column])
             _draw(axes, motion.t, found, _GROUPS[group])
             if place == 0 and motion.tracked:
                 axes.plot([], [], color="#888888", **_PALE, label="reference")
@@ -137,12 +134,13 @@ def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None
                 strip.ticklabel_format(axis="y", scilimits=(-2, 3))
                 axes.tick_params(labelbottom=False)
                 axes.set_xlabel("")
+        spots = [grid[above + k // _ACROSS, k % _ACROSS] for k in range(len(panels) + 1)]
         _draw_panels(figure, spots, motion.t, panels, joints if "q_m" in states else None)
         rest = None if motion.phases else resting_from(motion)
         marks = [*motion.starts[1:].tolist(), *([] if rest is None else [rest])]
         for axes, mark in product(figure.axes, marks):
             axes.axvline(mark, lw=0.8, ls=":", color="#555555", label="_rest")
-        _drifts(figure.add_subplot(spots[len(panels)]), motion)
+        _drifts(figure.add_subplot(spots[-1]), motion)
         for axes in figure.axes:
             axes.margins(x=0.0)
         figure.suptitle(_title(motion), fontsize=11)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -47,14 +47,14 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
     dt, channel = times.dt, plan.channel()
     reference = MomentumReference(conserved, plan.method, dt, q, v)
     advance = _advance(plan, plant, conserved, reference, channel)
-    t_of = np.empty(times.rows)
-    rows = tuple(np.empty((times.rows, size)) for size in (len(q), len(v), len(plan.initial), 6, 3))
+    rows = tuple(
+        np.empty((times.rows, size)) for size in (1, len(q), len(v), len(plan.initial), 6, 3)
+    )
     count = 0
 
     def record(t: float, u: Array) -> None:
         nonlocal count
-        t_of[count] = t
-        values = q, v, u, reference.momentum, reference.center(t)
+        values: tuple[Any, ...] = t, q, v, u, reference.momentum, reference.center(t)
         for row, value in zip(rows, values, strict=True):
             row[count] = value
         count += 1
@@ -85,8 +85,8 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
         bar.close()
     if not stopped.startswith(("diverged", "interrupted")):
         record(t, u)
-    q_of, v_of, u_of, momentum, center = (row[:count] for row in rows)
-    return Recording(t_of[:count], q_of, v_of, u_of, momentum, center, step + 1, stopped, "python")
+    t_of, q_of, v_of, u_of, momentum, center = (row[:count] for row in rows)
+    return Recording(t_of[:, 0], q_of, v_of, u_of, momentum, center, step + 1, stopped, "python")
 
 
 def _advance(
@@ -145,7 +145,19 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
     def ending(t: float, q: Array, v: Array) -> str:
         place, rates = q.tolist(), v.tolist()
         if goes_on(stop, origin, place, rates):
-            return _event(plan, t, q, v)
+            for event in plan.events:
+                value = event(t, q.copy(), v.copy())
+                try:
+                    margin = float(value)
+                except (TypeError, ValueError):
+                    margin = math.nan
+                if math.isnan(margin):
+                    raise InputError(
+                        f"an event returned {value!r} at t = {t:g} s, expected a number"
+                    )
+                if margin <= 0.0:
+                    return f"{getattr(event, '__name__', 'event')} at t = {t:g} s"
+            return ""
         if goes_on(anywhere, origin, place, rates):
             return f"left the chart at t = {t:g} s: the base rotated by 180 deg from the reference"
         dt, turn = plan.times.dt, float(np.abs(v[plan.turning]).max()) * plan.times.dt
@@ -154,21 +166,6 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
         return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}; give a smaller dt"
 
     return ending
-
-
-def _event(plan: Plan, t: float, q: Array, v: Array) -> str:
-    """Name the first event that is no longer positive."""
-    for event in plan.events:
-        value = event(t, q.copy(), v.copy())
-        try:
-            margin = float(value)
-        except (TypeError, ValueError):
-            margin = math.nan
-        if math.isnan(margin):
-            raise InputError(f"an event returned {value!r} at t = {t:g} s, expected a number")
-        if margin <= 0.0:
-            return f"{getattr(event, '__name__', 'event')} at t = {t:g} s"
-    return ""
 
 
 def stop_of(message: str) -> int:

@@ -1,8 +1,10 @@
 """Step, sample time, delay, recorded rows and duration of a simulation."""
 
+from __future__ import annotations
+
 import math
 import warnings
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +16,9 @@ from fflin.control.tracking import TrajectoryFeedback, largest_rate, tracking_of
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from fflin.simulation.plan import SimulationOptions
 
 # Of a run whose duration is not given [s], and between looks at the linear loop.
 SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
@@ -61,17 +66,14 @@ class Times(NamedTuple):
 
     def require_room(self, width: int, *, chosen: bool) -> None:
         """Refuse too many rows or steps; warn of many steps that were `chosen` automatically."""
-        forced = chosen and self.fastest * _STEP > 1.0
         most = _ENDLESS if self.thinned else _MOST_STEPS
         if self.rows * width > _MOST_ENTRIES or self.steps > most:
-            asked = f" (required by the loop's fastest pole at {self.fastest:.3g} 1/s)"
             raise InputError(
-                f"{self.steps * self.dt:g} s in steps of {self.dt:g} s"
-                f"{asked if forced else ''} are "
-                f"{self.steps:.3g} steps and {self.rows:.3g} rows, which is too many; use a larger "
-                "dt or `every`"
+                f"{self.steps * self.dt:g} s in steps of {self.dt:g} s are {self.steps:.3g} steps "
+                f"and {self.rows:.3g} rows, which is too many; use a larger dt or `every`, or a "
+                "slower gain if a fast pole of the loop requires this step"
             )
-        if forced and self.steps > _MANY_STEPS:
+        if chosen and self.fastest * _STEP > 1.0 and self.steps > _MANY_STEPS:
             warnings.warn(
                 f"the simulation takes long: the loop's fastest pole at {self.fastest:.3g} 1/s "
                 f"requires {self.steps:,} steps of {self.dt:.3g} s; give dt=, sample= or a slower "
@@ -81,15 +83,9 @@ class Times(NamedTuple):
             )
 
 
-def times_of(
-    policy: Any,
-    duration: float | None,
-    dt: float | None,
-    every: int | None,
-    sample: float | None,
-    delay: float,
-) -> Times:
-    """Return the times of a simulation from arguments of `simulate`."""
+def times_of(policy: Any, options: SimulationOptions) -> Times:
+    """Return the times of a simulation of a policy."""
+    duration, dt, every, sample = options.duration, options.dt, options.every, options.sample
     follows = tracking_of(policy)
     if sample is not None:
         sample = _positive("sample", sample)
@@ -101,7 +97,7 @@ def times_of(
     if duration is None and follows is None:
         raise InputError("the duration is missing; give duration= in s")
     duration = _positive("duration", follows.duration if follows and duration is None else duration)
-    delay = number("delay", delay)
+    delay = number("delay", options.delay)
     if not 0.0 <= delay < duration:
         raise InputError(
             f"delay is {delay:g} s, expected at least 0 and less than the duration of "
@@ -127,19 +123,12 @@ def times_of(
         dt = duration / steps
     if sample is None:
         sample = dt if delay else 0.0
-    samples, late = _whole(dt, sample=sample, delay=delay)
+    samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
     thinned = every is None and steps > _MANY_ROWS
-    if every is None:
-        every = _thinning(steps, samples) if thinned else 1
+    if every is None:  # rows of a sampled loop fall on its samples
+        part = max(samples, 1)
+        every = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
     return Times(dt, steps, every, samples, late, fastest, thinned)
-
-
-def _thinning(steps: int, sample: int) -> int:
-    """Return the steps from row to row, for rows that are few and fall on samples, if there are."""
-    least = -(-steps // _FEW_ROWS)
-    if least >= sample:
-        return max(sample, 1) * -(-least // max(sample, 1))
-    return next(part for part in range(least, sample + 1) if sample % part == 0)
 
 
 def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> float:
@@ -152,15 +141,14 @@ def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> float:
     return float(np.abs(np.linalg.eigvals(closed[0])).max())
 
 
-def _whole(dt: float, **times: float) -> list[int]:
-    """Return named times [s] in steps."""
-    for name, time in times.items():
-        if abs(round(time / dt) * dt - time) > 1e-6 * dt:
-            raise InputError(
-                f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
-                "choose dt accordingly"
-            )
-    return [round(time / dt) for time in times.values()]
+def _in_steps(name: str, time: float, dt: float) -> int:
+    """Return a time [s] in steps."""
+    if abs(round(time / dt) * dt - time) > 1e-6 * dt:
+        raise InputError(
+            f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
+            "choose dt accordingly"
+        )
+    return round(time / dt)
 
 
 def _part_of(sample: float, largest: float, *times: float) -> float:

@@ -126,7 +126,7 @@ CASES = {
     "[[input]]\ntype = base_force": ":2: column 8",
     "[[input]]\ntype = 'base_force": ":2: TOML",
     "[[input]]\ntype = 'a'\ntype = 'b'": ":3: TOML",
-    b"[[input]]\n\ntype = '\xe9'": ":3: UTF-8",
+    b"[[input]]\n\ntype = '\xe9'": ":3: utf-8",
     "[[input]]": ":1: 'type'",
     "[[input]]\nTYPE = 'thruster'": ":1: 'type'",
     "[[input]]\n\ntype = 'truster'": ":3: 'truster'",
