@@ -63,7 +63,7 @@ def add_commands(commands: parser.Commands) -> None:
     )
     options.add_point(held)
     what = "q, u, the deflections and the poles"
-    options.add_output_file(held.group(parser.OUTPUT), what, parser.RECORD)
+    options.add_output_file(held.group(parser.OUTPUT), what, parser.RECORD, "Equilibrium")
     _add_sensitivity(commands)
     _add_uncertain(commands)
 
@@ -95,7 +95,7 @@ def _add_sensitivity(commands: parser.Commands) -> None:
         metavar="NAME",
     )
     what = "dA, dB, df0 for each parameter"
-    options.add_output_file(sensitivity.group(parser.OUTPUT), what, parser.RECORD)
+    options.add_output_file(sensitivity.group(parser.OUTPUT), what, parser.RECORD, "Sensitivity")
 
 
 def _add_uncertain(commands: parser.Commands) -> None:
@@ -127,7 +127,7 @@ def _add_uncertain(commands: parser.Commands) -> None:
         required=True,
     )
     what = "A, B1 .. D22 and the blocks"
-    options.add_output_file(uncertain.group(parser.OUTPUT), what, parser.RECORD)
+    options.add_output_file(uncertain.group(parser.OUTPUT), what, parser.RECORD, "LFT")
 
 
 def _range(text: str) -> tuple[str, Any]:

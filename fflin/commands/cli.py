@@ -14,7 +14,7 @@ from fflin.base import __version__
 from fflin.base.errors import FflinError, FflinWarning
 from fflin.base.writing import check_ending, check_output_path, files_of_command
 from fflin.commands import BAD_INPUT, DONE, parser
-from fflin.commands.results import finish
+from fflin.commands.results import finish, require_own_kind
 
 # The commands by task, in the order of the help, each with its module.
 TASKS = {
@@ -109,3 +109,4 @@ def check_outputs(arguments: argparse.Namespace) -> None:
             from fflin.base.figures import require_matplotlib
 
             require_matplotlib()
+    require_own_kind(arguments)

@@ -79,7 +79,9 @@ def _add_linearize(commands: parser.Commands) -> None:
     )
     add_trajectory(linearize)
     what = "A, B, C, D (with .csv one file per matrix: NAME.A.csv, ...)"
-    options.add_output_file(made, what, parser.TABLE)
+    options.add_output_file(
+        made, what, parser.TABLE, "LinearModel", "LinearTrajectory", "ToolModel"
+    )
     options.add_figure(linearize, "the magnitudes of the entries of A and B")
 
 

@@ -252,9 +252,9 @@ def add_system(command: Command) -> None:
 
 
 def add_output_file(
-    group: Group, what: str, endings: OutputFile, *, required: bool = False
+    group: Group, what: str, endings: OutputFile, *kinds: str, required: bool = False
 ) -> None:
-    """Add -o FILE."""
+    """Add -o FILE, and --force if `kinds` of results are given; see `require_own_kind`."""
     group.add_argument(
         "-o",
         "--output-file",
@@ -263,6 +263,13 @@ def add_output_file(
         required=required,
         help=f"save {what} to FILE: {endings}",
     )
+    if kinds:
+        group.switch(
+            "--force",
+            "let -o replace a file of any content; by default -o replaces only results of the same "
+            "kind",
+        )
+        group.set_defaults(kinds=kinds)
 
 
 def add_figure(command: Command, what: str) -> None:

@@ -89,7 +89,7 @@ def _add_funnel(commands: parser.Commands) -> None:
     runs.add("--threads", "number of threads; by default one per core", int)
     options.add_step(runs)
     options.add_figure(funnel, "the funnel")
-    options.add_output_file(shown, "the funnel", parser.RECORD)
+    options.add_output_file(shown, "the funnel", parser.RECORD, "Funnel")
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 

@@ -42,7 +42,7 @@ def _add_lqr(commands: parser.Commands) -> None:
     )
     options.add_point(lqr)
     add_weights(lqr)
-    options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD)
+    options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD, "Gain")
     options.add_figure(lqr, "the poles, and the loop gain of each input with its margins,")
 
 
@@ -68,7 +68,7 @@ def _add_tvlqr(commands: parser.Commands) -> None:
         parser.assignment,
         repeatable=True,
     )
-    options.add_output_file(tvlqr.group(parser.OUTPUT), "the gains", parser.RECORD)
+    options.add_output_file(tvlqr.group(parser.OUTPUT), "the gains", parser.RECORD, "GainSchedule")
 
 
 def _add_export(commands: parser.Commands) -> None:

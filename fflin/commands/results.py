@@ -11,11 +11,22 @@ from pathlib import Path
 from typing import Any
 
 from fflin.base import __version__
+from fflin.base.errors import FileError
 from fflin.base.tables import first_paragraph, headed
+from fflin.base.writing import followed_path
 from fflin.commands import DONE
 
 # Files whose size is reported.
 _PAGES = (".html", ".gif")
+
+
+# The entries by which a result is known whose file does not name its kind.
+_ENTRIES = {
+    "Sensitivity": {"urdf_sha256", "dA", "dB"},
+    "LinearModel": {"urdf_sha256", "certificate"},
+    "LinearBatch": {"header", "B_lower"},
+    "Campaign": {"header", "drawn"},
+}
 
 
 @dataclass(frozen=True)
@@ -131,3 +142,56 @@ def _fields(value: Any) -> Any:
         # The model of a result is a result of its own.
         return {key: x for key, x in own.items() if not isinstance(x, LinearModel)}
     return value._asdict() if hasattr(value, "_asdict") else value
+
+
+def require_own_kind(arguments: argparse.Namespace) -> None:
+    """Raise `FileError` if -o names a file of a kind that the command does not write."""
+    path, kinds = getattr(arguments, "output_file", None), getattr(arguments, "kinds", ())
+    if path is None or not kinds or arguments.force:
+        return
+    if path.suffix == ".csv" and "LinearModel" in kinds:
+        from fflin.linear.files import foreign_table
+
+        path = foreign_table(path) or path
+        followed_path(path)  # refuses a table that is an input file
+    if not path.is_file():
+        return
+    found = kind_of(path)
+    if found not in kinds and path.stat().st_size:
+        there = f"holds a {found}" if found else "exists and is not a result of fflin"
+        raise FileError(
+            f"{path} {there}; without --force, this command replaces only files that contain a "
+            f"{' or '.join(kinds)}. Give another file name, or add --force"
+        )
+
+
+def kind_of(path: Path) -> str:
+    """Return the name of the class of a file's result; "" if it is not known."""
+    try:
+        names, kind = _entries(path)
+    except Exception:  # each decoder has its own
+        return ""
+    return kind or next((name for name, of in _ENTRIES.items() if of <= names), "")
+
+
+def _entries(path: Path) -> tuple[set[str], str]:
+    """Return the names of a file's entries, and its kind where it has one."""
+    from fflin.base.record import decoded, text
+
+    entries: Any
+    if path.suffix == ".csv":
+        with path.open(encoding="utf-8") as file:
+            names = {*file.readline().strip().split(",")}
+        return names, "Motion" if {"t [s]", "q_b.x"} <= names else ""
+    if path.suffix == ".h5":
+        from fflin.batch.files import hdf5
+
+        with hdf5().File(path, "r") as file:
+            return {*file, *file.attrs}, ""
+    if path.suffix == ".npz":
+        import numpy as np
+
+        with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
+            return {*entries.files}, text(entries["kind"]) if "kind" in entries.files else ""
+    entries, _ = decoded(path.suffix, path.read_bytes())  # `read_file` would make it an input
+    return {*entries}, text(entries["kind"]) if "kind" in entries else ""

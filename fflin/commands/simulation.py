@@ -54,7 +54,9 @@ def _add_plan(commands: parser.Commands) -> None:
     weight = "weight on an input, a group or a pattern. The default is 1/limit^2"
     group.add("--r", weight, parser.assignment, "NAME=W", repeatable=True)
     options.add_limits(group)
-    options.add_output_file(plan.group(parser.OUTPUT), "the trajectory", parser.TABLE)
+    options.add_output_file(
+        plan.group(parser.OUTPUT), "the trajectory", parser.TABLE, "Trajectory", "Motion"
+    )
     # Options of other commands, which the start and the target read.
     plan.set_defaults(relative_equilibrium=None)
 
@@ -91,7 +93,7 @@ def _add_simulate(commands: parser.Commands) -> None:
         metavar="NAME",
         repeatable=True,
     )
-    options.add_output_file(shown, "the motion", parser.TABLE)
+    options.add_output_file(shown, "the motion", parser.TABLE, "Motion")
     add_pictures(simulate)
 
 

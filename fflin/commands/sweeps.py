@@ -81,7 +81,9 @@ def add_commands(commands: parser.Commands) -> None:
     workers = "distribute the work over N processes; at most one per core"
     work.add("--workers", workers, int)
     what = "the models (after an interruption, the same command resumes from FILE.part)"
-    options.add_output_file(sweep.group(parser.OUTPUT), what, parser.ROWS, required=True)
+    options.add_output_file(
+        sweep.group(parser.OUTPUT), what, parser.ROWS, "LinearBatch", required=True
+    )
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:

@@ -14,7 +14,7 @@ from fflin.base.validation import Array, frozen, instance, shaped, vector
 from fflin.control.channel import Law
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.coordinates import states_of, unwound
+from fflin.dynamics.coordinates import readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.allocation import nearest
@@ -115,14 +115,8 @@ class StateFeedback(Feedback):
             If the robot's states or inputs differ from the model's. Its masses may differ.
         """
         state = self.state_map(robot)
-        K, offset, near = self.terms(state)
-
-        def command(_: float, q: Array, v: Array) -> Array:
-            x = unwound(state, states_of(state, q, state.velocities(v)), near)
-            found: Array = offset - K.dot(x)
-            return found
-
-        return command
+        command = readout(state, *self.terms(state))
+        return lambda _, q, v: command(q, v)
 
 
 @dataclass(eq=False)

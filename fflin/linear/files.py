@@ -204,6 +204,14 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
     return entries, bool(mark)
 
 
+def foreign_table(path: Path) -> Path | None:
+    """Return a file in the place of a table of NAME.csv if these are not the tables of a model."""
+    info = _csv_path(path, "info")
+    own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
+    tables = [] if own else [_csv_path(path, key) for key in _TABLES]
+    return next((table for table in tables if table.is_file() and table.stat().st_size), None)
+
+
 def _csv_path(path: Path, key: str) -> Path:
     return path.with_name(f"{path.stem}.{key}.csv")
 

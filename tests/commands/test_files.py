@@ -8,6 +8,7 @@ import pytest
 from fflin.commands import cli
 from fflin.commands.parser import OutputFile, input_file, input_name
 from tests.support.commands import run
+from tests.support.messages import any_wording
 
 # Of options that every call of a command needs and that take no file.
 NEEDED = {"runs": "1", "duration": "1", "vary": "base.mass=0.1"}
@@ -83,7 +84,53 @@ def test_what_a_robot_file_names_is_kept_too(included, tmp_path, capsys, monkeyp
     os.link(included, "m.npz")
     before = (tmp_path / included).read_bytes()
     monkeypatch.setattr("fflin.linear.linearization.linearize", None)  # the work
-    command = ("linearize", "r.toml", "--inputs", "in.toml", "-o", "m.npz")
+    command = ("linearize", "r.toml", "--inputs", "in.toml", "-o", "m.npz", "--force")
     code, _, error = run(*command)
     assert code == 2 and f"is the input file {tmp_path / included}" in error
     assert (tmp_path / included).read_bytes() == before
+
+
+WRITES = {
+    "linearize": ("cubesat", ".npz .mat .json"),
+    "lqr": ("cubesat", ".npz .mat .json"),
+    "simulate": ("cubesat --duration 1", ".npz .mat .json .csv"),
+    "sweep": ("canadarm2 --random 2", ".npz .h5"),
+    "sensitivity": ("cubesat", ".npz .mat .json"),
+    "uncertain": ("cubesat --vary base.mass=0.1", ".npz .mat .json"),
+}
+
+
+@pytest.mark.parametrize("name", WRITES)
+def test_a_command_replaces_files_of_its_own_kind_alone(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options, endings = WRITES[name]
+    command = (name, *options.split(), "-o")
+    for ending in endings.split():
+        path = tmp_path / f"own{ending}"
+        for _ in range(2):
+            code, _, error = run(*command, path)
+            assert code == 0, error
+        foreign = tmp_path / f"foreign{ending}"
+        foreign.write_text("somebody's own\n")
+        with any_wording():
+            code, _, error = run(*command, foreign)
+        assert code == 2 and "is not a result of fflin" in error and "--force" in error
+        assert error.count("\n") == 1 and foreign.read_text() == "somebody's own\n"
+        assert run(*command, foreign, "--force")[0] == 0
+    if name == "linearize":
+        for _ in range(2):
+            assert run(*command, tmp_path / "own.csv")[0] == 0
+        table = tmp_path / "foreign.A.csv"
+        table.write_text("somebody's own\n")
+        with any_wording():
+            code, _, error = run(*command, tmp_path / "foreign.csv")
+        assert code == 2 and str(table) in error and table.read_text() == "somebody's own\n"
+        assert run(*command, tmp_path / "foreign.csv", "--force")[0] == 0
+    other = ("lqr", "cubesat", "-o") if name != "lqr" else ("linearize", "cubesat", "-o")
+    path = tmp_path / "other.npz"
+    assert run(*other, path)[0] == 0
+    before = path.read_bytes()
+    with any_wording():
+        code, _, error = run(*command, path)
+    assert code == 2 and f"holds a {'LinearModel' if name == 'lqr' else 'Gain'}" in error
+    assert path.read_bytes() == before
