@@ -60,12 +60,13 @@ class TomlFile:
         return kind(f"{self.path}:{self.line(*place)}: {problem}")
 
     @contextmanager
-    def located(self, *table: str | int) -> Iterator[None]:
-        """Put file and line in front of errors that name a key, or a text, of a table."""
+    def located(self, *table: str | int, of: str = "") -> Iterator[None]:
+        """Put file, line and `of` in front of errors that name a key, or a text, of a table."""
         try:
             yield
         except FflinError as error:
-            raise self.error(error, *self._named_in(str(error), *table)) from None
+            place = self._named_in(str(error), *table)
+            raise self.error(type(error)(f"{of}{error}"), *place) from None
 
     def _named_in(self, message: str, *table: str | int) -> tuple[str | int, ...]:
         """Return the place of the first key, text or pattern of a table that a message names."""

@@ -275,7 +275,7 @@ class ReactionWheel(WrenchInput):
         given = self.max_speed if self.inertia is None else self.momentum
         if given:
             raise InputError(
-                f"wheel has inertia {self.inertia}, momentum {self.momentum:g} and max_speed "
+                f"wheel momentum is {self.momentum:g}, inertia is {self.inertia} and max_speed is "
                 f"{self.max_speed}; give either an inertia, whose speed is a state, or a momentum"
             )
         if self.inertia is None:

@@ -222,8 +222,5 @@ def _built(document: TomlFile, place: tuple[str, int], build: Any, values: dict[
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in values:
             raise document.error(f"{of}the key '{name}' is missing; add this key", *place)
-    try:
+    with document.located(*place, of=of):
         return build(**values)
-    except FflinError as error:
-        with document.located(*place):
-            raise type(error)(f"{of}{error}") from None

@@ -160,7 +160,7 @@ CASES = {
     "[[input]]\ntype = 'base_force'\n[[input]]\ntype = 'joint_torque'\n"
     'joint = """\n[[input]]\nodd = 1"""  # \'\'\'\n# """\n\n odd = 1': (":10: 'odd'"),
     "\ninput = [{type = 'base_force'},\n  {type = 'odd'}]": ":2: 'odd'",
-    WHEEL + "inertia = 0\nname = 'spin'": ":1: 'spin'",
+    WHEEL + "inertia = 0\nname = 'spin'": ":4: 'spin'",
     "[[input]]\ntype = 'thruster'\nname = 'jet'": ":1: ('jet')",
 }
 

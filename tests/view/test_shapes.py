@@ -154,8 +154,9 @@ def test_meshes_are_found_where_urdfs_say(tmp_path):
     assert find_mesh("package://pkg/m.stl", elsewhere, (tmp_path / "ws",)) == mesh
     robot = fflin.load(write(tmp_path, "package://pkg/m.stl"), package_dirs=[tmp_path / "ws"])
     assert not shapes(robot)[1]
+    assert not shapes(fflin.load(robot.urdf, package_dirs=tmp_path / "ws"))[1]
     with pytest.raises(fflin.InputError, match="package_dirs"):
-        fflin.load("cubesat", package_dirs="meshes")
+        fflin.load("cubesat", package_dirs=3)
 
 
 def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
