@@ -50,6 +50,12 @@ class Progress:
         said = f"\r{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left "
         print(said, end="", file=sys.stderr, flush=True)
 
+    def say(self, text: str) -> None:
+        """Show a line instead of the bar, for work of unknown length."""
+        if self._shown and (now := time.monotonic()) >= self._next:
+            self._next, self._drawn = now + _INTERVAL, True
+            print(f"\r\x1b[2K{text}", end="", file=sys.stderr, flush=True)
+
     def close(self) -> None:
         """Take the bar away."""
         if self._drawn:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, input_keys
+from fflin.base.process import Progress
 from fflin.base.validation import Array, number, whole
 from fflin.control.channel import input_limits
 from fflin.control.optimal.plan_search import Search, cost_of_inputs, excess, limited_values
@@ -47,6 +49,7 @@ def plan(
     limits: float | str | Mapping[str, Any] | Sequence[Any] | None = "urdf",
     R: Weight | None = None,
     free: Sequence[str] = (),
+    progress: bool | None = None,
 ) -> Trajectory:
     r"""Plan a low-effort trajectory to a goal within limits, such as a slew or detumbling.
 
@@ -90,6 +93,9 @@ def plan(
     free : sequence of str
         States whose end value is free, by name, group or pattern:
         ``["r_b", "qdot_m.wheel_*"]``.
+    progress : bool, optional
+        Whether to show the iteration, the cost relative to the initial guess, and the largest
+        violation on stderr; by default on a terminal, for long runs.
 
     Returns
     -------
@@ -158,11 +164,12 @@ def plan(
     size[size == 0.0] = 1.0
     for name, point, which in (("start", start, slice(None)), ("goal", end, asked)):
         _require_within(state, bounds, name, point, which)
-    with np.errstate(all="ignore"):  # what leads nowhere may diverge, which is said
+    # What leads nowhere may diverge, which is said.
+    with np.errstate(all="ignore"), closing(Progress(progress)) as line:
         guess = shooting.guess(start, end)
         cost = cost_of_inputs(shooting, weights, guess[2])
         inputs = np.array((low, high))
-        search = Search(shooting, start, end, asked, bounds, inputs, cost, _PARTS)
+        search = Search(shooting, start, end, asked, bounds, inputs, cost, _PARTS, line.say)
         made = _least(search, guess, size)
     if made.reached:
         q, v, u = made.q, made.v, made.u

@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import record
-from fflin.base.errors import FflinError, FileError, InputError, unknown
+from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
 from fflin.base.record import Record, figure, figures, read_record, reading, text, texts
 from fflin.base.validation import as_double, frozen
 from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
@@ -270,6 +270,8 @@ def arguments(
     state = StateMap(robot, reference=reference, frame=frame)
     u = as_double("u", entries["u"])
     u = u[:, None] if u.ndim == 1 else u
+    if "input_names" in entries or u.shape[-1] != len(Actuation(state).names):
+        _require_inputs(Actuation(state).names, entries.get("input_names", []), u.shape[-1])
     for columns in Actuation(state).held:
         # In the axes of the world, which those of the reference may not be.
         u[:, columns] = u[:, columns] @ reference.rotation.T
@@ -284,6 +286,21 @@ def arguments(
         )
     q, v = map(np.array, zip(*map(state.to_pinocchio, x), strict=True))
     return found_as | {"q": q, "v": v}
+
+
+def _require_inputs(known: Sequence[str], names: Any, count: int) -> None:
+    """Raise `InputError` if the inputs of a file, named or not, are not the robot's inputs."""
+    given = texts(names)
+    if given == tuple(known):
+        return
+    missing, extra = ([n for n in a if n not in b] for a, b in ((known, given), (given, known)))
+    said = "the file has the inputs of the robot in another order"
+    if not given:
+        said = f"u has {count} columns, expected one for each input of the robot: {listed(known)}"
+    elif missing or extra:
+        parts = (("lacks the inputs", missing), ("has the other inputs", extra))
+        said = "the file " + " and ".join(f"{what} {listed(n)}" for what, n in parts if n)
+    raise InputError(f"{said}; load the robot with the inputs of the trajectory (--inputs)")
 
 
 def _digest(table: Sequence[Sequence[Any]]) -> str:

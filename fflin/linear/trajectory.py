@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinError, FflinWarning, InputError
-from fflin.base.record import Design
+from fflin.base.record import Design, record_of, write_record
 from fflin.base.tables import folded
 from fflin.base.validation import Array, as_double, frozen, number, vector
 from fflin.base.writing import as_path
@@ -251,6 +251,9 @@ class Trajectory(Design):
         target = as_path(path)
         if type(self) is Trajectory and target.suffix == ".csv":
             write_csv(target, self)
+        elif type(self) is Trajectory:
+            record = record_of(self) | {"input_names": list(Actuation(self._state).names)}
+            write_record(target, record, checksummed=self.verified)
         else:
             super().save(target)
 

@@ -367,3 +367,35 @@ def test_what_is_no_plan_is_refused(cube, wrong, said):
     robot, _ = cube
     with pytest.raises(fflin.FflinError, match=said):
         fflin.plan(robot, **{"goal": (None, None), "duration": 1.0} | wrong)
+
+
+@pytest.fixture(scope="module")
+def free_floating():
+    inputs = [fflin.JointTorque(f"joint_{i}") for i in (1, 2, 3)]
+    robot = fflin.load("planar_detumble", inputs=inputs, damping={})
+    return robot, fflin.configuration(robot, {"joint_1": 0.3})
+
+
+def test_progress_shows_iterations_cost_and_violation(cube, capsys):
+    robot, _ = cube
+    goal = turned(robot, 0.5)
+    fflin.plan(robot, (goal, None), 60.0, knots=11)
+    assert capsys.readouterr().err == ""
+    fflin.plan(robot, (goal, None), 60.0, knots=11, progress=True)
+    shown = capsys.readouterr().err
+    assert "iteration 1: cost 1 of the guess, largest violation" in shown
+    assert shown.endswith("\r\x1b[2K")
+
+
+def test_a_file_of_other_inputs_names_what_differs(free_floating, tmp_path):
+    robot, goal = free_floating
+    whole = fflin.load("planar_detumble")
+    path = tmp_path / "plan.npz"
+    fflin.plan(whole, (goal, None), 20.0, knots=4, limits=None).save(path)
+    assert fflin.Trajectory.load(path, whole).u.shape == (4, 9)
+    with pytest.raises(fflin.InputError, match=r"other inputs tau_b\.x.*F_b\.z"):
+        fflin.Trajectory.load(path, robot)
+    own = np.zeros((2, robot.nv))
+    fflin.Trajectory(robot, [0.0, 1.0], [robot.neutral()] * 2, own, np.zeros((2, 3))).save(path)
+    with pytest.raises(fflin.InputError, match=r"lacks the inputs tau_b\.x"):
+        fflin.Trajectory.load(path, whole)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -76,6 +77,7 @@ class Search(NamedTuple):
     limits: Array  # limits of inputs (2, nu)
     cost: Array  # of squared inputs (N + 1, nu)
     parts: int  # states are limited at the ends of so many equal parts of each interval
+    report: Callable[[str], None]  # is given a line of text in each iteration
 
     def best(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return q, v and u at the knots with least effort, or closest to the end.
@@ -93,7 +95,8 @@ class Search(NamedTuple):
             lost = (price * np.abs(missed)).sum() + _PRICE * outside
             return float((cost * u * u).sum() / 2.0 + lost)
 
-        for _ in range(_MOST):
+        for iteration in range(_MOST):
+            self._tell(f"iteration {iteration + 1}", trial, limited)
             step = self._step(trial, limited, near, cost * trial.u)
             if step is None:
                 return self._acting(self._flown(trial.u))
@@ -115,6 +118,12 @@ class Search(NamedTuple):
             if saved <= _SAVED * was and (limited == known).all():
                 break
         return self._acting(self._closed(trial, limited, first))
+
+    def _tell(self, what: str, trial: Trial, limited: Flags) -> None:
+        """Report the cost relative to the guess, and the largest violation."""
+        cost, inside = float((self.cost * trial.u**2).sum()), excess(trial.inside)[limited]
+        most = max(trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0)))
+        self.report(f"{what}: cost {cost:.4g} of the guess, largest violation {most:.2g}")
 
     @property
     def _size(self) -> Array:
@@ -176,6 +185,7 @@ class Search(NamedTuple):
         trial = self._trial(*trial[:3])
         for _ in range(_MOST_CLOSING):
             limited = limited | self._exceeding(trial)
+            self._tell("closing the gaps", trial, limited)
             if trial.gap <= _MEETS and trial.outside(limited) <= _ENDS:
                 one = self._flown(trial.u)
                 limited, before = limited | self._exceeding(one), last
