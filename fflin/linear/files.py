@@ -313,6 +313,11 @@ def _columns(path: Path) -> tuple[Record, bool]:
 
 def _entries(columns: Record, state: StateMap) -> Record:
     """Return the entries that the named columns of a csv are."""
+    if "t [s]" in columns:
+        raise FileError(
+            "this is the table of a motion, expected a trajectory; save motion.trajectory() "
+            "instead, or save the motion as .npz, .mat or .json"
+        )
     inputs = Actuation(state).names
     rows = {key: [name for name in columns if name.startswith(f"{key}[")] for key in "qv"}
     rows = rows if any(rows.values()) else {"x": list(state.names)}
