@@ -343,6 +343,12 @@ def _entries(columns: Record, state: StateMap) -> Record:
 
 def _numbers(name: str, cells: tuple[str, ...]) -> Array:
     try:
-        return np.array(cells, dtype=float)
+        values = np.array(cells, dtype=float)
     except ValueError as error:
         raise InputError(f"column {name}: {error}; expected numbers") from None
+    if not np.isfinite(values).all():
+        row = int(np.argmin(np.isfinite(values)))
+        raise InputError(
+            f"row {row + 2} of column {name} is '{cells[row]}', expected a finite number"
+        )
+    return values

@@ -183,8 +183,8 @@ def test_what_a_trajectory_already_says_is_refused(flown, options, said):
 
 
 def test_the_table_of_a_motion_is_no_trajectory(flown):
-    folder, _, motion = flown
-    motion.save(folder / "table.csv")
+    folder, robot, _ = flown
+    fflin.simulate(robot, duration=0.1, dt=0.05).save(folder / "table.csv")
     given = ("--trajectory", folder / "table.csv")
     assert "save motion.trajectory()" in refused("simulate", "planar_detumble", *given)
 
