@@ -58,6 +58,10 @@ class TomlFile:
             raise InputError(message) from None
         # Keys may be quoted, so that strings of one line stay.
         self._lines = _lines_of(_TEXTS.sub(lambda x: "\n" * x[0].count("\n") or x[0], text))
+        for place, value in _values(self.record):
+            # Python refuses to write longer integers, as a message would.
+            if type(value) is int and value.bit_length() > 10_000:
+                raise self.error(f"{place[-1]} has too many digits; write it as 1e30", *place)
 
     def line(self, *place: str | int) -> int:
         """Return the line number of a key, or of the table that contains it."""
