@@ -19,6 +19,14 @@ else:
 # Some 1,000 inputs.
 _SIZE_LIMIT = 2**17
 
+# The time for a dotted key grows with the square of its parts.
+_DOTS_LIMIT = 1_000
+
+# What may hold a line that looks like a key: strings of several lines. Strings of one line and
+# comments are matched too, for they may hold quotes.
+_TEXTS = re.compile(
+    r'"""(?:\\.|[^\\])*?"""+|\'\'\'.*?\'\'\'+|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
+)
 _PART = r"""(?:[\w-]+|"[^"]*"|'[^']*')"""
 _KEY = rf"({_PART}(?:\s*\.\s*{_PART})*)\s*"
 _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
@@ -38,6 +46,9 @@ class TomlFile:
         content = read_file(path, "TOML", _SIZE_LIMIT)
         try:
             text = content.decode("utf-8-sig").replace("\r\n", "\n")
+            for number, written in enumerate(text.split("\n"), start=1):
+                if written.count(".") > _DOTS_LIMIT:
+                    raise ValueError(f"more than {_DOTS_LIMIT} dots (at line {number})")
             self.record: dict[str, Any] = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
             found = re.search(r"at line (\d+)", str(error))
@@ -45,7 +56,12 @@ class TomlFile:
             line = found[1] if found else content.count(b"\n", 0, last) + 1
             message = f"{path}:{line}: invalid TOML: {error}; correct the file"
             raise InputError(message) from None
-        self._lines = _lines_of(text)
+        # Keys may be quoted, so that strings of one line stay.
+        self._lines = _lines_of(_TEXTS.sub(lambda x: "\n" * x[0].count("\n") or x[0], text))
+        for place, value in _values(self.record):
+            # Python refuses to write longer integers, as a message would.
+            if type(value) is int and value.bit_length() > 10_000:
+                raise self.error(f"{place[-1]} has too many digits; write it as 1e30", *place)
 
     def line(self, *place: str | int) -> int:
         """Return the line number of a key, or of the table that contains it."""

@@ -184,6 +184,8 @@ class MemoryStore:
     def __init__(self, count: int, chunk: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
         self.count, self.chunk = count, chunk
         try:
+            if 8 * count * sum(map(math.prod, shapes.values())) > _memory():
+                raise MemoryError
             self.arrays = {key: np.empty((count, *shape)) for key, shape in shapes.items()}
         except (MemoryError, ValueError):
             raise InputError(
@@ -334,6 +336,14 @@ def _reserve(path: Path, size: int) -> None:
     except BaseException:
         path.unlink(missing_ok=True)
         raise
+
+
+def _memory() -> float:
+    """Return the size of the machine's memory [bytes], infinite if it is not known."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):  # not on this system
+        return math.inf
 
 
 def require_room(path: Path, size: int) -> None:

@@ -159,7 +159,10 @@ def failure(
         )
     else:
         batch = made(kept)
-        message += "; the results of the other chunks are in the attribute `batch` of this error"
+        message += (
+            "; the results of the other chunks are in the attribute `batch` of this error. With "
+            "out='NAME.h5' (-o NAME.h5), the same call resumes"
+        )
     return SweepError(message, tuple((*span, reason) for span, _, reason in failed), batch)
 
 

@@ -173,7 +173,7 @@ def monte_carlo(
     UnknownNameError
         If a name is unknown.
     SweepError
-        If a run fails or a worker dies repeatedly; the message names the chunk.
+        If a run fails or a worker dies; the message names the chunk.
     FileError
         If the file cannot be written, or exists already and belongs to another call.
     MissingPackageError
@@ -234,10 +234,11 @@ def monte_carlo(
                 break
             done = min(runs, math.ceil(_GROWTH * done / _STAGE) * _STAGE)
         if failed:
-            rows: Any = store.read(runs)
             raise failure(
                 *(failed, store, "runs"),
-                lambda kept: Campaign.of({k: x[kept] for k, x in rows.items()}, header, job),
+                lambda kept: Campaign.of(
+                    {key: rows[kept] for key, rows in store.read(runs).items()}, header, job
+                ),
             )
         if isinstance(store, MemoryStore):
             campaign = Campaign.of(store.read(done), header, job)

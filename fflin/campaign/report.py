@@ -18,11 +18,11 @@ def campaign_report(campaign: Any) -> str:
     by = ", compiled" if campaign.engine == "compiled" else ""
     few = f" of {campaign.asked:,} requested" if count < campaign.asked else ""
     title = f"{campaign.robot}: {count:,} runs{few}, {campaign.duration:g} s each"
-    rows = [["error", "unit", "median", "95 %", "99 %", "worst 95 %", "settle 95 % [s]"]]
+    rows = [["error", "unit", "median", "95 %", "99 %", "worst 95 %", "settle 95 %"]]
     for name, unit in KINDS.items():
         figures = [quantile(name, p).value for p in _SHARES]
         figures.append(quantile(f"worst {name}", 0.95).value)
-        when = _when(quantile(f"settle {name}", 0.95).value)
+        when = _when(quantile(f"settle {name}", 0.95).value, " s")
         rows.append([name, unit, *(f"{x:.3g}" for x in figures), when])
     causes: dict[str, list[str]] = {}
     for name, found in influences(campaign).items():
@@ -85,9 +85,9 @@ def worst_runs(campaign: Any, k: int) -> list[str]:
     return ["", grid(rows, "rrlrll"), ""]
 
 
-def _when(time: float) -> str:
+def _when(time: float, unit: str = "") -> str:
     """Show a settling time as the report of a motion does."""
-    return f"{time:.3g}" if math.isfinite(time) else "not yet"
+    return f"{time:.3g}{unit}" if math.isfinite(time) else "not yet"
 
 
 def campaign_record(campaign: Any, worst: int) -> dict[str, Any]:

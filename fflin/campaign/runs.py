@@ -192,7 +192,8 @@ class CampaignJob:
             run = _recorded(plan, plant, plan.times.every)
         else:
             run = recorded(self.plan, self.plant, self._in_lanes(drawn[None]))
-        return motion_of(plan, plant, conserved_by(plant.robot, plan.q, plant.field), run)
+        motion = motion_of(plan, plant, conserved_by(plant.robot, plan.q, plant.field), run)
+        return replace(motion, _nominal=self.plant.robot.urdf_sha256)
 
 
 def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:

@@ -102,8 +102,8 @@ def add_loop(command: parser.Command) -> None:
 def _add_controllers(group: parser.Group) -> None:
     group.add(
         "--schedule",
-        "follow the trajectory with gains saved by `fflin tvlqr`. By default, gains are designed "
-        "along --trajectory",
+        "use gains saved by `fflin tvlqr`, and follow the trajectory that FILE contains, without "
+        "--trajectory",
         Path,
     )
     group.add(
@@ -272,7 +272,7 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
         models = models_along(arguments, design)
         policy = TrajectoryFeedback(models, schedule_of(models, arguments))
     else:
-        why = "--schedule contains its trajectory, its weights and its sample time"
+        why = "the file of --schedule contains the trajectory, weights and sample time"
         refuse(arguments, ("trajectory", "hold", *_WEIGHTS), why)
         schedule = GainSchedule.load(arguments.schedule)
         policy = TrajectoryFeedback(schedule.trajectory(design), schedule)

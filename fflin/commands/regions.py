@@ -74,7 +74,8 @@ def _add_funnel(commands: parser.Commands) -> None:
     runs, shown = funnel.group("runs"), funnel.group(parser.OUTPUT)
     funnel.group(parser.CONTROLLER).add(
         "--schedule",
-        "use gains saved by `fflin tvlqr`. By default, gains are designed along the trajectory",
+        "use gains saved by `fflin tvlqr`, and the trajectory that FILE contains, without "
+        "--trajectory",
         Path,
     )
     goal = f"largest error allowed at the end: {_ERRORS}"

@@ -201,7 +201,7 @@ def _add_montecarlo(commands: parser.Commands) -> None:
     )
     shown.add("--worst", "list the K worst runs", parser.whole, "K", default=3)
     options.add_figure(montecarlo, "quantile bands over time, histograms and the worst runs")
-    what = "the runs (after an interruption, the same command resumes from FILE.part)"
+    what = "the runs (with .h5, the same command resumes after an interruption)"
     force = "replace the file of -o even if the file contains another campaign"
     options.add_output_file(shown, what, parser.ROWS)
     shown.switch("--force", force)

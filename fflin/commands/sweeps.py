@@ -80,7 +80,7 @@ def add_commands(commands: parser.Commands) -> None:
     )
     workers = "distribute the work over N processes; at most one per core"
     work.add("--workers", workers, int)
-    what = "the models (after an interruption, the same command resumes from FILE.part)"
+    what = "the models (with .h5, the same command resumes after an interruption)"
     options.add_output_file(
         sweep.group(parser.OUTPUT), what, parser.ROWS, "LinearBatch", required=True
     )

@@ -91,11 +91,13 @@ def _pulses(
     most = np.where(np.isfinite(high[at]), high[at], own)
     if (short := least > most * time).any() or not time:
         name, item = thrusters[at[int(short.argmax())]]
-        raise InputError(
-            f"thruster '{name}' is pulsed and its samples last {time:g} s, expected samples that "
-            f"fit its least impulse of {item.least_impulse or 0.0:g} N s; give a longer sample=, "
-            "or a sampled policy"
+        why = (
+            f"has a least impulse of {item.least_impulse:g} N s, too large for a sample of "
+            f"{time:g} s; give a longer sample="
+            if time
+            else "is pulsed, which needs sampled commands; give sample=, or a sampled policy"
         )
+        raise InputError(f"thruster '{name}' {why}")
     return Pulses(
         at=np.array(at),
         on_off=on_off,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -284,18 +285,22 @@ def _unregulated(gain: Gain) -> str:
 
 
 def _poles(gain: Gain) -> str:
-    """Return a table of the poles, complex pairs once, the slowest first."""
+    """Return a table of the poles, complex pairs and repeated poles once, the slowest first."""
     poles = gain.poles[gain.poles.imag >= 0.0]
     rates = rates_of(poles, gain.dt)
     heads = ["pole" if gain.dt else "pole [1/s]", "frequency [rad/s]", "damping"]
-    body = [
-        [
+    rows = Counter(
+        (
             f"{poles[k].real:.5g}" + (f" +- {poles[k].imag:.5g}i" if poles[k].imag else ""),
             f"{abs(rates[k]):.4g}",
             f"{-rates[k].real / abs(rates[k]):.4g}",
-        ]
+        )
         for k in np.argsort(-rates.real)
-    ]
+    )
+    body = [list(row) for row in rows]
+    if max(rows.values()) > 1:
+        heads.append("times")
+        body = [[*row, f"{count}"] for row, count in rows.items()]
     return f"poles of A - B K, slowest first\n\n{grid(cut([heads, *body]), 'l')}"
 
 

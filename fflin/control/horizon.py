@@ -16,6 +16,9 @@ from fflin.control.policies import Clock
 # weight and regularisation of soft limits, and the smallest violation that is reported.
 _EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
 
+# Violations by the robot below this fraction of a limit's width are not reported.
+_OVER = 1e-3
+
 # DAQP's infinity, its code of a soft limit, its exit flag of a softened plan, and most iterations.
 _OPEN, _SOFT, _SOFTENED, _MOST = 1e30, 8, 2, 10_000
 
@@ -128,8 +131,9 @@ class Receding:
     def __init__(self, horizon: Horizon, at: Any = None) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
-        self.solves = self.softened = self.unfinished = 0
-        self._worst, self._said = 0.0, ""
+        self.solves = self.softened = self.unfinished = self.exceeded = 0
+        self._worst, self._said, self._over, self._met = 0.0, "", _OVER, ""
+        self._due: tuple[Stage, Array] | None = None  # the last sample and its input
         if horizon.limited:  # prepared here, so that the first sample takes no longer than others
             self._change(horizon.window(0.0))
 
@@ -139,6 +143,9 @@ class Receding:
         said = f"{self.solves} plans of {self.of.samples} samples of {self.of.dt:g} s"
         if self.softened:
             said += f"; {self.softened} plans exceed a soft limit (worst: {self._said})"
+        if self.exceeded:
+            said += f"; the robot exceeds a soft limit at {self.exceeded} samples"
+            said += f" (worst: {self._met})"
         if self.unfinished:
             said += f"; the saturated LQR command replaces {self.unfinished} plans without solution"
         return (said,) if self.solves else ()
@@ -160,6 +167,7 @@ class Receding:
             self._change(stages)
         free = self._free @ e
         self.solves += 1
+        self._judge(t, e)
         z, flag = self._solved(free)
         if flag <= 0:  # once more, without a warm start
             self._start()
@@ -179,7 +187,23 @@ class Receding:
                     2,
                 )
         d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
+        self._due = now, d
         return d
+
+    def _judge(self, t: float, e: Array) -> None:
+        """Record violations of soft limits by the robot, which differs from the linear model."""
+        first = len(self.of.acting)
+        if self._due is None or first == len(self.of.limited):
+            return
+        by, d = self._due
+        reached, low, high = ((by.E @ e + by.D @ d)[first:], by.low[first:], by.high[first:])
+        excess = np.maximum(low - reached, reached - high)
+        fractions = excess / np.where(np.isfinite(high - low), high - low, 1.0)
+        at = int(fractions.argmax())
+        self.exceeded += bool(fractions[at] > _OVER)
+        if fractions[at] > self._over:
+            self._over = float(fractions[at])
+            self._met = f"{self.of.limited[first + at]} by {excess[at]:.2g} at {t:.4g} s"
 
     def _count(self, t: float, reached: Array) -> None:
         """Record how far a plan violates the soft limits."""

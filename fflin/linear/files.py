@@ -330,6 +330,11 @@ def _columns(path: Path) -> tuple[Record, bool]:
 
 def _entries(columns: Record, state: StateMap) -> Record:
     """Return the entries that the named columns of a csv are."""
+    if "t [s]" in columns:
+        raise FileError(
+            "this is the table of a motion, expected a trajectory; save motion.trajectory() "
+            "instead, or save the motion as .npz, .mat or .json"
+        )
     inputs = Actuation(state).names
     rows = {key: [name for name in columns if name.startswith(f"{key}[")] for key in "qv"}
     rows = rows if any(rows.values()) else {"x": list(state.names)}
@@ -355,6 +360,12 @@ def _entries(columns: Record, state: StateMap) -> Record:
 
 def _numbers(name: str, cells: tuple[str, ...]) -> Array:
     try:
-        return np.array(cells, dtype=float)
+        values = np.array(cells, dtype=float)
     except ValueError as error:
         raise InputError(f"column {name}: {error}; expected numbers") from None
+    if not np.isfinite(values).all():
+        row = int(np.argmin(np.isfinite(values)))
+        raise InputError(
+            f"row {row + 2} of column {name} is '{cells[row]}', expected a finite number"
+        )
+    return values

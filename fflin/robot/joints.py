@@ -246,8 +246,8 @@ class Coordinates:
         # Tells in a microsecond that nothing at all was changed.
         if self.model != made and (change := change_in(self.model, made)):
             raise ModelError(
-                f"the {change} in the model of '{self.name}' were changed after the robot was "
-                "made; make a new robot from it with fflin.from_model(model)"
+                f"the model of '{self.name}' was changed after the robot was made: {change}; make "
+                "a new robot from it with fflin.from_model(model)"
             )
 
     def create_data(self) -> pin.Data:
@@ -269,13 +269,23 @@ def require_room(model: pin.Model, name: str) -> None:
 def change_in(model: pin.Model, made: pin.Model) -> str:
     """Name a changed part of the model on which A, B and C depend; not limits or new frames."""
     parts = {
-        "joints": lambda x: (list(x.names), list(x.parents), list(x.joints)),
-        "placements": lambda x: list(x.jointPlacements),
-        "inertias": lambda x: (list(x.inertias), x.armature.tolist()),
-        "gravity": lambda x: x.gravity.vector.tolist(),
+        "names": lambda x: x.names,
+        "parents": lambda x: x.parents,
+        "axis": lambda x: x.joints,
+        "placement": lambda x: x.jointPlacements,
+        "inertia": lambda x: x.inertias,
+        "armature": lambda x: x.armature,
+        "gravity": lambda x: x.gravity.vector,
         "frames": lambda x: list(x.frames)[: made.nframes],
     }
-    return next((name for name, of in parts.items() if of(model) != of(made)), "")
+    for what, of in parts.items():
+        now, before = (list(of(each)) for each in (model, made))
+        if now != before:
+            at = next((i for i, x in enumerate(before) if now[i : i + 1] != [x]), 0)
+            if what in ("axis", "placement", "inertia"):
+                return f"the {what} of joint '{made.names[at]}'"
+            return f"the frame '{made.frames[at].name}'" if what == "frames" else f"its {what}"
+    return ""
 
 
 def joint_of(model: pin.Model, index: int) -> Joint:

@@ -11,7 +11,8 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, ModelError
 from fflin.base.validation import instance, is_rotation
-from fflin.robot.catalog import RobotFile, find_robot, folders
+from fflin.base.writing import remember
+from fflin.robot.catalog import RobotFile, find_mesh, find_robot, folders
 from fflin.robot.fields import MERGED
 from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import LinkMass, given_body, massless_note
@@ -133,6 +134,8 @@ def _load(
     description = read_urdf(found.path)
     loaded = _robot(description.model, found.name, lock, description.mimics)
     dirs = (*package_dirs, *found.package_dirs)
+    # Meshes are read when the robot is drawn, and no output may replace them before.
+    remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in description.meshes)))
     damping = {name: description.damping.get(name, 0.0) for name in loaded.joint_names}
     # That of mimic joints counts with that of their leaders: the power is the same.
     for joint, leader, multiplier, _ in loaded.followers:

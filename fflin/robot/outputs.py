@@ -292,5 +292,5 @@ def parse_output(text: str) -> tuple[Output, ...]:
     if len(names) != len(wanted) or not all(names):
         places = ("NAME", *(name.upper() for name in wanted[1:]))
         form = ":".join((word, *places[: len(wanted)]))
-        raise InputError(f"output '{text}' names other frames than it has; write {form}")
+        raise InputError(f"output '{text}' has too few or too many names; write {form}")
     return tuple(kind(*names) for kind in kinds[word])

@@ -19,6 +19,7 @@ from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 _LIMITS = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
+_STATE = {"rpy": "[deg]", "position": "[m]", "joints": "[rad | m]", "velocity": "[rad/s | m/s]"}
 
 _LOOKS = {
     "reaction_wheel": re.compile(r"(?<![a-z])(rw|(fly|reaction_?)?wheel)(?![a-z])", re.IGNORECASE),
@@ -121,7 +122,7 @@ def _settings(robot: Robot) -> list[str]:
         "limits": {key: f"{low:g} to {high:g}" for key, (low, high) in robot.limits.items()},
         **{f"weights, {part}": value for part, value in robot.weights.items()},
         **{
-            f"{name}, {part}": value
+            f"{name}, {part} {_STATE[part]}": value
             for name in ("point", "target", "start")
             for part, value in getattr(robot, name).items()
         },

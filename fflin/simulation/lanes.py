@@ -375,7 +375,7 @@ def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> 
         once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
         _log.warning(
             "fflin: the simulation took %.0f s in Python; engine='compiled' (--engine compiled) "
-            "would take about %.1g s%s",
+            "would take about %.0f s%s",
             spent,
             _FRACTION * spent,
             once,

@@ -145,6 +145,7 @@ class Motion(Design):
     stopped: str
     com_drift: Array = field(default_factory=lambda: np.zeros(0))
     _robot: Any = field(default=None, kw_only=True)  # that was simulated; no file has it
+    _nominal: str = field(default="", kw_only=True)  # checksum of its campaign's robot; as _robot
     wheels: tuple[str, ...] = field(default_factory=tuple)
     wheel_inertias: Array = field(default_factory=lambda: np.zeros(0))
     steered: tuple[str, ...] = field(default_factory=tuple)

@@ -40,9 +40,9 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | None:
     if linear is None:
         return None
     raise InputError(
-        f"linear= is given, but this model cannot predict a motion under {type(policy).__name__}; "
-        "leave linear= out, or give the full model of a StateFeedback, an "
-        "OutputFeedback, a LinearController or no policy"
+        "linear= is given, but this model cannot predict a motion with a policy of type "
+        f"{type(policy).__name__}; leave linear= out, or give the full model of a StateFeedback, "
+        "an OutputFeedback, a LinearController or no policy"
     )
 
 

@@ -251,9 +251,8 @@ def _robot_of(robot: Robot, motion: Motion) -> Robot:
     from fflin.simulation.motion import require_motion
 
     require_motion(motion)
-    own = motion._robot
-    if own and own.name == robot.name and list(own.model.names) == list(robot.model.names):
-        robot = own
+    if motion._nominal == robot.urdf_sha256:
+        robot = motion._robot or robot
     sizes = motion.q.shape[1], motion.u.shape[1]
     expected = robot.nq, len(Actuation(StateMap(robot)).names)
     if sizes != expected or motion.urdf_sha256 != robot.urdf_sha256:

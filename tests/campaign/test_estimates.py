@@ -9,7 +9,7 @@ import fflin
 from fflin.base.process import Progress
 from fflin.campaign import runs as runs_module
 from fflin.campaign.runs import CampaignJob
-from tests.support.commands import run
+from fflin.commands import cli
 
 STEP = 1e-3  # seconds of a step of one run
 
@@ -78,10 +78,11 @@ def test_an_estimate_is_a_line_on_stderr(capsys, seconds, cores, said):
 @pytest.mark.parametrize(
     "command", ["validity cubesat --samples 2", "montecarlo cubesat u.toml --runs 2 --duration 1"]
 )
-def test_commands_print_it_before_they_begin(command, tmp_path, monkeypatch):
+def test_commands_print_it_before_they_begin(command, tmp_path, monkeypatch, capsys):
     (tmp_path / "u.toml").write_text("[dispersions]\nq_b = 0.1\n")
     monkeypatch.setattr(CampaignJob, "seconds", lambda *_: np.float64(1000.0))
     monkeypatch.setattr(runs_module, "available_cores", lambda: 1)
-    code, _, err = run(*command.split(), cwd=tmp_path)
-    assert code == 0
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(command.split()) == 0
+    err = capsys.readouterr().err
     assert err.splitlines()[0] in ("fflin: about 17 min on 1 core", "fflin: about 33 min on 1 core")

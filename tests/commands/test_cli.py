@@ -486,8 +486,8 @@ def test_info_shows_what_was_set_beside_the_urdf(tmp_path):
     lines = out.splitlines()
     assert code == 0 and not err and max(map(len, lines)) <= 80
     for line in (
-        "stiffness [N m/rad | N/m]: panel_left = 40",
-        "damping [N m s/rad | N s/m]: panel_left = 0.4",
+        "stiffness [N m/rad | N/m | 1/s^2]: panel_left = 40",
+        "damping [N m s/rad | N s/m | 1/s]: panel_left = 0.4",
         "passive joints: panel_left",
         "locked joints: panel_right=0.0",
         "outputs: pose:tool, joints",

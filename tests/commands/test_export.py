@@ -26,6 +26,6 @@ def test_a_gain_and_a_compensator_become_c_code(tmp_path):
 
 def test_other_files_are_refused(tmp_path):
     run("linearize", "cubesat", "-o", tmp_path / "model.npz")
-    assert "expected a Gain" in refused("export", tmp_path / "model.npz", "-o", tmp_path / "c")
+    assert "not a Gain" in refused("export", tmp_path / "model.npz", "-o", tmp_path / "c")
     assert "No such file" in refused("export", tmp_path / "none.npz", "-o", tmp_path / "c")
     assert not (tmp_path / "c").exists()

@@ -116,11 +116,6 @@ def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
     weights = ("--bryson", "q_b=0.02", "--bryson", "q_m=0.05", "-o", "gains.npz")
     given = ("--trajectory", folder / "flown.csv", "--frame", "world")
     assert run("tvlqr", "planar_detumble", *given, *weights, cwd=folder)[0] == 0
-    code, _, err = chain(
-        folder, *OFFSET, "--schedule", "gains.npz", "--limit", "tau_m=0.5", "-o", "b.npz"
-    )
-    assert (code, err) == (0, "")
-    np.testing.assert_array_equal(fflin.Motion.load(folder / "b.npz").x, run_.x)
     alone = ("--schedule", "gains.npz", *OFFSET, "--limit", "tau_m=0.5", "-o", "c.npz")
     assert run("simulate", "planar_detumble", *alone, cwd=folder)[0] == 0
     np.testing.assert_allclose(fflin.Motion.load(folder / "c.npz").x, run_.x, atol=1e-12)
@@ -173,8 +168,8 @@ def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
         (("--offset", "yaw=1", "--offset", "q_b.x=0.1"), "q_b"),
         (("--offset", "q_b=0.8"), "1.39"),
         (("--offset", "jaw=1"), "'jaw'"),
-        (("--schedule", "other.npz"), "--trajectory"),
-        (("--schedule", "other.npz", "--q", "q_b=1"), "--schedule"),
+        (("--schedule", "other.npz"), "remove --trajectory"),
+        (("--schedule", "other.npz", "--q", "q_b=1"), "remove --trajectory, --q"),
         (("--allocate",), "thrusters"),
     ],
 )
@@ -185,6 +180,13 @@ def test_what_a_trajectory_already_says_is_refused(flown, options, said):
         fflin.tvlqr(along).save(folder / "other.npz")
     given = ("--trajectory", folder / "flown.mat")
     assert said in refused("simulate", "planar_detumble", *given, *options, cwd=folder)
+
+
+def test_the_table_of_a_motion_is_no_trajectory(flown):
+    folder, robot, _ = flown
+    fflin.simulate(robot, duration=0.1, dt=0.05).save(folder / "table.csv")
+    given = ("--trajectory", folder / "table.csv")
+    assert "save motion.trajectory()" in refused("simulate", "planar_detumble", *given)
 
 
 def test_gains_of_another_robot_are_refused(flown):

@@ -184,6 +184,23 @@ def test_what_cannot_be_kept_is_passed_by_the_least(servicer):
     assert says(ahead.notes[0], "1 plans of 12 samples of 0.1 s", "qdot_m.joint")
 
 
+def test_what_the_robot_passes_is_said_though_no_plan_does(servicer):
+    """Far from the point the inertia is another, and rates pass their limit."""
+    robot, lin = servicer
+    rates = np.flatnonzero([name.startswith("qdot_m") for name in lin.state_names])
+    for far, passes in ((0.3, False), (1.0, True)):
+        policy = fflin.mpc(lin, dt=0.1, limits={"qdot_m": 0.1})
+        x0 = np.zeros(30)
+        x0[6:15] = far * (-1.0) ** np.arange(9)
+        motion = fflin.simulate(robot, policy, x0=x0, duration=20.0, dt=0.02)
+        sampled = np.abs(motion.x[5::5, rates])
+        over = (sampled > 0.1 + 2e-4).any(axis=1)
+        assert over.any() == passes == ("robot" in motion.notes[0])
+        if passes:
+            assert f"{over[:-1].sum()} samples" in motion.notes[0]
+            assert f" by {sampled[:-1].max() - 0.1:.2g} at " in motion.notes[0]
+
+
 def test_slews_that_break_the_regulator_are_held(servicer):
     """The base turns hard while the joints are weak: under the regulator arm and panels swing
     beyond their travels, and it has not settled after a minute; the controller turns no harder than

@@ -108,7 +108,7 @@ def test_what_has_other_names_is_refused_with_the_names(nominal):
     assert says(
         said(fflin.load("cubesat")),
         "lacks the",
-        "tau_m.joint_1, tau_m.joint_2, tau_m.joint_3, tau_m.joint_4, ...",
+        "tau_m.joint_1, tau_m.joint_2, tau_m.joint_3, tau_m.joint_4, tau_m.joint_5, tau_m.joint_6",
     )
 
 

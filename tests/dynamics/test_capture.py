@@ -180,7 +180,7 @@ def test_what_is_wrong_is_one_line():
         (lambda: fflin.capture(robot, "tool", DEBRIS, prefix="a.b"), "dots"),
         (lambda: fflin.capture(robot, "tool", DEBRIS, payload_v=[1.0]), "payload_v"),
         (lambda: fflin.capture(robot, "tool", DEBRIS, placement=3), "placement"),
-        (lambda: fflin.capture(robot, "tool", pin.Inertia.Zero()), "inertia"),
+        (lambda: fflin.capture(robot, "tool", pin.Inertia.Zero()), "mass of 'payload' is 0 kg"),
         (lambda: fflin.capture(robot, "tool", other.replace(gravity=(0, 0, -9.8))), "gravity"),
     ]
     for call, said in cases:

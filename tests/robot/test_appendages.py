@@ -360,10 +360,10 @@ def test_what_the_link_cannot_have_is_refused():
     robot = hub_with_rod(1.0, 0.1, 1.0, 1.0)
     heavy = fflin.FlexibleAppendage("root_joint", [1.0, 2.0], [[0, 0], [0, 0], [0.5, 1.5]],
                                     np.zeros((3, 2)), name="array")  # fmt: skip
-    with pytest.raises(InputError, match="'array' has more participation"):
+    with pytest.raises(InputError, match="'array_mode_2' has more participation"):
         robot.replace(appendages=[heavy])
     liquid = fflin.Slosh("root_joint", 2.5, (0, 0, 0), frequency=0.1)
-    with pytest.raises(InputError, match="'root_joint_slosh' has more"):
+    with pytest.raises(InputError, match="'root_joint_slosh_x'"):
         robot.replace(appendages=[liquid])
     light = fflin.FlexibleAppendage("nowhere", 1.0, np.zeros((3, 1)), np.zeros((3, 1)))
     with pytest.raises(fflin.UnknownNameError, match="nowhere"):
@@ -409,7 +409,7 @@ def test_slosh_and_modes_must_leave_mass_to_a_body():
 @pytest.mark.parametrize("size", [1e160, 1e200, 1e300])
 def test_huge_participation_is_refused_by_the_mode(size):
     huge = fflin.FlexibleAppendage("root_joint", 1.0, [[size], [0.0], [0.0]], np.zeros((3, 1)))
-    with np.errstate(over="ignore"), pytest.raises(InputError, match="'root_joint' has more"):
+    with np.errstate(over="ignore"), pytest.raises(InputError, match="'root_joint_mode_1'"):
         hub_with_rod(9.0, 1.0, 1.0, 1.0).replace(appendages=[huge])
 
 

@@ -174,6 +174,13 @@ def test_results_of_the_one_are_not_taken_for_the_others(tmp_path):
     motion = fflin.simulate(robot, duration=0.05)
     with pytest.raises(fflin.InputError, match="robot"):
         fflin.visualize(other, motion, html=tmp_path / "a.html", open=False)
+    # Runs of a campaign are drawn with their own bodies.
+    drawn = {"base.density": (0.1, 0.2)}
+    policy = lambda t, q, v: np.zeros(9)  # noqa: E731
+    made = fflin.monte_carlo(robot, policy, drawn, runs=1, duration=0.02, dt=0.01)
+    fflin.visualize(robot, made.replay(0), html=tmp_path / "b.html", open=False)
+    with pytest.raises(fflin.InputError, match="another robot"):
+        fflin.visualize(other, made.replay(0), html=tmp_path / "c.html", open=False)
 
 
 @pytest.mark.parametrize(

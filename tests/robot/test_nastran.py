@@ -88,6 +88,12 @@ def test_superelement_is_reduced_to_its_rigid_interface(files):
     assert found * signs == pytest.approx(expected, rel=1e-6, abs=1e-6)
     about = shifted(shifted(rigid_mass, center).T, center)
     assert array.inertia == pytest.approx(about, rel=1e-6, abs=1e-6 * about.max())
+    text = str(array)
+    assert "array_mode_5" in text and "clamped at frame 'base'" in text
+    rows = {line.split()[0]: line.split() for line in text.splitlines() if line}
+    residual = (array.inertia - found @ found.T).diagonal()
+    assert [float(x) for x in rows["residual"][1:]] == pytest.approx(residual, rel=1e-3, abs=1e-9)
+    assert max(map(len, text.splitlines())) <= 80
 
 
 def test_units_origin_and_number_of_modes_are_as_told(files):

@@ -300,6 +300,12 @@ refuse(
 )
 refuse("nested 200 deep", robot(link("base"), "<x>" * 200 + "</x>" * 200), "nested")
 refuse("nested 100,000 deep", "<robot>" + "<x>" * 100_000, "nested")
+refuse("a million elements", robot("<x/>" * 1_000_000), "elements")
+refuse(
+    "a million attributes",
+    robot(link("a", "<x " + " ".join(f'a{k}=""' for k in range(1_000_000)) + "/>")),
+    "longer",
+)
 accept("name of a megabyte cut short", robot(link("x" * 100_000)))
 accept("byte order mark", "\ufeff".encode() + arm().encode())
 accept("CRLF", arm().replace("\n", "\r\n").encode())
@@ -411,6 +417,7 @@ refuse("Link in capitals", robot(link("base"), link("arm").replace("link", "Link
 refuse("Joint in capitals", arm().replace("joint", "Joint"), "<Joint>")
 refuse("a chain of 10,000 links", chain(10_000, "fixed"), "10000", "1000")
 refuse("1,000 joints", chain(999, "continuous"), "998 joints", "GiB")
+refuse("20,000 links", robot(*(link(f"l{k}", "") for k in range(20_000))), "20000 links")
 refuse("317 joints", chain(318, "continuous"), "317 joints", "GiB")
 accept("a chain of 900 links", chain(900, "fixed"))
 refuse(

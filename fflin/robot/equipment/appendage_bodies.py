@@ -151,15 +151,14 @@ def _require_inertia(body: pin.Inertia, of: str, found: Sequence[_Modes]) -> Non
     """Raise `InputError` if M_rr - L L^T of a body has a negative eigenvalue."""
     L = np.hstack([item.L for item in found])
     rows = np.array([body.mass]), body.lever[None], body.inertia[None]
-    least = float(_least_eigenvalue(*rows, L)[0])
-    if least >= -_NEGATIVE:
-        return
-    titles = ", ".join(f"'{item.appendage.title}'" for item in found)
-    raise InputError(
-        f"{titles} has more participation than {of} with {body.mass:.4g} kg can have: M_rr - L L^T "
-        f"has the eigenvalue {least:.2g}, relative to the largest eigenvalue of M_rr; the URDF's "
-        "inertia must include the appendage as if it were rigid"
-    )
+    for k, mode in enumerate((name for item in found for name in item.appendage.modes), start=1):
+        least = float(_least_eigenvalue(*rows, L[:, :k])[0])
+        if not least >= -_NEGATIVE:
+            raise InputError(
+                f"mode '{mode}' has more participation than {of} with {body.mass:.4g} kg can have: "
+                f"M_rr - L L^T has the eigenvalue {least:.2g}, relative to the largest eigenvalue "
+                "of M_rr; the URDF's inertia must include the appendage as if it were rigid"
+            )
 
 
 def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> Array:

@@ -230,6 +230,26 @@ class FlexibleAppendage(Appendage):
         values = {"stiffness": omega**2, "damping": 2.0 * self.damping * omega}
         return {key: dict(zip(self.modes, x.tolist(), strict=True)) for key, x in values.items()}
 
+    def __str__(self) -> str:
+        from fflin.base.tables import grid
+
+        squares = self.participation.T**2
+        rows = [["mode", "f [Hz]", "damping", "m_x", "m_y", "m_z", "I_x", "I_y", "I_z"]]
+        for mode, f, ratio, sizes in zip(
+            self.modes, self.frequency, self.damping, squares, strict=True
+        ):
+            rows.append([mode, f"{f:.5g}", f"{ratio:.3g}", *(f"{x:.3g}" for x in sizes)])
+        sums, head = squares.sum(axis=0), f"{self.title}: clamped at frame '{self.frame}'"
+        totals = {"all modes": sums}
+        if self.inertia is not None:
+            rigid, body = self.inertia.diagonal(), rigid_inertia(self.inertia)
+            totals |= {"rigid": rigid, "residual": rigid - sums}
+            at = ", ".join(f"{x:.4g}" for x in body.lever)
+            head += f"\n{body.mass:.5g} kg, centre of mass ({at}) m in the frame"
+        rows += [[name, "", "", *(f"{x:.4g}" for x in of)] for name, of in totals.items()]
+        about = "effective masses m [kg] and moments of inertia I [kg m^2] about the frame"
+        return f"{head}\n{about}\n\n{grid(rows, 'l')}"
+
 
 @dataclass(frozen=True, eq=False)
 class Slosh(Appendage):

@@ -27,6 +27,9 @@ _SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
 # urdfdom and Pinocchio's parser recurse along the tree, about 2.5 kB of stack for each link.
 _DEPTH_LIMIT = 1_000
 
+# Robots have some 100 links; far more would take time and memory without bound.
+_LINK_LIMIT = 10_000
+
 
 class Mimic(NamedTuple):
     """A joint that moves with another: value = multiplier * leader's value + offset."""
@@ -211,6 +214,7 @@ class Urdf(NamedTuple):
     name: str  # empty where the file gives none
     links: dict[str, Link]  # by name, in the order of the file
     joints: dict[str, JointElement]
+    depth: int  # number of links on the longest path from the root
 
 
 def read_description(root: Element) -> Urdf:
@@ -219,9 +223,14 @@ def read_description(root: Element) -> Urdf:
     links = _by_name(read_link, root.find_all("link"))
     if not links:
         raise root.error("<robot> has no <link>; add one")
+    if len(links) > _LINK_LIMIT:
+        raise root.error(
+            f"<robot> has {len(links)} links, expected at most {_LINK_LIMIT}; merge links that are "
+            "fixed to each other"
+        )
     joints = _by_name(read_joint, root.find_all("joint"))
-    _check_tree(root, links, joints)
-    return Urdf(root.attributes.get("name", "").strip(), links, joints)
+    depth = _check_tree(root, links, joints)
+    return Urdf(root.attributes.get("name", "").strip(), links, joints, depth)
 
 
 def _check_root(root: Element) -> None:
@@ -253,8 +262,8 @@ def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[s
     return parts
 
 
-def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointElement]) -> None:
-    """Check that the joints connect the links into one tree."""
+def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointElement]) -> int:
+    """Check that the joints connect the links into one tree; return its depth in links."""
     above: dict[str, JointElement] = {}
     for joint in joints.values():
         of = f"joint {quoted(joint.name)}"
@@ -295,3 +304,4 @@ def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointEl
             f"the tree is {depth} links deep, expected at most {_DEPTH_LIMIT}; merge links that "
             "are fixed to each other"
         )
+    return depth

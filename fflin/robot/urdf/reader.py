@@ -2,7 +2,8 @@
 
 import hashlib
 import sys
-from collections.abc import Collection, Iterator, Mapping
+import threading
+from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +26,10 @@ from fflin.robot.urdf.links import INERTIA, Link, Pose, inertia_notes
 from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
 _SIZE_LIMIT = 64 * 2**20
+
+# Up to this depth the recursion of the parsers fits the smallest stack of a thread in use, 512 kB.
+_SHALLOW = 100
+_STACK = 16 * 2**20
 
 # What the values of attributes cannot hold as it is.
 _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
@@ -57,6 +62,7 @@ class Description(NamedTuple):
     sha256: str  # of the file as it was read, without files that a xacro includes
     mimics: dict[str, Mimic]  # of the joints that follow another, with independent leaders
     damping: dict[str, float]  # {joint: value} where not zero [N m s/rad | N s/m]
+    meshes: tuple[str, ...]  # mesh files as it names them; they are not read
     links: dict[str, Link]  # those that weigh something
     joints: tuple[str, ...]  # all, as they stand in it
     notes: tuple[str, ...]  # warnings, one line each
@@ -90,6 +96,7 @@ def describe(document: bytes, path: Path) -> Description:
         hashlib.sha256(document).hexdigest(),
         mimics,
         damping,
+        tuple({e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh"}),
         links={name: link for name, link in urdf.links.items() if link.mass},
         joints=tuple(urdf.joints),
         notes=tuple(notes),
@@ -128,7 +135,10 @@ def _build(urdf: Urdf, path: Path, counted: Collection[str]) -> pin.Model:
         root_joint += "_"
     document = write_urdf(urdf, counted)
     try:
-        model = pin.buildModelFromXML(document, pin.JointModelFreeFlyer(), root_joint)
+        model = _with_stack(
+            urdf.depth,
+            lambda: pin.buildModelFromXML(document, pin.JointModelFreeFlyer(), root_joint),
+        )
     except (ValueError, RuntimeError) as error:
         raise UrdfError(
             f"{path}: Pinocchio cannot build the model: {' '.join(str(error).split())[:300]}"
@@ -143,6 +153,21 @@ def _build(urdf: Urdf, path: Path, counted: Collection[str]) -> pin.Model:
     # The name of a file need not be text.
     model.name = urdf.name or path.stem.encode(errors="backslashreplace").decode()
     return model
+
+
+def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
+    """Call a function that recurses along the tree, with a large enough stack."""
+    if depth <= _SHALLOW:
+        return call()
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(1) as other:
+        usual = threading.stack_size(_STACK)
+        try:
+            built = other.submit(call)
+        finally:
+            threading.stack_size(usual)
+        return built.result()
 
 
 def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:

@@ -15,6 +15,10 @@ from fflin.base.errors import UrdfError, listed
 # URDFs nest some 10 elements; deeper ones would exceed the recursion limit.
 _DEPTH_LIMIT = 100
 
+# URDFs hold some 10,000 elements; millions would fill the memory.
+_ELEMENT_LIMIT = 500_000
+_TAG_LIMIT = 2**20  # bytes
+
 # No physical value is larger, and products of two such numbers do not overflow.
 _LARGEST = 1e30
 
@@ -166,13 +170,18 @@ def notes_of(root: Element) -> list[str]:
 def parse(document: bytes, origin: str) -> Element:
     """Return the root of a document in the encoding that it declares, without entities."""
     top = Element("", {}, 0, origin)
-    opened, parser = [top], expat.ParserCreate()
+    opened, count, parser = [top], 0, expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         element = Element(tag, attributes, parser.CurrentLineNumber, origin, [], top.notes)
         if len(opened) > _DEPTH_LIMIT:
             raise element.error(
                 f"elements are nested more than {_DEPTH_LIMIT} deep; check for a missing end tag"
+            )
+        nonlocal count
+        if (count := count + 1) > _ELEMENT_LIMIT:
+            raise element.error(
+                f"the file has more than {_ELEMENT_LIMIT} elements; reduce it to the robot"
             )
         opened[-1].children.append(element)
         opened.append(element)
@@ -188,7 +197,14 @@ def parse(document: bytes, origin: str) -> Element:
     parser.EndElementHandler = lambda _: opened.pop()
     parser.StartDoctypeDeclHandler = refuse_document_type
     try:
-        parser.Parse(document, True)
+        for begin in range(0, len(document), _TAG_LIMIT):
+            parser.Parse(document[begin : begin + _TAG_LIMIT], False)
+            if begin - parser.CurrentByteIndex > _TAG_LIMIT:
+                raise UrdfError(
+                    f"{origin}:{parser.CurrentLineNumber}: a tag or comment is longer than "
+                    f"{_TAG_LIMIT} bytes; shorten it"
+                )
+        parser.Parse(b"", True)
     except expat.ExpatError as error:
         raise UrdfError(
             f"{origin}:{error.lineno}: not well-formed XML: {expat.errors.messages[error.code]} at "

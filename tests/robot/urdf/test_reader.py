@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import threading
 import warnings
 from pathlib import Path
 
@@ -327,6 +328,14 @@ def test_xacro_includes_from_its_own_folder(tmp_path):
 def test_lines_of_elements():
     root = parse(b"<robot>\n\n<a\n b='1'/>\n<c><d/></c></robot>", "f")
     assert [(e.tag, e.line) for e in root.iterate()] == [("a", 3), ("c", 5), ("d", 5)]
+
+
+def test_the_stack_size_of_threads_is_left_as_it_was():
+    before = threading.stack_size()
+    links = [link(f"l{k}") for k in range(200)]
+    joints = [joint(f"j{k}", f"l{k}", f"l{k + 1}", "fixed") for k in range(199)]
+    assert read(robot(*links, *joints)).model.inertias[1].mass == 200.0
+    assert threading.stack_size() == before
 
 
 def test_wrong_and_infinite_limits_are_none():

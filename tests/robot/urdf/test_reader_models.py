@@ -1,6 +1,7 @@
 """The reader gives the model that Pinocchio builds from the same file, where it builds one."""
 
 import re
+import sys
 import warnings
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from example_robot_data.robots_loader import getModelPath
 import fflin
 from fflin.base.errors import FflinError
 from fflin.robot.urdf.reader import read_urdf
+from tests.support.patience import finished
 
 BUNDLED = Path(__file__).parents[3] / "robots"
 EXAMPLES = Path(getModelPath("talos_data/robots/talos_reduced.urdf")).resolve()
@@ -77,6 +79,32 @@ def test_refused_with_a_reason(name):
     path = next(p for p in FILES if p.name == name)
     with pytest.raises(fflin.UrdfError, match=rf"{name}:\d+: .*{re.escape(REFUSED[name])}"):
         read_urdf(path)
+
+
+CHAIN = """
+import sys, threading
+from pathlib import Path
+from fflin.robot.urdf.reader import describe
+link = '<link name="l{0}"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" \
+iyz="0" izz="1"/></inertial></link>'
+joint = '<joint name="j{0}" type="fixed"><parent link="l{0}"/><child link="l{1}"/></joint>'
+text = "".join(link.format(i) for i in range(1000))
+text += "".join(joint.format(i, i + 1) for i in range(999))
+def run():
+    robot = describe(f"<robot>{text}</robot>".encode(), Path("chain.urdf"))
+    print(robot.model.inertias[1].mass)
+threading.stack_size(512 * 1024)
+thread = threading.Thread(target=run)
+thread.start()
+thread.join()
+"""
+
+
+@pytest.mark.process
+def test_deep_chain_in_a_thread_of_small_stack():
+    # Pinocchio itself overruns such a stack between 200 and 400 links.
+    result = finished([sys.executable, "-c", CHAIN], capture_output=True, text=True)
+    assert (result.stdout.strip(), result.stderr) == ("1000.0", "")
 
 
 def test_every_named_robot_loads_or_says_why():
