@@ -52,7 +52,7 @@ ERRORS = [
         "180 deg",
     ),
     ("fflin.equilibrium(falling, robot.neutral()); fflin.lqr(fflin.linearize(falling))", "v_b.z"),
-    ("fflin.lqr(fflin.linearize(arm))", "joint_2, joint_3"),
+    ("fflin.lqr(fflin.linearize(arm))", "momentum of joint_2"),
     (
         "fflin.kalman(fflin.linearize(robot.replace(outputs=[fflin.Momentum()])), 1e-3, 1e-4)",
         "q_b.x",
