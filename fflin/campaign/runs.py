@@ -292,6 +292,5 @@ def completed(
         all_needed=True,
     )
     if failed:
-        died = "a worker process died: " if executor else ""
-        raise FflinError(f"{died}{failed[0].reason}")
+        raise FflinError(failed[0].reason)
     return dict(store.arrays)

@@ -241,7 +241,7 @@ def test_ctrl_c_keeps_what_is_done(robots, monkeypatch):
         if next(count) == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(lanes.Progress, "update", update)
+    monkeypatch.setattr(lanes.Progress, "__call__", update)
     motion = fflin.simulate(robots["cubesat"], duration=500.0, dt=0.01, engine="compiled")
     assert motion.stopped == f"interrupted at t = {motion.t[-1] + 0.01:g} s"
     assert 4 * 16 <= len(motion.t) < 1e6
