@@ -188,9 +188,9 @@ class Campaign(FrozenArrays):
     def about(self) -> str:
         """Default figure of `worst` and `sensitivity`.
 
-        The default is the figure in the first comparison ``<`` or ``<=`` of the goals. Without
-        such a comparison, the default is ``worst KIND`` for the first kind of error (in the order
-        ``attitude``, ``position``, ``joints``, ...) that the policy controls.
+        The default is the figure in the first comparison ``<`` or ``<=`` of the goals. If no goal
+        contains such a comparison, the default is ``worst KIND``. KIND is the first of
+        ``attitude``, ``position``, ``joints``, ... that the policy controls.
         """
         bounded = [each.name for each in self.bounds if each.sign[0] == "<"]
         return [*bounded, f"worst {(self.judged or tuple(KINDS))[0]}"][0]

@@ -39,8 +39,9 @@ _FARTHEST = 1e6
 class Validity(FrozenArrays):
     """Range of validity of a linear model and its loop; prints in words.
 
-    A level is a fraction of the largest displacement. Base attitude, base position and joints are
-    displaced together, in a random direction.
+    The loop starts at displacements of several levels. A level is a fraction of the largest
+    displacement that was tested. Base attitude, base position and joints are displaced together, in
+    a random direction.
 
     Attributes
     ----------

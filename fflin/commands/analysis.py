@@ -120,7 +120,8 @@ def _add_uncertain(commands: parser.Commands) -> None:
         "--vary",
         "range of the parameter NAME, or of all parameters that match a pattern; `fflin "
         "sensitivity` lists the names. RANGE is a fraction of the nominal value, such as 0.2, or "
-        "LEAST:LARGEST. With RANGE,tied all parameters of the pattern share one delta",
+        "LEAST:LARGEST. If `,tied` follows RANGE, such as 0.2,tied, all parameters of the pattern "
+        "vary together",
         _range,
         "NAME=RANGE",
         repeatable=True,

@@ -237,7 +237,7 @@ def add_system(command: Command) -> None:
         "--inputs",
         "inputs of the robot: a TOML file of inputs, a bundled name such as cubesat, `joints` "
         "(joint torques only) or `base` (base torque and force only). The default is the inputs in "
-        "robot.toml, or base torque, base force and all joint torques",
+        "robot.toml. If robot.toml has none, it is base torque, base force and all joint torques",
         input_name,
     )
     group.add(

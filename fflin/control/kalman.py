@@ -220,7 +220,7 @@ def kalman(
     UnknownNameError
         If a name does not exist.
     ModelError
-        If the robot's model was changed after the robot was made.
+        If the robot's Pinocchio model was changed after `load`.
 
     References
     ----------

@@ -112,7 +112,7 @@ def lqr(
     UnknownNameError
         If a name does not exist.
     ModelError
-        If the robot's model was changed after the robot was made.
+        If the robot's Pinocchio model was changed after `load`.
 
     Warns
     -----
@@ -191,7 +191,7 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
         If the model is sampled, its dynamics are not double integrators, or a weight is negative or
         not diagonal. Qp and Ra must be positive.
     ModelError
-        If the robot's model was changed after the robot was made.
+        If the robot's Pinocchio model was changed after `load`.
 
     References
     ----------

@@ -108,7 +108,8 @@ def plan(
     InputError
         If an argument has a wrong size or value, the start or goal is outside a limit, or no
         motion to the goal within the limits is found. The message gives the largest error of the
-        last trial, in its end state or its limits. A feasible motion may still exist.
+        last trial: how far it misses the goal, or exceeds a limit. A feasible motion may still
+        exist.
     MissingPackageError
         If PIQP is not installed.
     UnknownNameError

@@ -111,7 +111,7 @@ def jam(
         If a size or value is wrong, no joint is named, a mode of a flexible appendage is named, or
         the robot would have no input left.
     ModelError
-        If the robot's model was changed after the robot was made.
+        If the robot's Pinocchio model was changed after `load`.
 
     Examples
     --------

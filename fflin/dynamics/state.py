@@ -67,7 +67,7 @@ class StateMap:
     InputError
         If the frame is unknown or the reference is not a pin.SE3.
     ModelError
-        If the robot's model was changed after the robot was made.
+        If the robot's Pinocchio model was changed after `load`.
 
     Examples
     --------

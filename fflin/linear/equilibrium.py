@@ -107,8 +107,8 @@ def equilibrium(
     in N m and N, are scaled by :math:`\sqrt{(M^{-1})_{ii}}`, so that different units become
     comparable. The weighted residual must not exceed 1e-9 of the balanced forces.
 
-    A joint with a spring and without a `JointTorque` deflects if no input holds the joint.
-    Newton's method finds the deflected position, with the Jacobian
+    A joint with a spring but without a `JointTorque` deflects, unless another input balances the
+    force on the joint. Newton's method finds the deflected position, with the Jacobian
     :math:`M\,\partial\dot\nu/\partial q_m`.
 
     Parameters

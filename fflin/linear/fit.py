@@ -137,7 +137,7 @@ def outputs(
 def line_up(gain: Any, lin: LinearModel) -> Array:
     """Return the K of a gain for another model, with states and inputs matched by name.
 
-    A robot keeps most of its states when the robot captures a payload or a joint jams. Columns of
+    A robot keeps most of its states when a joint jams, or when it captures a payload. Columns of
     K for states that the gain lacks are zero, and so are rows for inputs that the gain lacks.
     States and inputs that the model lacks are dropped.
 

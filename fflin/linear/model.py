@@ -230,7 +230,7 @@ class LinearModel(StateSpace):
             )
 
     def require_unchanged(self) -> None:
-        """Raise `ModelError` if the robot's model was changed after the robot was made."""
+        """Raise `ModelError` if the robot's Pinocchio model was changed after `load`."""
         if self._robot is not None:
             self._robot.require_unchanged()
 
@@ -321,7 +321,7 @@ class LinearModel(StateSpace):
         InputError
             If `dt` is not positive or the model is already sampled.
         ModelError
-            If the robot's model was changed after the robot was made.
+            If the robot's Pinocchio model was changed after `load`.
         """
         self.require_unchanged()
         dt = positive("dt", dt, "s")
@@ -367,7 +367,7 @@ class LinearModel(StateSpace):
         MissingPackageError
             If python-control is not installed.
         ModelError
-            If the robot's model was changed after the robot was made.
+            If the robot's Pinocchio model was changed after `load`.
         """
         self.require_unchanged()
         matrices = (self.A, self.B, self.C, self.D)

@@ -82,7 +82,7 @@ class WrenchInput(Input, ABC):
     @property
     @abstractmethod
     def wrench(self) -> Array:
-        """Force [N] and torque [N m] (6,) of a unit input, about the frame's origin in its axes."""
+        """Force [N] and torque [N m] (6,) of a unit input at the frame's origin, in frame axes."""
 
 
 class BaseTorque(Input):
@@ -206,7 +206,7 @@ class Thruster(WrenchInput):
 
     @property
     def wrench(self) -> Array:
-        """Force [N] and torque [N m] (6,) of a unit input, about the frame's origin in its axes."""
+        """Force [N] and torque [N m] (6,) of a unit input at the frame's origin, in frame axes."""
         return np.concatenate((self.direction, np.cross(self.position, self.direction)))
 
 
@@ -286,7 +286,7 @@ class ReactionWheel(WrenchInput):
 
     @property
     def wrench(self) -> Array:
-        """Force [N] and torque [N m] (6,) of a unit input, about the frame's origin in its axes."""
+        """Force [N] and torque [N m] (6,) of a unit input at the frame's origin, in frame axes."""
         return np.concatenate((np.zeros(3), -np.array(self.axis)))
 
 

@@ -91,7 +91,7 @@ class Robot(Coordinates):
         Default weights of `lqr`, which replace the weights of the rule "urdf" or "identity", see
         `replace`.
     point : mapping
-        Operating point of the commands, see `replace`.
+        Operating point of the command line, see `replace`.
     target : mapping
         Target state of the commands `simulate` and `montecarlo`, see `replace`.
     start : mapping
@@ -192,7 +192,7 @@ class Robot(Coordinates):
             Default weights of `lqr`: ``rule`` ("urdf" or "identity"), and ``q``, ``r``,
             ``bryson``, each {state, input, group or pattern: weight or largest value}.
         point : mapping
-            Operating point of the commands `linearize`, `check`, `lqr` and others: ``joints``
+            Operating point of `fflin linearize`, `fflin check`, `fflin lqr` and others: ``joints``
             {joint: position [rad|m]}, ``rpy`` (3,) [deg] about fixed axes, ``position`` (3,) [m]
             of the base, ``velocity`` {joint or state: rate}, as in `fflin.velocity`. Functions
             ignore `point`; their arguments define the operating point.
@@ -203,7 +203,8 @@ class Robot(Coordinates):
             Default initial state of `simulate`, with the keys of `point`. Omitted parts are as in
             `point`.
         limits : mapping
-            {name, group or pattern of inputs or states: largest magnitude, or (least, largest)}.
+            {key: limit}. A key is a name, a group or a pattern of inputs or states. A limit is a
+            largest magnitude, or a pair (least, largest).
             Limits given here replace the limits of the URDF and of the inputs.
 
         Returns
@@ -222,7 +223,7 @@ class Robot(Coordinates):
             If a field, a joint, a frame of an input or output, or a name in `limits` does not
             exist.
         ModelError
-            If the robot's model was changed after the robot was made.
+            If the robot's Pinocchio model was changed after `load`.
         """
         self.require_unchanged()
         robot = self

@@ -90,10 +90,10 @@ class Motion(Design):
         the joints.
     mode_rotations : ndarray (k,)
         Rotation [rad] of the structure per unit of each mode's amplitude; 0 if a mode causes no
-        rotation. A mode of a flexible appendage rotates the appendage's mass by w and displaces
-        it by v, at the distance c from the appendage's frame. The rotation is :math:`|w| + |v| /
-        |c|`. The term with c is omitted if c is below 5 % of the radius of gyration of the
-        carrying body.
+        rotation. Per unit of amplitude, a mode of a flexible appendage rotates the moving mass by
+        w, and displaces its centre of mass by v. With the vector c from the appendage's frame to
+        this centre of mass, the rotation is :math:`|w| + |v| / |c|`. The second term is omitted if
+        :math:`|c|` is below 5 % of the radius of gyration of the carrying body.
     steered : tuple of str
         States that the policy feeds back; empty if these states are not known.
     notes : tuple of str

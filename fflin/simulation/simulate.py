@@ -119,7 +119,7 @@ def simulate(
         Model that predicts the motion under the same control law; by default the policy's own
         model, False for no prediction. A motion can be predicted for a StateFeedback, an
         OutputFeedback or LinearController (without its noise), or no policy.
-        A sampled model that was read from a file predicts nothing.
+        There is no prediction for a sampled model that was read from a file.
     target : LinearModel or array_like (nx,), optional
         Target state from which errors are measured, or a model whose operating point is the
         target. By default the operating point of the policy's own model, or the followed

@@ -44,8 +44,9 @@ class LFT(Design):
     repeats : ndarray (k,)
         Number of times that each delta is repeated in :math:`\Delta`.
     middle, half : ndarray (k,)
-        A parameter is ``middle + half * delta``. For tied parameters, ``middle + half * delta``
-        is their common value, or the common factor on their nominal values.
+        A parameter is ``middle + half * delta``. Tied parameters have one common number ``middle +
+        half * delta``: their value if their range is in their unit, and the factor that multiplies
+        their nominal values if their range is relative.
     units : tuple of str
         Units of the parameters; "1" for a factor.
     state_names, input_names, output_names : tuple of str

@@ -78,7 +78,8 @@ class FlexibleAppendage(Appendage):
         modal rate, in the frame's axes. The square of an entry is the effective mass of the mode
         along the axis.
     rotation : array_like (3, k)
-        Modal participation in rotation [kg^0.5 m]: the angular momentum about the frame's origin.
+        Modal participation in rotation [kg^0.5 m]: the angular momentum of each mode about the
+        frame's origin, for a unit modal rate.
     damping : float or sequence of float (k,)
         Damping ratios, from 0 to 1.
     name : str, optional
