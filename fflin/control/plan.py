@@ -25,6 +25,7 @@ from fflin.dynamics.coordinates import refuse_orbit
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
+from fflin.robot.inputs import JointTorque, ReactionWheel
 from fflin.robot.limits import chosen_limits
 from fflin.robot.robot import Robot
 
@@ -182,18 +183,7 @@ def plan(
                 f"{note}; give more knots or a longer duration", FflinWarning, stacklevel=2
             )
         return Trajectory(robot, t, q, v, u, hold=hold, _note=note)
-    units = ["rad"] * 3 + [*state.units[3:]]
-    by = [
-        f"{words} {state.names[i]} by {far[i]:.2g} {units[i]}"
-        for words, far in (("misses", made.missed), ("exceeds the limit of", made.at_knots))
-        for i in np.argsort(-far)[:3]
-        if far[i] > _REACHED
-    ]
-    raise InputError(
-        f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
-        f"last trial {listed(by) if by else 'diverges'}; give a longer duration, wider limits, "
-        "more knots, or name states with a free end value by `free` (--free-end)"
-    )
+    raise _failure(shooting, made, asked, duration)
 
 
 class _Made(NamedTuple):
@@ -247,6 +237,34 @@ def _require_within(
     ]
     if outside:
         raise InputError(f"the {what} is outside the limits: {listed(outside)}")
+
+
+def _failure(
+    shooting: Shooting, made: _Made, asked: NDArray[np.bool_], duration: float
+) -> InputError:
+    """Return the error of a search that failed, with what its last trial misses and exceeds."""
+    robot, state = shooting.state.robot, shooting.state
+    units = ["rad"] * 3 + [*state.units[3:]]
+    by = [
+        f"{words} {state.names[i]} by {far[i]:.2g} {units[i]}"
+        for words, far in (("misses", made.missed), ("exceeds the limit of", made.at_knots))
+        for i in np.argsort(-far)[:3]
+        if far[i] > _REACHED
+    ]
+    advice = (
+        "give a longer duration, wider limits, more knots, or name states with a free end value by "
+        "`free` (--free-end)"
+    )
+    internal = all(isinstance(each, JointTorque | ReactionWheel) for each in robot.inputs)
+    if internal and asked[state.groups.omega_b].any() and asked[state.groups.v_b].any():
+        advice = (
+            "the inputs cannot change the momentum, which determines omega_b and v_b at the end; "
+            "name omega_b and v_b by `free` (--free-end), and r_b or q_b if the goal moves the base"
+        )
+    return InputError(
+        f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
+        f"last trial {listed(by) if by else 'diverges'}; {advice}"
+    )
 
 
 def _note(shooting: Shooting, made: _Made, size: Array) -> str:

@@ -399,3 +399,11 @@ def test_a_file_of_other_inputs_names_what_differs(free_floating, tmp_path):
     fflin.Trajectory(robot, [0.0, 1.0], [robot.neutral()] * 2, own, np.zeros((2, 3))).save(path)
     with pytest.raises(fflin.InputError, match=r"lacks the inputs tau_b\.x"):
         fflin.Trajectory.load(path, whole)
+
+
+def test_a_failed_plan_of_internal_inputs_advises_to_free_the_base_velocities():
+    """Joint torques conserve the momentum: an end value of omega_b and v_b is no choice."""
+    robot = fflin.load("planar_detumble").replace(inputs=[fflin.JointTorque("*")])
+    goal = fflin.configuration(robot, {"joint_1": 0.2}, base=pin.SE3(np.eye(3), np.ones(3)))
+    with any_wording(), pytest.raises(fflin.InputError, match="omega_b and v_b"):
+        fflin.plan(robot, (goal, None), 5.0, knots=4)
