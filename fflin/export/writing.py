@@ -59,7 +59,7 @@ def write_c(
         sampled.
     folder : path
         Folder for the files; a missing folder is created. Existing files of the same name are
-        replaced.
+        replaced only if they were written for the same type of law and the same robot.
     robot : Robot, optional
         Robot of the law. The robot is necessary only for a law from a file whose robot name is
         not known to `load`.
@@ -78,7 +78,8 @@ def write_c(
     Raises
     ------
     InputError
-        If the law cannot be written in C, its robot is not known, or an argument is invalid.
+        If the law cannot be written in C, its robot is not known, other files have the same
+        names, or an argument is invalid.
     FileError
         If a file cannot be written.
 
@@ -100,6 +101,12 @@ def write_c(
     tables = law_of(law, robot, limits)
     texts = _Texts(tables, name, real)
     contents = {target / file: text.encode() for file, text in texts.files().items()}
+    old = next((path for path in contents if path.exists()), None)
+    if old and _title(target / f"{name}.json") != texts.title:
+        raise InputError(
+            f"{old} exists and does not belong to the {texts.title}; give another name= (--name) "
+            "or another folder, or delete the file"
+        )
     try:
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -112,6 +119,14 @@ def digest_of(about: dict[str, Any], header: bytes, source: bytes) -> str:
     """Return the digest that ties the description of a law to its code."""
     parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
     return content_digest(parts)
+
+
+def _title(path: Path) -> str | None:
+    """Return the title of the law that a file of `write_c` describes, or None."""
+    try:
+        return json.loads(path.read_bytes())["title"]
+    except (OSError, ValueError, TypeError, LookupError):
+        return None
 
 
 class _Texts:
