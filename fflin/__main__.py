@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+# Built in, so that no module of the working folder takes its place.
+import _signal as signal  # type: ignore[import-not-found]
 import gc
 import os
-import signal
 import sys
 from typing import TYPE_CHECKING
 

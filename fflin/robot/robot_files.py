@@ -170,7 +170,10 @@ def read_inputs(document: TomlFile) -> tuple[Input, ...]:
     """Return the inputs of a file, as `load_inputs` does."""
     inputs: list[Input] = []
     for index, table in enumerate(_tables(document, "input")):
-        kind, values = str(table.get("type", "")), {**table}
+        kind, values = str(table.get("type")), {**table}
+        if "type" not in table:
+            problem = f"input {index + 1}: the key 'type' is missing; set 'type' to one of "
+            raise document.error(problem + ", ".join(_TYPES), "input", index)
         if kind not in _TYPES:
             problem = f"input {index + 1}: no valid 'type': {unknown('type', kind, _TYPES)}"
             raise document.error(UnknownNameError(problem), "input", index, "type")
