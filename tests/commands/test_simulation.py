@@ -298,6 +298,15 @@ def test_a_target_velocity_is_the_points_and_is_held(tmp_path):
     )
 
 
+def test_what_nothing_regulates_is_not_passed_over(tmp_path):
+    wheels = ("cubesat", "--inputs", wheels_file(tmp_path), "--position", 1, 0, 0)
+    joints = ("ets_vii", "--inputs", "joints", "--reduce", "--rpy", 30, 0, 0)
+    for command, error in ((wheels, "position"), (joints, "attitude")):
+        code, out, _ = run("simulate", *command, "--duration", 1)
+        assert code == 0
+        assert re.search(rf"{error} .* not controlled\n", out)
+
+
 def test_show_is_checked_before_the_run(tmp_path):
     said = refused(
         *("simulate", "ets_vii", "--show", "q_x", "--plot", tmp_path / "a.png"),
