@@ -350,7 +350,7 @@ def require_room(path: Path, size: int) -> None:
     """Raise `FileError` if a file of this size [bytes] does not fit on the disk."""
     if size > (free := shutil.disk_usage(path.parent).free):
         raise FileError(
-            f"{path} needs {size / 1e9:,.1f} GB, but only {free / 1e9:,.1f} GB are free; free "
+            f"{path} needs {size / 1e6:,.1f} MB, but only {free / 1e6:,.1f} MB are free; free "
             "space, or choose fewer rows"
         )
 

@@ -194,6 +194,8 @@ class _OutputLoop(Loop):
 
 def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
     """Return the shared library of a source file."""
+    if not isinstance(compiler, str) or "\0" in compiler:
+        raise InputError(f"compiler is {compiler!r}, expected the name of a C compiler, such as cc")
     command = shutil.which(compiler)
     if command is None:
         raise MissingPackageError(
@@ -211,4 +213,7 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
         if done.returncode:
             line = next((x for x in done.stderr.splitlines() if "error" in x), done.stderr)
             raise InputError(f"{source}: cannot be compiled: {line}")
-        return ctypes.CDLL(str(library))
+        try:
+            return ctypes.CDLL(str(library))
+        except OSError as error:
+            raise InputError(f"'{compiler}' made no library of {source}: {error}") from None

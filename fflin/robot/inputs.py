@@ -33,7 +33,7 @@ class Input:
     def __post_init__(self) -> None:
         for name in ("frame", "joint", "name"):
             value = getattr(self, name, None)
-            if value is not None and not (value and isinstance(value, str)):
+            if value is not None and not (isinstance(value, str) and value):
                 raise InputError(f"{self.KEY} {name} is {value!r}, expected a name")
         for name in ("max", "min"):
             value, what = getattr(self, name), f"{self.KEY} {name}"

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
-from fflin.base.validation import NORM_TOLERANCE, Array, vector
+from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
@@ -187,21 +187,25 @@ class Coordinates:
 
     def checked_configuration(self, q: Array) -> Array:
         """Return a valid configuration q (nq,), corrected within 1e-6, or raise `InputError`."""
-        q = self._sized("q", q, self.nq, _CONFIGURATION)
+        if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
+            q = self._sized("q", q, self.nq, _CONFIGURATION)
         entries = q.tolist()
+        if not math.isfinite(sum(entries)):
+            vector("q", q, self.nq, _CONFIGURATION)  # says which entry it is
         x, y, z, w = entries[3:7]
-        squares = {3: x * x + y * y + z * z + w * w}
-        squares |= {i: entries[i] ** 2 + entries[i + 1] ** 2 for i in self.unbounded}
-        index = max(squares, key=lambda i: abs(squares[i] - 1.0))
-        error = abs(squares[index] - 1.0)
-        if error > NORM_TOLERANCE:
-            what = "the base quaternion (x, y, z, w) q[3:7]"
-            if index != 3:
-                name = self.unbounded[index]
-                what = f"(cos, sin) of continuous joint '{name}', q[{index}:{index + 2}],"
-            length = math.sqrt(squares[index])
-            raise InputError(f"{what} has length {length:.9g}, expected 1; normalise it")
-        if error > ROUND_OFF:
+        square = x * x + y * y + z * z + w * w
+        worst = abs(square - 1.0)
+        if worst > NORM_TOLERANCE:
+            raise _not_of_length_1("the base quaternion (x, y, z, w) q[3:7]", square)
+        for index in self.unbounded:
+            square = entries[index] ** 2 + entries[index + 1] ** 2
+            error = abs(square - 1.0)
+            if error > worst:
+                worst = error
+                if error > NORM_TOLERANCE:
+                    what = f"(cos, sin) of continuous joint '{self.unbounded[index]}'"
+                    raise _not_of_length_1(f"{what}, q[{index}:{index + 2}],", square)
+        if worst > ROUND_OFF:
             q = pin.normalize(self.model, q)
         return self._followed(q) if self.followers else q
 
@@ -286,6 +290,11 @@ def change_in(model: pin.Model, made: pin.Model) -> str:
                 return f"the {what} of joint '{made.names[at]}'"
             return f"the frame '{made.frames[at].name}'" if what == "frames" else f"its {what}"
     return ""
+
+
+def _not_of_length_1(what: str, square: float) -> InputError:
+    length = math.sqrt(square)
+    return InputError(f"{what} has length {length:.9g}, expected 1; normalise it")
 
 
 def joint_of(model: pin.Model, index: int) -> Joint:

@@ -47,8 +47,6 @@ def test_refused(regulated):
     knots = [np.tile(row, (2, 1)) for row in (q, v, u)]
     there = fflin.linearize(free)
     policy = fflin.StateFeedback(there, fflin.lqr(there).K)
-    with pytest.raises(fflin.InputError, match="`frames`"):
-        fflin.validity(robot, lin, gain, frames=("hill",))
     with pytest.raises(fflin.InputError, match="compiled"):
         fflin.monte_carlo(robot, None, {"q_b": 0.1}, runs=2, duration=0.1, engine="compiled")
     for refused in (

@@ -70,7 +70,7 @@ def test_the_engine_can_be_chosen(tmp_path):
         (("--grid", "joint_2=0:1:0"), "--grid"),
         (("--grid", "joint_2=0:1:2", "--grid", "joint_2=0:1:3"), "'joint_2'"),
         (("--grid", "joint_2=0:1:2", "--joint", "joint_2=1"), "grid"),
-        (("--grid", "joint_2=0:1:100000", "--grid", "joint_3=0:1:100000"), "10,000,000,000"),
+        (("--random", "3", "--range", "joint_22=0:1"), "'joint_22'"),
         (("--random", "0"), "--random"),
         (("--random", "3", "--range", "joint_1=-1e308:1e308"), "narrow"),
         (("--random", "3", "--grid", "joint_2=0:1:2"), "--grid"),
@@ -80,6 +80,14 @@ def test_the_engine_can_be_chosen(tmp_path):
 def test_bad_input_is_one_line(arguments, message, tmp_path):
     error = refused("sweep", "ets_vii", "-o", "out.npz", *arguments, cwd=tmp_path)
     assert re.search(message, error), error
+    assert not list(tmp_path.iterdir())
+
+
+def test_more_points_than_fit_are_refused(tmp_path):
+    many = ("--grid", "joint_2=0:1:100000", "--grid", "joint_3=0:1:100000")
+    code, out, err = run("sweep", "ets_vii", *many, "-o", "out.npz", cwd=tmp_path)
+    assert (code, out) == (2, "")
+    assert re.fullmatch(r"fflin: error: 10,000,000,000 .*memory.*", err.splitlines()[-1])
     assert not list(tmp_path.iterdir())
 
 

@@ -72,7 +72,7 @@ def test_where_nothing_can_be_foreseen_the_reason_is_said():
     )
     for policy in policies:
         for linear in (lin, True):
-            why = f"cannot predict a motion under {type(policy).__name__}"
+            why = f"cannot predict a motion with a policy of type {type(policy).__name__}"
             with pytest.raises(fflin.InputError, match=why) as caught:
                 fflin.simulate(robot, policy, duration=0.1, linear=linear)
             assert "\n" not in str(caught.value)

@@ -95,7 +95,7 @@ def sound(folder):
         "linearize": found | place,
         "linearize_trajectory": dict(zip("tqvu", (t, *rows), strict=True))
         | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},
-        "Linearizer": {"robot": robot, "engine": None} | place,
+        "Linearizer": {"robot": robot} | place,
         "list_robots": {},
         "LinearController": {"system": -gain.K, "lin": lin, "sign": -1, "noise": None},
         "load": {
@@ -215,7 +215,7 @@ def sound(folder):
         "validity": {
             **{"robot": robot, "lin": lin, "gain": None, "attitude": 5.0, "position": 0.1},
             **{"joint": 0.1, "samples": 1, "seed": 0, "confidence": 0.9, "executor": None},
-            **{"frames": (), "limits": None, "workers": None, "threads": 1, "engine": None},
+            **{"limits": None, "workers": None, "threads": 1, "engine": None},
         },
         "velocity": {"robot": robot, "values": {}},
         "CLaw": {"folder": fflin.write_c(gain, folder / "c_code"), "compiler": "cc"},
@@ -225,8 +225,7 @@ def sound(folder):
         },
         "visualize": {
             **{"robot": robot, "motion": motion, "html": folder / "a.html", "open": False},
-            **{"tool": None, "fps": 10.0, "speed": 1.0, "scene": "space", "cloud": None},
-            "funnel": None,
+            **{"tool": None, "fps": 10.0, "speed": 1.0, "scene": "space"},
         },
         "Sensitivity.along": {"self": sensitive, "direction": {"base.mass": 1.0}},
         "Sensitivity.check": {"self": sensitive, "names": ["base.mass"]},

@@ -98,20 +98,6 @@ def test_a_body_flies_to_the_grasp_and_is_held(watch, tmp_path):
 
 
 @pytest.mark.browser
-def test_what_coincides_with_the_robot_is_not_in_the_legend(watch, tmp_path):
-    robot = fflin.load("servicer_7dof")
-    lin = fflin.linearize(robot)
-    still = {"robot": robot, "policy": fflin.StateFeedback(lin, fflin.lqr(lin).K), "duration": 1.0}
-    q0 = fflin.configuration(robot, {"joint_1": 0.8})
-    for options, there in (({}, False), ({"q0": q0, "duration": 60.0}, True)):
-        path = tmp_path / "page.html"
-        fflin.visualize(robot, fflin.simulate(**still | options), html=path)
-        watched = watch(path.as_uri() + "#pause")
-        said = watched.page.locator("#legend").text_content()
-        assert ("target" in said, "path of the tool" in said) == (there, there)
-
-
-@pytest.mark.browser
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_a_payload_with_joints_comes_with_them(watch, tmp_path):
     other = fflin.load("ets_vii", stiffness=20.0, damping=2.0)
