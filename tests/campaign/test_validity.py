@@ -347,7 +347,7 @@ def test_a_process_that_dies_is_one_line(robots, monkeypatch):
     # A function of Python's own, for which a worker imports nothing.
     monkeypatch.setattr(Loop, "__reduce__", lambda _: (signal.raise_signal, (signal.SIGKILL,)))
     for pool in (executor_of(None, 1), ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
-        with pool as executor, pytest.raises(fflin.FflinError, match="died|terminated abruptly"):
+        with pool as executor, pytest.raises(fflin.FflinError, match=r"died|terminated abruptly"):
             fflin.validity(robot, lin, gain, samples=2, executor=executor)
 
 
