@@ -113,11 +113,14 @@ def solve(
     if start is not None and start.residual <= _SOUND:
         return start
     found = [] if start is None else [start]
-    # SciPy raises one or the other where it cannot reorder a pencil.
-    with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
-        refined = _refined(equation, _general(equation), None)
-        if (general := _finished(equation, *refined, "general")) is not None:
-            found.append(general)
+    for unit in (False, True):
+        # SciPy raises one or the other where it cannot reorder a pencil.
+        with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
+            refined = _refined(equation, _general(equation, unit), None)
+            if (general := _finished(equation, *refined, "general")) is not None:
+                found.append(general)
+                if general.residual <= _SOUND:
+                    break
     if not found:
         raise np.linalg.LinAlgError("the weights or the model are too badly scaled")
     return min(found, key=lambda solution: solution.residual)
@@ -214,17 +217,19 @@ def _refined(
     return best, modes
 
 
-def _general(equation: Riccati) -> Array:
-    """Solve by SciPy, in inputs that cost 1, since SciPy takes a badly scaled R for singular."""
+def _general(equation: Riccati, unit: bool) -> Array:
+    """Solve by SciPy, which takes an R badly scaled for singular; `unit`: inputs that cost 1."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     solver = solve_discrete_are if equation.discrete else solve_continuous_are
-    B = dtrtrs(equation.R_factor, equation.B.T, lower=1)[0].T
-    N = equation.N
-    N = None if N is None else dtrtrs(equation.R_factor, N.T, lower=1)[0].T
+    B, R, N = equation.B, equation.R, equation.N
+    if unit:
+        B = dtrtrs(equation.R_factor, B.T, lower=1)[0].T
+        N = None if N is None else dtrtrs(equation.R_factor, N.T, lower=1)[0].T
+        R = np.eye(len(R))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ill-conditioning shows in the residual
-        P: Array = solver(equation.A, B, equation.Q, np.eye(B.shape[1]), s=N)
+        P: Array = solver(equation.A, B, equation.Q, R, s=N)
     return 0.5 * (P + P.T)
 
 
