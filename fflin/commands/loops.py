@@ -21,11 +21,13 @@ from fflin.commands.points import (
     velocity_of,
 )
 from fflin.commands.regulator import (
+    add_allocation,
     add_trajectory,
     add_weights,
     gain_of,
     models_along,
     regulated_part,
+    robot_of_design,
     schedule_of,
     weights_of,
 )
@@ -122,12 +124,7 @@ def _add_controllers(group: parser.Group) -> None:
         "--negative-feedback",
         "use the controller of --controller with negative feedback, u - u0 = -K (y - y0)",
     )
-    group.yes_or_no(
-        "--allocate",
-        "design the regulator with base torque and force, and let thrusters produce the nearest "
-        "possible wrench. Allocation is the default if the thrusters can push in every direction. "
-        "With --no-allocate, negative thrust is set to zero",
-    )
+    add_allocation(group)
     group.switch(
         "--mpc",
         "use model predictive control (MPC) with the limits of the robot; MPC requires --sample",
@@ -198,7 +195,6 @@ def about_point(
     robot: Robot, arguments: argparse.Namespace
 ) -> tuple[Feedback | Allocation, Any, LinearModel | None]:
     """Return the policy, its feedback, and the model that predicts every row."""
-    from fflin.control.authority import thrusters_give_every_wrench
     from fflin.control.linear_controller import LinearController
     from fflin.control.policies import Allocation, StateFeedback
 
@@ -207,9 +203,6 @@ def about_point(
         names = ("allocate", "gain", "controller", "reduce")
         refuse(arguments, names, "--mpc computes the inputs itself")
         arguments.allocate = False
-    allocate = (
-        thrusters_give_every_wrench(robot) if arguments.allocate is None else arguments.allocate
-    )
     if arguments.gain:
         from fflin.control.gain import Gain
 
@@ -217,13 +210,10 @@ def about_point(
             arguments, (*_WEIGHTS, *_TARGETS), "--gain contains its weights and its operating point"
         )
         gain = Gain.load(arguments.gain)
-        # A gain designed for the motors and thrusters needs no allocation of a wrench.
-        if arguments.allocate is None:
-            allocate = allocate and "tau_b.x" in gain.input_names
-        design = _without_thrusters(robot) if allocate else robot
+        design = robot_of_design(robot, arguments.allocate, gain)
         lin = _about_gain(design, gain, arguments)
     else:
-        design = _without_thrusters(robot) if allocate else robot
+        design = robot_of_design(robot, arguments.allocate)
         lin = _about_target(design, arguments)
     if arguments.controller:
         refuse(arguments, (*_WEIGHTS, "gain", "reduce"), "--controller replaces the regulator")
@@ -232,9 +222,9 @@ def about_point(
     elif arguments.mpc:
         feedback = _mpc(lin, arguments)
     else:
-        gain = gain or gain_of(lin, arguments)
+        gain = gain or gain_of(lin, arguments, allocated=design is not robot)
         feedback = StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
-    if allocate:
+    if design is not robot:
         return Allocation(feedback, design), feedback, None
     return feedback, feedback, None if arguments.reduce else lin
 
@@ -267,7 +257,7 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
     )
     poses = ("joint", "rpy", "position", "velocity")
     refuse(arguments, poses, "the start is on the trajectory, or displaced from it by --offset")
-    design = _without_thrusters(robot) if arguments.allocate else robot
+    design = robot_of_design(robot, bool(arguments.allocate))
     if arguments.schedule is None:
         models = models_along(arguments, design)
         policy = TrajectoryFeedback(models, schedule_of(models, arguments))
@@ -305,21 +295,6 @@ def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> Linea
     if number := arguments.relative_equilibrium:
         q, reference = attitude(robot, q, number, gain.frame)
     return linearize(robot, q, v, gain.u0, frame=gain.frame, reference=reference)
-
-
-def _without_thrusters(robot: Robot) -> Robot:
-    from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
-
-    others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
-    if len(others) == len(robot.inputs):
-        raise InputError(
-            f"--allocate: '{robot.name}' has no thrusters; give --inputs with thrusters"
-        )
-    missing = [
-        kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)
-    ]
-    base = tuple(kind() for kind in missing)
-    return robot.replace(inputs=(*base, *others))
 
 
 def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:

@@ -260,13 +260,13 @@ def model_report(lin: LinearModel) -> str:
     parts.append(_named_matrix("A", lin.A, lin.state_names, lin.state_names))
     parts.append(_named_matrix("B", lin.B, lin.state_names, lin.input_names))
     if lin.output_names == lin.state_names and not lin.D.any():
-        parts.append("C = E, D = 0: the output is the state")
+        parts.append("C = I, D = 0: the output is the state")
     else:
         parts.append(_named_matrix("C", lin.C, lin.output_names, lin.state_names))
         parts.append(_named_matrix("D", lin.D, lin.output_names, lin.input_names))
     c = lin.certificate
     parts.append(
-        f"A and B against ABA derivatives: {c.route_A:.1e} and {c.route_B:.1e}; M M^-1 - E: "
+        f"A and B against ABA derivatives: {c.route_A:.1e} and {c.route_B:.1e}; M M^-1 - I: "
         f"{c.inertia_residual:.1e};\ncond(M), scaled: {c.condition:.1e}; |f0|: {c.f0:.1e}"
     )
     return "\n\n".join(parts)
@@ -283,7 +283,7 @@ def inputs_report(robot: Robot) -> str:
     for name, unit in zip(acting.names, acting.units, strict=True):
         ends = limits.get(name, (-math.inf, math.inf))
         rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
-    return grid(cut(rows, "see linearize -o"), "ll")
+    return grid(cut(rows, "see --json"), "ll")
 
 
 def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
