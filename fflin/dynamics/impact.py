@@ -119,7 +119,7 @@ def jam(
         - `joints` names a mode of a flexible appendage, which cannot jam;
         - the jammed robot would have no inputs.
     ModelError
-        If ``robot.model`` was modified in place after the robot was created.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     Examples
     --------
@@ -311,8 +311,7 @@ def capture(
         - robot and payload have different gravity or orbits;
         - a wheel of the payload has momentum but no inertia.
     ModelError
-        If the Pinocchio model of the robot or of the payload was modified in place after this robot
-        was created.
+        If the Pinocchio model of the robot or of the payload was modified after its creation.
 
     References
     ----------

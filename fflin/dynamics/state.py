@@ -69,7 +69,7 @@ class StateMap:
     InputError
         If the frame is unknown or the reference is not a pin.SE3.
     ModelError
-        If ``robot.model`` was modified in place after the robot was created.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     Examples
     --------
