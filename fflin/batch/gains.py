@@ -88,7 +88,7 @@ class GainBatch(Design):
 
     @property
     def grid(self) -> dict[str, Array]:
-        """Axes of the grid: {joint: values [rad|m]}, for the joints that vary.
+        """Axes of the grid as {joint: values [rad|m]}; only joints that vary are included.
 
         Raises
         ------
@@ -105,8 +105,8 @@ class GainBatch(Design):
         Raises
         ------
         InputError
-            If the positions are not n finite numbers, or the points are not on a grid or are all
-            the same.
+            If `joints` does not contain n finite numbers, or if the points of the batch are all the
+            same or not on a grid.
         """
         return self._between(vector("joints", joints, len(self.joint_names), "the joint positions"))
 
@@ -148,15 +148,18 @@ class GainBatch(Design):
 def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     r"""Return the linear quadratic regulator about every point of a batch.
 
-    For fully actuated models at rest, many gains are computed together:
+    For fully actuated models at rest, the gains at many points are computed together:
 
-    1. With L the lower half of B, factorise :math:`L R^{-1} L^T = L_s L_s^T`. The factor defines
-       coordinates :math:`(p, \dot p)` in which the weight on :math:`\ddot p` is the identity.
+    1. Let L be the lower half of B. Factorise :math:`L R^{-1} L^T = L_s L_s^T`. The factor
+       :math:`L_s` defines coordinates :math:`(p, \dot p)` in which the weight on :math:`\ddot p` is
+       the identity.
     2. Solve an eigenproblem of half the Hamiltonian's size (see `lqr`) for the poles and modes of
-       the closed loop. Inputs u and states x of the modes give :math:`K = -u\,x^{-1}`.
+       the closed loop. If the columns of u and x are the inputs and states of the modes, then
+       :math:`K = -u\,x^{-1}`.
     3. Refine each solution by Newton's method, and compute the residual of its Riccati equation.
 
-    `lqr` computes the gains of all other models, and recomputes gains whose residual is too large.
+    `lqr` computes the gains of all other models. It also recomputes gains whose residual is too
+    large.
 
     Parameters
     ----------
@@ -293,15 +296,17 @@ class ScheduledFeedback(Feedback):
     Parameters
     ----------
     lin : LinearModel
-        Model about the target.
+        Linear model about the target state.
     gains : GainBatch
         Gains of the same robot, on a grid of its joint positions. If the robot has captured or
-        released an object since the gains were designed, `line_up` matches states and inputs.
+        released an object since the gains were designed, `line_up` matches the states and inputs of
+        `gains` with those of `lin`.
 
     Raises
     ------
     InputError
-        If states and inputs cannot be matched, or the gains are not on a grid.
+        If the states and inputs of `gains` and `lin` cannot be matched, or the gains are not on a
+        grid.
 
     Examples
     --------
