@@ -294,7 +294,7 @@ def _difference(a: Array, b: Array, c: Array) -> Array:
     return np.where(np.abs(difference) > rounding, difference, 0.0)
 
 
-def _near_boundary(poles: Values, dt: float) -> bool:
+def near_boundary(poles: Values, dt: float) -> bool:
     """Whether a pole of a stable loop is close to the boundary of stability."""
     decay = 1.0 - np.abs(poles) if dt else -poles.real
     return decay.min() < _NEAR_BOUNDARY * np.abs(poles - 1.0 if dt else poles).max()
@@ -302,7 +302,7 @@ def _near_boundary(poles: Values, dt: float) -> bool:
 
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
     structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
-    if structured is not None and not _near_boundary(structured.poles, lin.dt):
+    if structured is not None and not near_boundary(structured.poles, lin.dt):
         return structured
     # A general solver would fail without saying which mode is to blame.
     require_stabilizable(lin)

@@ -71,7 +71,7 @@ class Impact(FrozenArrays):
 
     @property
     def told(self) -> str:
-        """Event, impulse and lost energy, in one line."""
+        """One-line summary of the event, its impulse and the lost energy."""
         felt = f"largest impulse {np.abs(self.impulse).max(initial=0.0):.4g}"
         return f"{self.event}: {felt}, {self.energy_lost:.4g} J lost"
 
@@ -85,33 +85,41 @@ def jam(
 ) -> Impact:
     r"""Stop joints or wheels instantly and permanently at their present positions.
 
-    The other joints are free during the impact. Immediately after the impact, the velocity
-    satisfies :math:`M_+ \nu_+ = G^T M \nu` (13.1), where G is the Jacobian of the robot with the
-    jammed joints fixed. Linear and angular momentum are conserved. For a failed motor whose joint
-    still moves freely, use ``robot.replace(passive=[joint])`` instead of `jam`.
+    The other joints are free during the impact. The velocity :math:`\nu_+` just after the impact
+    satisfies :math:`M_+ \nu_+ = G^T M \nu`, see (13.1) of docs/derivation.md. M and :math:`M_+` are
+    the inertia matrices before and after the impact, and :math:`\nu` is the velocity before the
+    impact. G is the Jacobian that maps velocities of the jammed robot to velocities of the robot
+    before the impact. Linear and angular momentum are conserved.
+
+    If a motor fails but its joint still moves freely, use ``robot.replace(passive=[joint])``
+    instead of `jam`.
 
     Parameters
     ----------
     robot : Robot
     joints : str or sequence of str
-        Names or patterns of joints. The mimic joints of a jammed joint are also jammed.
+        Names of the joints to jam, or patterns. Mimic joints of a jammed joint are also jammed.
     q, v : array_like (nq,), (nv,), optional
         Configuration and velocity just before the impact; neutral and at rest by default.
 
     Returns
     -------
     Impact
-        Result of the impact. The jammed joints are welded in `robot` and have no inputs.
+        Result of the impact. In its `robot`, the jammed joints are welded and have no inputs.
 
     Raises
     ------
     UnknownNameError
-        If there is no such joint.
+        If a name or pattern in `joints` matches no joint.
     InputError
-        If a size or value is wrong, no joint is named, a mode of a flexible appendage is named, or
-        the robot would have no input left.
+        If one of these conditions is true:
+
+        - an argument has a wrong size or value;
+        - `joints` is empty;
+        - `joints` names a mode of a flexible appendage, which cannot jam;
+        - the jammed robot would have no inputs.
     ModelError
-        If the robot's Pinocchio model was changed after `load`.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     Examples
     --------
@@ -198,16 +206,18 @@ def joint_called(robot: Robot, name: str) -> Any:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Capture(Impact):
-    """Robot with a grasped payload, and the impact of the grasp; see also `Impact`.
+    """Result of `capture`: the robot combined with its payload just after the grasp.
+
+    A `Capture` also has the attributes of `Impact`.
 
     Attributes
     ----------
     impulse : ndarray (6,)
-        Impulse on the robot about the origin of the payload's frame, in the axes of this frame:
-        linear [N s], then angular [N m s].
+        Impulse of the payload on the robot, in the axes of the payload's frame: linear [N s], then
+        angular [N m s] about the origin of this frame.
     payload : Robot
-        The grasped payload as a robot. The configuration and velocity of the payload just before
-        the impact are ``payload_q`` (nq,) and ``payload_v`` (nv,).
+        The grasped payload as a separate robot. The configuration and velocity of the payload just
+        before the impact are ``payload_q`` (nq,) and ``payload_v`` (nv,).
     prefix : str
         Name of the payload's frame in the combined robot.
 
@@ -228,7 +238,7 @@ class Capture(Impact):
 
     @property
     def told(self) -> str:
-        """Event, impulse and lost energy, in one line."""
+        """One-line summary of the event, its impulse and the lost energy."""
         force, torque = (np.linalg.norm(each) for each in np.split(self.impulse, 2))
         return (
             f"{self.event}: impulse at the grasp {force:.4g} N s and {torque:.4g} N m s, "
@@ -250,11 +260,16 @@ def capture(
 ) -> Capture:
     r"""Grasp a payload rigidly, instantly and permanently.
 
-    The joints are free during the impact, because motors give only finite torques. The velocity
-    just after the impact solves :math:`M_+ \nu_+ = G^T \mathrm{diag}(M, M_p) (\nu_-, V_p)`. G is
-    the Jacobian of the velocities of robot and payload with respect to the velocity of the
-    combined robot. The solution is the M-orthogonal projection onto the motions that the rigid
-    grasp permits. The impact conserves linear and angular momentum.
+    The joints are free during the impact, because the finite torques of motors have no effect in
+    an instant. The velocity :math:`\nu_+` just after the impact solves
+    :math:`M_+ \nu_+ = G^T \mathrm{diag}(M, M_p) (\nu_-, V_p)`. Just before the impact,
+    :math:`\nu_-` is the velocity of the robot, :math:`V_p` is the velocity of the payload, and M
+    and :math:`M_p` are their inertia matrices. :math:`M_+` is the inertia matrix of the combined
+    robot. G is the Jacobian that maps the velocity of the combined robot to the velocities of robot
+    and payload.
+
+    The solution is the projection of the velocities onto the motions that the rigid grasp permits,
+    orthogonal with respect to the inertia. The impact conserves linear and angular momentum.
 
     Parameters
     ----------
@@ -262,19 +277,20 @@ def capture(
     frame : str
         Name of the grasping frame.
     payload : pin.Inertia or Robot
-        A rigid body with its inertia in its own frame, or a robot that is grasped at its base.
-        The joints of a payload robot keep their springs and dampers and lose their motors.
+        The inertia of a rigid body in the payload's frame, or a robot that is grasped at its base.
+        If the payload is a robot, its joints keep their springs and dampers but lose their motors.
     q, v : array_like (nq,), (nv,), optional
         Configuration and velocity of the robot just before the impact; neutral and at rest by
         default.
     placement : pin.SE3, optional
         Placement of the payload's frame in the grasping frame; the identity by default.
     payload_q : array_like (nq,), optional
-        Configuration of a payload with joints, neutral by default. The base pose in `payload_q`
-        is ignored.
+        Configuration of a payload with joints; neutral by default. The base pose in `payload_q`
+        is ignored, because `placement` defines the pose.
     payload_v : array_like (6,) or (nv,), optional
-        Twist of the payload's frame in its own axes (Pinocchio's LOCAL), linear [m/s], then
-        angular [rad/s], followed by the joint rates; at rest by default.
+        Velocity of the payload; at rest by default. The first six entries are the twist of the
+        payload's frame in its own axes (Pinocchio's LOCAL): linear [m/s], then angular [rad/s].
+        The joint rates of the payload follow.
     prefix : str
         Name of the payload's frame. The payload's joints and links are named PREFIX.NAME.
 
@@ -285,22 +301,22 @@ def capture(
     Raises
     ------
     UnknownNameError
-        If there is no such frame.
+        If the robot has no frame with the given name.
     InputError
         If one of these conditions is true:
 
-        - a size or value is wrong;
+        - an argument has a wrong size or value;
         - the payload's inertia is not physically realisable;
         - the robot already has names with this prefix;
         - robot and payload have different gravity or orbits;
         - a wheel of the payload has momentum but no inertia.
     ModelError
-        If the model of a robot was changed after the robot was made.
+        If the Pinocchio model of the robot or of the payload was modified after its creation.
 
     References
     ----------
-    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989, for free joints. The
-    impact is the perfectly inelastic collision of two bodies.
+    The impact is a perfectly inelastic collision of two bodies. For the dynamics of a robot with
+    free joints, see Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
 
     Examples
     --------

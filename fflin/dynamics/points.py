@@ -22,14 +22,14 @@ LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
 def configuration(
     robot: Robot, joints: Mapping[str, float] | None = None, base: pin.SE3 | None = None
 ) -> Array:
-    """Return a Pinocchio configuration, from joint values by name and a base placement.
+    """Return the Pinocchio configuration with the named joint values and base placement.
 
     Parameters
     ----------
     robot : Robot
     joints : mapping, optional
-        {joint: value [rad|m]} of independent joints; all other joints are at their neutral
-        positions. A name may be a pattern, ``hinge_*``.
+        Values of independent joints by name, {joint: value [rad|m]}. All other joints are at their
+        neutral positions. A name may be a pattern such as ``hinge_*``.
     base : pin.SE3, optional
         Placement of the base in the world; the identity by default.
 
@@ -40,7 +40,7 @@ def configuration(
     Raises
     ------
     UnknownNameError
-        If there is no such joint.
+        If a name or pattern in `joints` matches no joint.
     InputError
         If a value is not a finite number, or a named joint is a mimic joint.
 
@@ -102,15 +102,18 @@ def point_of(
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
-    """Return a Pinocchio velocity, from joint rates and base velocities by name.
+    """Return the Pinocchio velocity with the named joint rates and base velocities.
 
     Parameters
     ----------
     robot : Robot
     values : mapping
-        {name: rate}, with joint names [rad/s|m/s], and omega_b.x, .y, .z [rad/s] and v_b.x, .y, .z
-        [m/s] of the base in base axes. All other rates are zero. A name may be a pattern,
-        ``hinge_*``, or a group, ``qdot_m``.
+        Rates by name, {name: rate}; all other rates are zero. A name is one of
+
+        - a joint [rad/s|m/s];
+        - a component of the base velocity in base axes: omega_b.x, .y, .z [rad/s] or v_b.x, .y, .z
+          [m/s];
+        - a pattern such as ``hinge_*``, or a group such as ``qdot_m``.
 
     Returns
     -------
@@ -119,7 +122,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     Raises
     ------
     UnknownNameError
-        If there is no such joint or component.
+        If a name or pattern in `values` matches no joint and no velocity component.
     InputError
         If a value is not a finite number.
 
@@ -139,13 +142,14 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
 
 
 def effort(robot: Robot, values: Mapping[str, float]) -> Array:
-    """Return an input vector u, from values by name.
+    """Return the input vector u with the named values.
 
     Parameters
     ----------
     robot : Robot
     values : mapping
-        {name of an input, group or pattern, such as ``tau_m``: value}; all other inputs are zero.
+        Values by name, {name: value}; all other inputs are zero. A name is an input, a group such
+        as ``tau_m``, or a pattern.
 
     Returns
     -------
@@ -154,7 +158,7 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     Raises
     ------
     UnknownNameError
-        If there is no such input.
+        If a name or pattern in `values` matches no input.
     InputError
         If a value is not a finite number.
 

@@ -32,38 +32,40 @@ _INVALID = 2  # status of a step
 
 
 class CLaw:
-    """Policy that compiles the C code of `write_c` and calls it.
+    """Policy that compiles C code written by `write_c` and calls it.
 
-    The C compiler of the system (``cc``) makes a shared library of the code in a temporary folder.
+    The C compiler of the system (``cc``) compiles the code to a shared library in a temporary
+    folder.
 
     Parameters
     ----------
     folder : path
         Folder that `write_c` wrote.
     name : str, optional
-        The `name` given to `write_c`; necessary only if the folder contains several laws.
+        The `name` given to `write_c`; required only if the folder contains several control laws.
     compiler : str
-        Command of the C compiler.
+        Command that runs the C compiler.
 
     Attributes
     ----------
     name : str
-        Name of the code, see `write_c`.
+        The `name` given to `write_c`, with which all names in the C code begin.
     dt : float
-        Sampling time [s]; 0 for a law that is not sampled.
+        Sampling time [s] of the control law; 0 in continuous time.
     frame : str
-        Axes of the inputs, as in `LinearModel`.
+        Axes of the inputs on the base, as in `LinearModel`.
     origin : pin.SE3 or None
-        Reference of the state and of the axes of the inputs.
+        Reference placement of the state and of the inputs on the base.
 
     Raises
     ------
     FileError
-        If the folder does not contain the files of one law, or the files were edited.
+        If the folder contains no law, or several laws without `name`, or the files were edited.
     MissingPackageError
         If there is no C compiler.
     InputError
-        If the code cannot be compiled, or was written from a design without a model.
+        If the code cannot be compiled, or was written from a `Compensator`, which contains no
+        model.
 
     Examples
     --------
@@ -121,12 +123,14 @@ class CLaw:
         return f"CLaw('{self.name}', {about['kind']}, {about['real']}, dt={self.dt:g} s)"
 
     def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot, with a separate memory for each call.
+        """Return the function policy(t, q, v) -> u for a robot.
+
+        Each call of `bind` returns a policy with a separate controller memory.
 
         Raises
         ------
         InputError
-            If states, inputs or outputs of the robot differ from those of the C code.
+            If the states, inputs or outputs of the robot differ from the C code.
         """
         made = f"the C code '{self.name}' was made from the {self._about['title']}"
         state = StateMap(robot, reference=self.origin, frame=self.frame)
@@ -159,7 +163,7 @@ class CLaw:
         return policy
 
     def output_step(self, z: Array, y: Array, t: float) -> tuple[Array, Array]:
-        """Return u and the next controller state z of one step with the outputs y."""
+        """Return u and the next controller state from the controller state z and outputs y."""
         real = self._real
         memory = (real * max(len(z), 1))(*z.tolist())
         u = (real * len(self._about["u0"]))()

@@ -37,38 +37,39 @@ def write_c(
     name: str = "controller",
     real: str = "double",
 ) -> Path:
-    r"""Write a control law as C99, with a test program.
+    r"""Write a control law as C99 code, with a test program.
 
-    The folder then contains ``NAME.h``, ``NAME.c``, the test program ``NAME_test.c`` and
-    ``NAME.json``, which `CLaw` reads. The code needs no library except ``sqrt``. The code
-    allocates no memory and has no global variables. The header describes each entry of the
-    arguments.
+    The function writes the code to ``NAME.h`` and ``NAME.c``, the test program to ``NAME_test.c``,
+    and a description that `CLaw` reads to ``NAME.json``. The code calls no library function except
+    ``sqrt``, allocates no memory and has no global variables. The header describes each entry of
+    the arguments.
 
-    - For a state feedback, the arguments of ``NAME_step`` are the measured attitude, position,
-      joint angles and velocities. ``NAME_step`` computes the state as `StateMap` does, and from
-      the state the
-      inputs.
-    - For an output feedback, the arguments of ``NAME_step`` are the outputs y and a memory that
-      the caller owns.
-    - For gains along a trajectory, the number of the sample is another argument of ``NAME_step``.
+    The code's function ``NAME_step`` computes the inputs of one sample:
+
+    - For a state feedback, the arguments are the measured attitude, position, joint angles and
+      velocities. ``NAME_step`` computes the state in the same way as `StateMap`, then the inputs
+      from the state.
+    - For an output feedback, the arguments are the outputs y, and the controller memory, which the
+      caller allocates.
+    - For gains along a trajectory, the sample number is an additional argument.
 
     Parameters
     ----------
     law : Gain, StateFeedback, ScheduledFeedback, OutputFeedback, LinearController or GainSchedule
-        Or a `Compensator` or `TrajectoryFeedback`. Controllers and gains along a trajectory must be
-        sampled.
+        Control law, which may also be a `Compensator` or `TrajectoryFeedback`. A controller, or
+        gains along a trajectory, must be in discrete time.
     folder : path
-        Folder for the files; a missing folder is created. Existing files of the same name are
+        Folder for the files; created if it does not exist. Existing files with the same names are
         replaced only if they were written for the same type of law and the same robot.
     robot : Robot, optional
-        Robot of the law. The robot is necessary only for a law from a file whose robot name is
-        not known to `load`.
+        Robot that the law controls. Give the robot only if the law was read from a file and `load`
+        does not know the robot's name in this file.
     limits : "urdf", float, mapping or list, optional
-        Limits of the inputs as in `simulate`. By default the inputs are not limited.
+        Limits at which the inputs saturate, as in `simulate`; none by default.
     name : str
-        Prefix of all names in C, and of the files.
+        Prefix of the file names and of all names in the C code.
     real : {"double", "float"}
-        Type of the numbers.
+        Floating-point type of the C code.
 
     Returns
     -------
@@ -78,8 +79,12 @@ def write_c(
     Raises
     ------
     InputError
-        If the law cannot be written in C, its robot is not known, other files have the same
-        names, or an argument is invalid.
+        If one of these conditions is true:
+
+        - the law cannot be written in C;
+        - the robot of the law is not known;
+        - existing files with the same names were not written for the same law and robot;
+        - an argument is invalid.
     FileError
         If a file cannot be written.
 

@@ -55,10 +55,10 @@ class LeastSquares(
 
 
 class Allocation(namedtuple("Allocation", "asking giving point work problem")):
-    """The robot whose inputs are commanded, and the robot whose inputs realise the command.
+    """Allocation of commands for the inputs of one robot (`asking`) to another robot (`giving`).
 
-    The `point` has q and the inputs of either; `work` is work space. There is no allocation where
-    `problem` has no inputs.
+    `point` holds the configuration q and the inputs of one robot at a time, and `work` is work
+    space. Commands are not allocated if `problem` has no inputs.
     """
 
 

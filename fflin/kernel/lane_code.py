@@ -131,7 +131,7 @@ def _write(builder: Any, value: Any, place: Any) -> None:
 
 @intrinsic
 def load(typing: Any, array: Any, index: Any) -> Any:
-    """Read the number or the lanes at an index of a contiguous array."""
+    """Read an entry of a contiguous array: one number, or one number per lane."""
 
     def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
         value = builder.load(_place(context, builder, array, *arguments))

@@ -40,7 +40,7 @@ floor, whole, root, angle = np.floor, np.rint, np.sqrt, math.atan2
 
 
 def load(array: Any, index: int) -> Any:
-    """Return the number or the lanes at an index."""
+    """Return an entry of an array: one number, or one number per lane."""
     return array[index]
 
 

@@ -187,9 +187,10 @@ class Law(
 
 
 class Grid(namedtuple("Grid", "joint first values stride K offset at")):
-    """Joints (k,) between whose `values` from `first` (k + 1,) on u = offset - K y is interpolated.
+    """Grid of feedback laws u = offset - K y, interpolated over the positions of k joints.
 
-    A step along each of them goes on by `stride` of the gains. `at` (k,) is work space.
+    The grid values of joint i are ``values[first[i]:first[i + 1]]``. The gain at the next value of
+    joint i is ``stride[i]`` gains further in `K`. `at` (k,) is work space.
     """
 
 

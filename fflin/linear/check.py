@@ -10,7 +10,6 @@ from fflin.base.errors import InputError
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, instance, share
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same, sensed
@@ -44,7 +43,7 @@ class Row(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """Whether the error is within the tolerance; False if the error is NaN."""
+        """Whether the error is at most the tolerance; False if the error is NaN."""
         return self.error <= self.tolerance
 
 
@@ -70,12 +69,12 @@ _LOOSEST = 1e-2
 
 @dataclass(frozen=True)
 class Check:
-    """Result of the check of a linear model; prints as tables.
+    """Result of `check`: the errors of a linear model; prints as a table.
 
     Attributes
     ----------
     rows : tuple of Row
-        All errors, each with its tolerance.
+        One row per comparison of a block of A or B, with its error and tolerance.
     title : str
         Description of the checked model.
 
@@ -92,7 +91,7 @@ class Check:
 
     @property
     def ok(self) -> bool:
-        """Whether every error is within its tolerance."""
+        """Whether no error exceeds its tolerance."""
         return all(row.ok for row in self.rows)
 
     @property
@@ -102,7 +101,7 @@ class Check:
 
     @property
     def failures(self) -> tuple[Row, ...]:
-        """Rows whose error exceeds the tolerance."""
+        """Rows in which the error exceeds the tolerance."""
         return tuple(row for row in self.rows if not row.ok)
 
     def __str__(self) -> str:
@@ -131,32 +130,34 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 
     A and B are compared block by block with
 
-    - Pinocchio's ABA derivatives, mapped into the chart (tolerance 1e-9, relative);
+    - Pinocchio's ABA derivatives, mapped into the attitude chart of the model (relative tolerance
+      1e-9);
     - sixth-order central differences of the nonlinear model :math:`\dot x = f(x, u)` in the same
-      chart (tolerance 1e-8). The function f is itself verified by integrated motions.
+      chart (relative tolerance 1e-8). The function f is itself compared with integrated motions.
 
-    Tolerances are proportional to round-off errors, which grow with the condition number of M.
+    For an ill-conditioned inertia matrix M, the tolerances are larger, because round-off errors
+    grow with the condition number of M.
 
     Parameters
     ----------
     robot : Robot
-        Robot that the model should describe.
+        Robot whose linear model is checked.
     lin : LinearModel
-        Model in continuous time, from `linearize`, a file or another tool.
+        Continuous-time model from `linearize`, a file or another tool.
     tolerance : float, optional
-        Relative tolerance that replaces the tolerance of every error, such as 1e-5 if another tool
-        computed A and B by finite differences.
+        Relative tolerance for all errors, instead of the default tolerances. For example, use 1e-5
+        if another tool computed A and B by finite differences.
 
     Returns
     -------
     Check
-        Result with ``ok``, ``max_error`` and ``rows``; printable.
+        Result, which prints as a table; ``ok`` is True if no error exceeds its tolerance.
 
     Raises
     ------
     InputError
-        If the model is sampled, its states or inputs differ from the robot's, or the tolerance is
-        not between 0 and 1.
+        If the model is in discrete time, the model and the robot have different states or inputs,
+        or the tolerance is not between 0 and 1.
 
     Examples
     --------
@@ -253,7 +254,7 @@ def _point_errors(
     mobility, input_mobility = mobilities(M, lin.B)
     rate = model(lin.x0, lin.u0)
     # In an orbit it is the absolute velocity whose terms cancel.
-    field = field_of(state.robot, state.frame)
+    field = state.field
     _, rate_of_turn, momentum = speeds(state, field.absolute(q, v) if field else v)
     push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
     push += rate_of_turn**2 * float((1.0 / mobility).max())

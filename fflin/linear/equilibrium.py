@@ -31,19 +31,19 @@ _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium(FrozenArrays):
-    """Equilibrium of a robot: minimum-norm inputs, spring deflections and residual forces.
+    """Result of `equilibrium`: minimum-norm inputs, spring deflections and residual forces.
 
     Attributes
     ----------
     q : ndarray (nq,)
-        Equilibrium configuration, the argument q of `linearize`. The equilibrium differs from the
-        given configuration by the spring deflections of passive joints.
+        Equilibrium configuration, for the argument q of `linearize`. This configuration differs
+        from the given configuration by the spring deflections of joints without a motor.
     u : ndarray (nu,)
-        Minimum-norm inputs, the argument u of `linearize`.
+        Minimum-norm inputs, for the argument u of `linearize`.
     sag : ndarray (n,)
         Deflection of each joint from its given position [rad | m].
     residual : ndarray (6 + n,)
-        Generalised forces that the inputs do not balance; forces on the base in base axes.
+        Generalised forces that the inputs do not balance. Forces on the base are in base axes.
     input_names, input_units : tuple of str
         Names and units of u.
     force_names, force_units : tuple of str
@@ -91,25 +91,27 @@ def equilibrium(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
 ) -> Equilibrium:
-    r"""Compute the minimum-norm inputs that balance all forces on a robot, with spring deflections.
+    r"""Compute the spring deflections and the minimum-norm inputs that balance all forces.
 
     The forces are the same as in `linearize`: springs, gravity, dampers, and the inertial forces of
-    a steady motion. In orbit, the forces include the gravity gradient and the inertial forces of
-    the rotating orbital frame, in which the base is at rest. `relative_equilibria` finds
-    attitudes in which no torque on the base is necessary. With f the generalised forces without
-    u, the inputs solve
+    a steady motion. In orbit, the base is at rest in the rotating orbital frame, and the forces
+    include the gravity gradient and the inertial forces of this frame. To find attitudes at which
+    the base needs no torque in orbit, use `relative_equilibria`.
+
+    Let f be the generalised forces on the robot without the inputs u, and B the matrix from u to
+    generalised forces. The inputs solve
 
     .. math::
         \min \|u\|_2 \quad \text{subject to} \quad B(q)\,u = -f(q, v), \qquad
         u_k \ge 0 \text{ for every thruster } k.
 
-    The norm of u is the norm of its numerical values in SI units. The rows of the force balance,
-    in N m and N, are scaled by :math:`\sqrt{(M^{-1})_{ii}}`, so that different units become
-    comparable. The weighted residual must not exceed 1e-9 of the balanced forces.
+    The norm of u is the norm of its numerical values in SI units. The force balance has rows in N m
+    and in N. To make these rows comparable, row i is scaled by :math:`\sqrt{(M^{-1})_{ii}}`, with
+    the inertia matrix M. The scaled residual must not exceed 1e-9 of the balanced forces.
 
     A joint with a spring but without a `JointTorque` deflects, unless another input balances the
-    force on the joint. Newton's method finds the deflected position, with the Jacobian
-    :math:`M\,\partial\dot\nu/\partial q_m`.
+    force on the joint. Newton's method finds the deflected position. Its Jacobian is
+    :math:`M\,\partial\dot\nu/\partial q_m`, with the acceleration :math:`\dot\nu` of the robot.
 
     Parameters
     ----------
@@ -117,21 +119,21 @@ def equilibrium(
     q : array_like (nq,), optional
         Configuration in Pinocchio's order; neutral by default.
     v : array_like (nv,), optional
-        Velocity of a steady motion, which is constant in base axes; at rest by default. No joints
-        except rotors may move, see `LinearModel.ignorable`. Under gravity, the base may rotate only
-        about the vertical.
+        Velocity of a steady motion, which must be constant in base axes; at rest by default. Only
+        joints that are rotors may move, see `LinearModel.ignorable`. Under gravity, the base may
+        rotate only about the vertical.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the inputs on the base, as in `linearize`.
     reference : pin.SE3, optional
         Placement whose axes are the reference axes, as in `linearize`. The default is the base
-        placement, with inputs on the base in base axes for any `frame`. For a robot in orbit, the
-        default is the orbital frame.
+        placement; inputs on the base are then in base axes for any `frame`. For a robot in orbit,
+        the default is the orbital frame.
 
     Returns
     -------
     Equilibrium
-        Equilibrium for ``linearize(robot, result.q, v, u=result.u)`` with the same frame and
-        reference.
+        Result with q and u for ``linearize(robot, result.q, v, u=result.u)``, which needs the same
+        `frame` and `reference`.
 
     Raises
     ------
@@ -140,17 +142,17 @@ def equilibrium(
 
         - no inputs balance the forces; the message names the residual forces;
         - springs are too weak for their load, or Newton's method does not converge;
-        - the motion cannot be steady under any inputs.
+        - no inputs can make the motion steady.
     InputError
-        If a size is wrong or an entry is not a number.
+        If an argument has a wrong size or an entry that is not a number.
     ChartError, SingularInertiaError
-        As in `linearize`.
+        Under the same conditions as in `linearize`.
 
     Notes
     -----
-    With the bounds of thrusters, the minimisation is a least-distance problem, which non-negative
-    least squares solve exactly (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974,
-    chapter 23).
+    If the robot has thrusters, the minimisation is a least-distance problem because of the bounds.
+    Non-negative least squares solve this problem exactly (C. Lawson and R. Hanson, Solving Least
+    Squares Problems, 1974, chapter 23).
 
     Examples
     --------

@@ -81,18 +81,20 @@ def outputs(
 ) -> Array:
     """Return the outputs y of a robot in the coordinates of a linear model.
 
-    - Attitudes are in the model's chart, with q0 >= 0.
-    - Rotations of frames are relative to the point of linearisation.
-    - Angles of continuous joints are unwrapped to be nearest to the point of linearisation.
+    - Attitudes are in the model's chart, for the sign of the quaternion with a scalar part q0 >= 0.
+    - Rotations of frames are relative to their attitudes at the operating point.
+    - Angles of continuous joints are unwrapped to be nearest to their values at the operating
+      point.
 
-    The input of a controller designed for the linear model is ``y - lin.y0``.
+    Give ``y - lin.y0`` to a controller that was designed for the linear model.
 
     Parameters
     ----------
     robot : Robot
-        Robot with the states, inputs and outputs of the model; its masses may differ.
+        Robot with the same states, inputs and outputs as the model. Its masses may differ from the
+        robot that was linearised.
     lin : LinearModel
-        Model that defines the reference and the point.
+        Model that defines the reference and the operating point.
     q, v : array_like (nq,), (nv,)
         Configuration and velocity in Pinocchio's order; v is zero by default.
     u : array_like (nu,), optional
@@ -106,7 +108,8 @@ def outputs(
     Raises
     ------
     InputError
-        If a size is wrong, the model does not fit the robot, or the model has a moving reference.
+        If an argument has a wrong size, the model and the robot have different signals, or the
+        model has a moving reference.
 
     Examples
     --------
@@ -135,18 +138,19 @@ def outputs(
 
 
 def line_up(gain: Any, lin: LinearModel) -> Array:
-    """Return the K of a gain for another model, with states and inputs matched by name.
+    """Return the matrix K of a gain for another model, with states and inputs matched by name.
 
-    A robot keeps most of its states when a joint jams, or when it captures a payload. Columns of
-    K for states that the gain lacks are zero, and so are rows for inputs that the gain lacks.
-    States and inputs that the model lacks are dropped.
+    Use `line_up` to keep a gain after a change of the robot, such as a jammed joint or a captured
+    payload, which leaves most states the same. If the model has a state or an input that the gain
+    lacks, this column or row of K is zero. If the gain has a state or an input that the model
+    lacks, this column or row is dropped.
 
     Parameters
     ----------
     gain : Gain or GainBatch
-        Gain or gains of the first model.
+        Gain or gains of the robot before the change.
     lin : LinearModel
-        Model that needs the gain.
+        Model of the robot after the change.
 
     Returns
     -------
@@ -155,8 +159,8 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
     Raises
     ------
     InputError
-        If gain and model have different frames or sampling times, or if they belong to different
-        robots (each has states or inputs that the other lacks).
+        If gain and model have different frames or sampling times, or if each of them has states or
+        inputs that the other lacks, because they then belong to different robots.
 
     Examples
     --------

@@ -31,18 +31,20 @@ if TYPE_CHECKING:
 class LinearTrajectory(Trajectory):
     r"""Error dynamics along a motion, ``d(dx)/dt = A(t) dx + B(t) du``, ``dy = C dx + D du``.
 
-    The error dx is in the moving base's own axes, see `Linearizer` (``moving=True``). Torques and
-    forces on the base in du are in base axes. If ``dt`` is positive, the left side is the error
-    at the next knot. ``along[k]`` is the linear model at knot k.
+    The errors dx and du are the differences from the motion. The error dx is in the axes of the
+    moving base, see `Linearizer` (``moving=True``). Torques and forces on the base in du are also
+    in base axes. If ``dt`` is positive, the model is in discrete time: the left side of the first
+    equation is the error dx at the next knot. For a LinearTrajectory ``along``, ``along[k]`` is the
+    linear model at knot k.
 
     Attributes
     ----------
     A : ndarray (N, nx, nx)
-        State matrices at the knots. If ``dt`` is positive, there are N - 1 transition matrices
-        from one knot to the next.
+        State matrices at the knots. If ``dt`` is positive, A contains N - 1 discrete-time state
+        matrices, each from one knot to the next.
     B : ndarray (N, nx, nu)
-        Input matrices at the knots. If ``dt`` is positive, there are N - 1 transition matrices
-        from one knot to the next.
+        Input matrices at the knots. If ``dt`` is positive, B contains N - 1 discrete-time input
+        matrices, each from one knot to the next.
     C : ndarray (N, ny, nx)
         Output matrices at the knots.
     D : ndarray (N, ny, nu)
@@ -52,7 +54,7 @@ class LinearTrajectory(Trajectory):
     state_names, input_names, output_names : tuple of str
         Names of dx, du and dy.
     dt : float
-        Hold time of du [s]; 0 for continuous time.
+        Sampling time [s], during which du is constant; 0 in continuous time.
     robot, t, q, v, u, hold, frame : see `Trajectory`
 
     Examples
@@ -109,12 +111,12 @@ class LinearTrajectory(Trajectory):
         return Linearizer(self.robot, moving=True)
 
     def matrices(self, t: float) -> tuple[Array, Array]:
-        """Return A (nx, nx) and B (nx, nu) about the point at time t [s], also between knots."""
+        """Return A (nx, nx) and B (nx, nu) about the motion at time t [s], also between knots."""
         A, B = self.matrices_at(np.array([self._within(t)]))
         return A[0], B[0]
 
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
-        """Return A (k, nx, nx) and B (k, nx, nu) at the times (k,), see `matrices`."""
+        """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), with one matrix pair per time."""
         placements = [interval_of(self.t, t) for t in times.tolist()]
         sampled = bool(self.dt)
         knot = np.array([k + (share == 1.0 and not sampled) for k, share in placements])
@@ -126,26 +128,31 @@ class LinearTrajectory(Trajectory):
         return A, B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
-        """Evaluate arrays at one time: interpolated between knots, or held since the last knot."""
+        """Return the values of arrays given at the knots, at one time.
+
+        In continuous time, the values are interpolated between knots. In discrete time, they are
+        held from the previous knot.
+        """
         k, fraction = interval_of(self.t, self._within(t))
         if self.dt or not fraction:
             return tuple(each[k] for each in arrays)
         return tuple(each[k] + fraction * (each[k + 1] - each[k]) for each in arrays)
 
     def check(self) -> Check:
-        """Check every knot by `fflin.check`, and return the largest value of each error."""
+        """Check the linear model at every knot by `fflin.check`, and return the largest errors."""
         from fflin.linear.check import check_all
 
         return check_all(self.robot, self, f"{self.robot.name}, {len(self)} knots")
 
     @in_one_thread
     def discretize(self, dt: float) -> LinearTrajectory:
-        r"""Return the sampled model along the motion, with du held constant over each sample.
+        r"""Return the discrete-time model along the motion, with du constant over each sample.
 
-        The transition matrix solves :math:`\dot\Phi = F(t)\,\Phi` with F = [[A, B], [0, 0]] (10.3).
-        Each step uses two exponentials of F, evaluated on the motion itself. The method has order
-        four and is exact if F is constant. Steps are halved until the result changes by less than
-        1e-8.
+        The transition matrix :math:`\Phi` solves :math:`\dot\Phi = F(t)\,\Phi` with F = [[A, B],
+        [0, 0]], see (10.3) of docs/derivation.md. Each integration step uses two matrix
+        exponentials of F, with A and B evaluated on the motion between the knots. The method has
+        order four and is exact if F is constant. The steps are halved until the result changes by
+        less than 1e-8.
 
         Parameters
         ----------
@@ -155,7 +162,7 @@ class LinearTrajectory(Trajectory):
         Raises
         ------
         InputError
-            If the duration is not a multiple of dt, or the model is already sampled.
+            If the duration is not a multiple of dt, or the model is already in discrete time.
         """
         if self.dt:
             raise InputError(
@@ -168,7 +175,7 @@ class LinearTrajectory(Trajectory):
 
     @classmethod
     def load(cls, path: str | Path, robot: Robot) -> LinearTrajectory:  # type: ignore[override]
-        """Read a file that `save` wrote for this robot; every value is restored bit for bit."""
+        """Read a file that `save` wrote for this robot, and restore every value bit for bit."""
         return cls._read(path, robot=robot)
 
 
@@ -190,12 +197,13 @@ def linearize_trajectory(
     t : Trajectory or array_like (N,)
         The motion as a `Trajectory`, or the times of its knots [s].
     q, v, u : array_like, optional
-        Configurations, velocities and inputs at the knots, see `Trajectory`; required if t
-        contains times.
+        Configurations, velocities and inputs at the knots, see `Trajectory`. Give these arguments
+        only if t contains times.
     strict : bool
-        Whether to refuse knots that violate the robot's dynamics with a residual above 1e-2.
+        Whether to raise an error, instead of a warning, if the knots violate the robot's dynamics
+        with a residual above 1e-2.
     **options
-        hold and frame, see `Trajectory`.
+        The options `hold` and `frame` of `Trajectory`.
 
     Returns
     -------
@@ -210,8 +218,8 @@ def linearize_trajectory(
     Warns
     -----
     FflinWarning
-        If the knots do not satisfy the robot's dynamics. The warning names the interval with the
-        largest error, the error, and usual causes.
+        If the knots violate the robot's dynamics. The warning reports the largest error, the
+        interval in which it occurs, and usual causes.
 
     Examples
     --------

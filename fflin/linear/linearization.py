@@ -17,7 +17,7 @@ from fflin.base.validation import Array, frozen, truth, vector
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import Chart, Standing, refuse_orbit, unknown_frame
 from fflin.dynamics.orbital import mean_motion
-from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, rotor_names
+from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
 from fflin.linear.model import LinearModel
@@ -25,7 +25,7 @@ from fflin.linear.state_equations import assemble, at_rest, drift, output_equati
 from fflin.linear.verification import certify, inertia_matrix
 from fflin.robot.joints import ROOT
 from fflin.robot.limits import magnitudes_of
-from fflin.robot.mass_properties import require_inertia
+from fflin.robot.mass_properties import require_inertia, rotor_names
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -187,24 +187,27 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
 
 
 class Linearizer:
-    r"""Linearisation of one robot at many points; data common to all points are prepared once.
+    r"""Linearisation of one robot about many operating points; preparations are made only once.
 
-    Threads may share a `Linearizer`, but only one thread computes at a time. Every copy, also by
-    pickle, has a separate work space.
+    Threads may share a `Linearizer`, but only one thread computes at a time. To compute in
+    parallel, copy or pickle the `Linearizer`: every copy has a separate work space.
 
-    At rest, with N = blkdiag(E3/2, E3, En) and the joint-space inertia M in state order,
+    About a point at rest, the matrices of the linear model are
 
     .. math::
         A = \begin{bmatrix} 0 & N \\ 0 & 0 \end{bmatrix}, \qquad
         B = \begin{bmatrix} 0 \\ M^{-1} \end{bmatrix}.
 
-    At other points :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
-    :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`, then transformed to the chart and the
-    velocity frame. The dynamics do not depend on the position and linear velocity of the base
-    (Galilean invariance). The evaluation sets the position and linear velocity of the base to
-    zero, so that a large distance from the origin does not reduce the accuracy. The equations are
-    in docs/derivation.md. Section 14 of this document is about a robot in orbit, whose rates are
-    relative to the orbital frame.
+    M is the joint-space inertia in state order, and N = blkdiag(E3/2, E3, En) consists of identity
+    matrices of sizes 3, 3 and n.
+
+    About other points, the acceleration :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is
+    differentiated in base axes as :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`. The
+    derivatives are then transformed to the attitude chart and to the axes of `frame`. The position
+    and linear velocity of the base do not affect the dynamics (Galilean invariance). Therefore they
+    are set to zero in the computation, so that a large distance from the origin does not reduce the
+    accuracy. docs/derivation.md derives the equations; its section 14 treats robots in orbit, whose
+    velocities are relative to the orbital frame.
 
     Parameters
     ----------
@@ -213,15 +216,16 @@ class Linearizer:
         Axes of the base velocities and wrenches, see `StateMap`. The default is "hybrid". For a
         robot in orbit, the frames are "lvlh" (default) and "hill".
     reference : pin.SE3, optional
-        Placement to which attitude and position are relative. The default is the base placement
-        at each point, so that q_b and r_b are zero at the point. For a robot in orbit, the
-        default is the orbital frame.
+        Reference placement, relative to which the state gives the base attitude and position. The
+        default is the base placement at each operating point, so that q_b and r_b are zero there.
+        For a robot in orbit, the default is the orbital frame.
     moving : bool
         Whether to return the error dynamics about a moving reference, which passes through the
-        point and obeys the dynamics of the robot. The errors are
-        :math:`q_b = \mathrm{vec}(q^{*-1} q)` and :math:`r_b = R^{*T} (p - p^*)`, the frame is
-        "local", and f0 is zero. Trajectories require a moving reference, and so do relative
-        equilibria such as a steady spin.
+        operating point and obeys the dynamics of the robot. The frame is then "local", and f0 is
+        zero. With the attitude q (rotation matrix R) and the position p of the base, the errors are
+        :math:`q_b = \mathrm{vec}(q^{*-1} q)` and :math:`r_b = R^{*T} (p - p^*)`; a star denotes the
+        reference. Use a moving reference for trajectories, and for relative equilibria such as a
+        steady spin.
 
     Raises
     ------
@@ -231,17 +235,17 @@ class Linearizer:
         - the frame is unknown, or the reference is not a pin.SE3;
         - `moving` is given with a reference, or with a frame other than "local".
     SingularInertiaError
-        If M is singular at every configuration.
+        If the inertia M is singular at every configuration.
     ModelError
-        If Pinocchio's Data for the robot would exceed 1 GiB, or its model was changed after the
-        robot was made.
+        If Pinocchio's Data for the robot would exceed 1 GiB, or the robot's Pinocchio model
+        (``robot.model``) was modified after the robot was created.
 
     Attributes
     ----------
     robot : Robot
         The robot that is linearised.
     prepared : Prepared
-        Data that are the same for all points.
+        Data that are the same for all operating points.
 
     References
     ----------
@@ -335,9 +339,9 @@ class Linearizer:
         return LinearModel(self._fields | made)
 
     def along(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
-        """Return A, B, C, D and y (N, ..) about rows of valid points, with u in base axes.
+        """Return A, B, C, D and y (N, ..) about N valid points, with the inputs u in base axes.
 
-        The models must be relative to the placement of the base at each point.
+        Each model must be relative to the base placement at its point.
         """
         ready, lower, count = self.prepared, self._lower, len(q)
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing
@@ -388,7 +392,7 @@ def linearize(
     reference: pin.SE3 | None = None,
     moving: bool = False,
 ) -> LinearModel:
-    """Linearise a robot about a point, by default at rest with neutral joints.
+    """Linearise a robot about an operating point, by default at rest with neutral joints.
 
     Parameters
     ----------
@@ -403,15 +407,16 @@ def linearize(
         Axes of the base's velocities and wrenches, see `StateMap`; by default
         "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
-        Pose that attitude and position are relative to; by default the base pose,
-        or the orbit's frame if the robot is in orbit.
+        Reference pose, relative to which the state gives the base attitude and position. The
+        default is the base pose at the operating point, or the orbital frame in orbit.
     moving : bool
-        Return the error dynamics about a reference that moves through the point.
+        Whether to return the error dynamics about a reference that moves through the operating
+        point; see `Linearizer`.
 
     Returns
     -------
     LinearModel
-        See `Linearizer` for the equations, and to linearise at many points.
+        Linear model; `Linearizer` gives its equations, and linearises about many points.
 
     Raises
     ------
@@ -420,9 +425,9 @@ def linearize(
     ChartError
         If the base is rotated by 180 deg from the reference.
     SingularInertiaError
-        If a joint moves no mass.
+        If the inertia matrix is singular because a joint moves no mass.
     ModelError
-        If the robot is too large.
+        If the robot is too large for the memory limit, see `Linearizer`.
 
     Examples
     --------

@@ -50,24 +50,28 @@ class Trajectory(Design):
     v : array_like (N, nv)
         Velocities in Pinocchio's order.
     u : array_like (N, nu) or (N - 1, nu)
-        Inputs at the knots. With N - 1 rows, each row applies to one interval between knots.
+        Inputs at the knots. If u has N - 1 rows, each row applies to one interval between knots.
     hold : {"linear", "previous"}, optional
-        Inputs between the knots: "linear" interpolates, "previous" holds the value of the previous
-        knot, like a digital controller. The default is "linear", or "previous" if u has N - 1
-        rows.
+        Inputs between the knots: "linear" interpolates, and "previous" holds the value of the
+        previous knot, like a digital controller. The default is "linear", or "previous" if u has
+        N - 1 rows.
     frame : {"local", "hybrid", "world"}
-        Axes of the force and torque on the base. Held forces and torques are constant in these
-        axes. local: base axes. hybrid: force in world axes, torque in base axes. world: force and
-        torque in world axes.
+        Axes of the force and torque on the base:
+
+        - local: force and torque in base axes;
+        - hybrid: force in world axes, torque in base axes;
+        - world: force and torque in world axes.
+
+        If the inputs are held ("previous"), the force and torque are constant in these axes.
     verified : bool
-        False for data from a file without a SHA-256 digest. Damage to such a file cannot be
+        False for data from a file without a SHA-256 digest, because damage to such a file cannot be
         detected.
 
     Raises
     ------
     InputError
-        If a size is wrong, the times do not increase, or a row is not a valid configuration,
-        velocity or input.
+        If an array has a wrong size, the times do not increase, or a row is not a valid
+        configuration, velocity or input.
 
     Examples
     --------
@@ -149,22 +153,23 @@ class Trajectory(Design):
 
     @cached_property
     def flow(self) -> Flow:
-        """Motion between the knots."""
+        """Interpolation of the motion between the knots."""
         return Flow(self._state, self.t, self.q, self.v, self.u, self.hold == "previous")
 
     @cached_property
     def u_base(self) -> Array:
-        """Inputs (N, nu) just after each knot; inputs on the base are in base axes."""
+        """Inputs (N, nu) just after each knot, with inputs on the base in base axes."""
         state = self._state
         return frozen(Actuation(state).in_base_axes(state.charts(self.q), self.u))
 
     @property
     def residual(self) -> Array:
-        """Residual (N,) of the motion at each knot: the larger error of the two adjacent intervals.
+        """Residual (N,) at each knot, which shows how well the motion obeys the robot's dynamics.
 
-        Each interval is integrated from its first knot under its inputs. The error of the interval
-        is the difference between the integrated state and the next knot, divided by the duration of
-        the interval and by the largest rate of the motion; see `Flow`.
+        From each knot, the dynamics are integrated to the next knot under the given inputs. The
+        error of this interval is the difference between the integrated state and the next knot,
+        divided by the duration of the interval and by the largest rate of the motion; see `Flow`.
+        The residual of a knot is the larger error of its two adjacent intervals.
         """
         found = self.flow.residual
         return np.maximum(np.append(found, 0.0), np.append(0.0, found))
@@ -172,7 +177,8 @@ class Trajectory(Design):
     def point(self, t: float) -> tuple[Array, Array, Array]:
         """Return q (nq,), v (nv,), and u (nu,) in base axes, at time t [s].
 
-        Between knots, q and v are cubics that match the robot's velocities and accelerations.
+        Between knots, q and v are cubic polynomials that match the robot's velocities and
+        accelerations at the knots.
 
         Raises
         ------
@@ -182,9 +188,10 @@ class Trajectory(Design):
         return self.flow.at(self._within(t))
 
     def resampled(self, dt: float) -> Trajectory:
-        """Return the same motion with knots every dt [s] and a knot at the end, see `point`.
+        """Return the same motion, interpolated by `point`, with knots every dt [s] and at the end.
 
-        Held inputs are unchanged if every old knot is also a new knot.
+        If inputs are held and every old knot is also a new knot, the inputs are the same functions
+        of time.
         """
         times = self.samples(dt)
         if times[-1] < self.t[-1]:
@@ -210,8 +217,8 @@ class Trajectory(Design):
         """Warn if the residual of the motion exceeds 1e-2, or raise `InputError` if `strict`.
 
         The message gives the interval with the largest error, this error, and the number of
-        intervals with errors above 1e-2. If the motion overflows, `InputError` is raised in
-        either case.
+        intervals with errors above 1e-2. If the integration overflows, `InputError` is raised even
+        without `strict`.
         """
         fault = self._fault
         if fault and (strict or self.flow.residual.max() == np.inf):
@@ -263,14 +270,14 @@ class Trajectory(Design):
     ) -> Trajectory:
         """Read a trajectory that `save`, `Motion.save` or another program wrote.
 
-        A .npz, .mat or .json file has the entries
+        A .npz, .mat or .json file contains the entries
 
         - t (N,);
         - q and v, or the states x (N, nx) of `StateMap`;
         - u, with one row for each knot;
         - optionally the texts `hold` and `frame`.
 
-        A .csv file has the named columns
+        A .csv file contains the named columns
 
         - t;
         - q[0] ... and v[0] ..., or the names of the states, such as q_b.x;
@@ -282,8 +289,8 @@ class Trajectory(Design):
         path : str or Path
         robot : Robot
         hold, frame : str, optional
-            Options of `Trajectory`; by default as in the file. If the file contains x, `frame` is
-            also the frame of the velocities in x.
+            Options of `Trajectory`, by default as in the file. If the file contains x, `frame` also
+            defines the axes of the velocities in x.
 
         Raises
         ------
