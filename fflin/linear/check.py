@@ -70,7 +70,7 @@ _LOOSEST = 1e-2
 
 @dataclass(frozen=True)
 class Check:
-    """Result of `check`: the errors of a linear model; prints as a table.
+    """Result of `check`: the errors of a linear model; ``print`` shows a table.
 
     Attributes
     ----------
@@ -152,7 +152,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     Returns
     -------
     Check
-        Result, which prints as a table; ``ok`` is True if no error exceeds its tolerance.
+        Result, in which ``ok`` is True if no error exceeds its tolerance.
 
     Raises
     ------
