@@ -21,12 +21,12 @@ from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
-from fflin.dynamics.rnea import rotor_names
 from fflin.linear.equilibrium import equilibrium
 from fflin.linear.linear_trajectory import LinearTrajectory, Steps, along, transitions
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
+from fflin.robot.mass_properties import rotor_names
 
 
 @in_one_thread
