@@ -10,7 +10,6 @@ from fflin.base.errors import InputError
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, instance, share
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same, sensed
@@ -255,7 +254,7 @@ def _point_errors(
     mobility, input_mobility = mobilities(M, lin.B)
     rate = model(lin.x0, lin.u0)
     # In an orbit it is the absolute velocity whose terms cancel.
-    field = field_of(state.robot, state.frame)
+    field = state.field
     _, rate_of_turn, momentum = speeds(state, field.absolute(q, v) if field else v)
     push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
     push += rate_of_turn**2 * float((1.0 / mobility).max())
