@@ -61,18 +61,18 @@ class Motion(Design):
         Angular momentum about the centre of mass [N m s], then linear momentum [N s], in world
         axes. In orbit, `momentum` is the momentum of the motion relative to the orbital frame.
     momentum_drift : ndarray (N,)
-        Relative error of the simulated momentum: its difference from the initial momentum plus
-        the impulse of external forces, divided by the largest momentum that the kinetic energy
-        permits. This divisor is, see (11.5) of docs/derivation.md:
+        Relative error of the simulated momentum. The expected momentum is the initial momentum
+        plus the impulse of external forces. The difference from the expected momentum is divided
+        by the largest momentum that the kinetic energy permits, see (11.5) of docs/derivation.md:
 
-        - for the linear part: the mass times the root-mean-square speed of the mass elements in
-          the row with the fastest motion;
-        - for the angular part: the divisor of the linear part times the radius of gyration about
-          the initial base position, plus the momentum stored in wheels.
+        - Linear momentum is divided by the mass times the root-mean-square speed of the mass
+          elements in the row with the fastest motion.
+        - Angular momentum is divided by this value times the radius of gyration about the initial
+          base position, plus the momentum stored in wheels.
 
-        In orbit, momentum is not conserved, so the drift is the relative error of `energy`
-        instead: its difference from the initial energy plus the work of inputs and disturbances,
-        divided by the largest terms of the energy.
+        In orbit, momentum is not conserved. Therefore the drift in orbit is the relative error of
+        `energy`: the difference from the expected energy, divided by the largest terms of the
+        energy. The expected energy is the initial energy plus the work of inputs and disturbances.
     com_drift : ndarray (N,)
         Distance [m] of the centre of mass from the position that follows from its initial
         velocity and the impulse of external forces. The array is empty in orbit, or if the motion
@@ -106,7 +106,7 @@ class Motion(Design):
         Engine that ran the simulation, "compiled" or "python"; empty if the engine is not known.
     limits : ndarray (k, 2)
         Lower and upper limits of the states and inputs in `limit_names`; infinite if a bound does
-        not exist. These limits include limits that the simulation does not enforce.
+        not exist. Limits that the simulation does not enforce are included.
     phases, starts : tuple of str, ndarray (k,)
         Names and start times [s] of the phases, if `then` joined the motion from several phases.
 
@@ -232,7 +232,10 @@ class Motion(Design):
         return attitude_errors(self.x, self.target) if self.target.size else None
 
     def then(self, *later: Impact | Motion) -> Motion:
-        """Join this motion and later phases to one motion, such as ``approach.then(caught, held)``.
+        """Join this motion and later phases into one motion.
+
+        For example, ``approach.then(caught, held)`` joins an approach, the result ``caught`` of a
+        capture, and the motion ``held`` after the capture.
 
         Parameters
         ----------
@@ -244,9 +247,9 @@ class Motion(Design):
         Returns
         -------
         Motion
-            Joined motion on one time axis, with the states and the chart of this motion. The state
-            of a jammed joint is at rest. The energy and momentum of each phase are computed for the
-            robot of this phase, for example with its payload.
+            Joined motion on one time axis, with the states and the chart of this motion. A joint
+            that jams remains a state, and is at rest after the jam. The energy and momentum of each
+            phase are computed for the robot of that phase, for example with its payload.
 
         Raises
         ------

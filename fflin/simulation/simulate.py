@@ -121,9 +121,9 @@ def simulate(
         Function callback(t, q, v, u) that is called at every recorded row.
     linear : LinearModel or bool, optional
         Model that predicts the motion under the same control law. The default is the policy's own
-        model; with False, there is no prediction. A prediction is possible without a policy, and
-        for a StateFeedback, an OutputFeedback or a LinearController. The prediction ignores noise.
-        It is not possible for a discrete-time model that was read from a file.
+        model; with False, there is no prediction. The motion can be predicted without a policy,
+        and for a StateFeedback, an OutputFeedback or a LinearController, but not for a
+        discrete-time model that was read from a file. The prediction ignores noise.
     target : LinearModel or array_like (nx,), optional
         Target state from which errors are measured, or a model whose operating point is the
         target. The default is the operating point of the policy's own model, or the state of the

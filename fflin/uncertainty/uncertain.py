@@ -179,12 +179,13 @@ class Uncertain:
     def worst(
         self, gain: Any, q: Array | None = None, *, samples: int = 200, seed: int = 0
     ) -> Worst:
-        """Search the ranges for the worst closed loop u = -K x, and bound the stable set.
+        """Search the ranges for the worst closed loop u = -K x.
 
-        The result is at least as bad as the loop at every tried corner of the ranges and at every
-        random draw. The gains of the worst case are accurate to five digits. With more samples and
-        the same seed, the result cannot be better, because the search first repeats the search with
-        fewer samples.
+        The result also contains the central fraction of each range in which stability is
+        guaranteed. The worst loop is at least as bad as the loop at every tried corner of the
+        ranges and at every random draw. The gains of the worst case are accurate to five digits.
+        With more samples and the same seed, the result cannot be better, because the search first
+        repeats the search with fewer samples.
 
         Parameters
         ----------

@@ -128,7 +128,7 @@ def visualize(
 
         - the motion or modes belong to another robot, or the modes to a reduced model;
         - no mode oscillates;
-        - pictures of modes are requested;
+        - `png` or `gif` is given for modes, which have no pictures;
         - an argument is invalid, or the port is in use.
     FileError
         If a file cannot be written. Files are written atomically.
