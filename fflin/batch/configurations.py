@@ -42,8 +42,8 @@ class Grid:
     axes : mapping
         {joint: values (k,) [rad|m]}.
     start : ndarray (nq,)
-        Configuration with the base pose, and with the values of the joints that the grid does not
-        vary.
+        Configuration that contains the base pose and the positions of the joints that the grid does
+        not vary.
 
     Examples
     --------
@@ -59,7 +59,7 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of values of each joint."""
+        """Number of values of each joint in `axes`."""
         return tuple(len(values) for values in self.axes.values())
 
     def __len__(self) -> int:
@@ -86,7 +86,7 @@ class RandomConfigurations:
     ranges : mapping
         {joint: (low, high) [rad|m]}.
     start : ndarray (nq,)
-        Configuration with the base pose.
+        Configuration that contains the base pose; random values replace its joint positions.
 
     Examples
     --------
@@ -214,10 +214,10 @@ def random_configurations(
     count : int
         Number of configurations.
     seed : int
-        The same seed gives the same configurations.
+        Random seed. The same seed gives the same configurations.
     ranges : mapping, optional
-        {joint or pattern: (low, high) [rad|m]} instead of the joint limits. Revolute joints
-        without limits are drawn from one full turn.
+        Ranges {joint or pattern: (low, high) [rad|m]} that replace the joint limits. The angle of a
+        revolute joint with neither limits nor a range is drawn from one full turn.
     base : pin.SE3, optional
         Pose of the base; the identity by default.
 
@@ -230,8 +230,8 @@ def random_configurations(
     UnknownNameError
         If a joint does not exist.
     InputError
-        If the count or seed is not a whole number, a range is empty, or a prismatic joint has no
-        limits and no range is given.
+        If the count or seed is not a whole number, a range is empty, or a prismatic joint has
+        neither limits nor a range.
 
     Examples
     --------

@@ -57,13 +57,14 @@ def refuse_law(arguments: argparse.Namespace) -> None:
     refuse(
         arguments,
         ("limit", "delay"),
-        "--free means no inputs, so that limits and delays have no effect",
+        "with --free all inputs are zero, so limits and delays have no effect",
     )
     names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "reduce", "allocate", "gain", "controller", "mpc")
     refuse(
         arguments,
         names,
-        "--free means no regulator, so that weights, a target or thrusters have no effect",
+        "with --free there is no regulator, so the options of a regulator and its target have no "
+        "effect",
     )
 
 
@@ -74,8 +75,9 @@ def add_loop(command: parser.Command) -> None:
     options.add_pose(start)
     start.add(
         "--offset",
-        "initial error from the start of the trajectory, in base axes. NAME is a state, group or "
-        "pattern such as r_b.x, q_m or omega_b.z (SI units), or roll, pitch or yaw [deg]",
+        "initial error with respect to the start of the trajectory, in base axes. NAME is a "
+        "state, a group or a pattern, such as r_b.x, q_m or omega_b.z (SI units), or it is roll, "
+        "pitch or yaw [deg]",
         parser.assignment,
         repeatable=True,
     )
@@ -87,8 +89,9 @@ def add_loop(command: parser.Command) -> None:
     run = command.group(parser.SIMULATION)
     run.add(
         "--duration",
-        "duration [s]. The default is the duration of the trajectory; without a trajectory, the "
-        "settling time of the linear loop, limited to 60 ... 600 s",
+        "duration of the simulation [s]. The default is the duration of the trajectory. Without "
+        "a trajectory, the default is the settling time of the linear loop, limited to 60 ... "
+        "600 s",
         float,
         "T",
     )
@@ -102,31 +105,34 @@ def add_loop(command: parser.Command) -> None:
 def _add_controllers(group: parser.Group) -> None:
     group.add(
         "--schedule",
-        "use gains saved by `fflin tvlqr`, and follow the trajectory that FILE contains, without "
-        "--trajectory",
+        "use the gains in FILE, which `fflin tvlqr` saved, and follow the trajectory that FILE "
+        "also contains. This option replaces --trajectory",
         Path,
     )
     group.add(
         "--gain",
-        "use a gain saved by `fflin lqr`, and regulate to the operating point of its design",
+        "use the gain in FILE, which `fflin lqr` saved, and regulate to the operating point for "
+        "which the gain was designed",
         Path,
     )
     group.add(
         "--controller",
-        "use a linear controller K with positive feedback, u - u0 = K (y - y0), about the target. "
-        "FILE (.mat, .npz or .json) contains A, B, C, D, and dt or Ts if the controller is "
-        "sampled. --output defines y",
+        "use a linear controller K with positive feedback, u - u0 = K (y - y0), about the "
+        "target. FILE (.mat, .npz or .json) contains the matrices A, B, C and D of the "
+        "controller and, if the controller is sampled, its sample time dt or Ts. --output "
+        "defines y",
         Path,
     )
     group.switch(
         "--negative-feedback",
-        "use the controller of --controller with negative feedback, u - u0 = -K (y - y0)",
+        "apply the controller of --controller with negative feedback, u - u0 = -K (y - y0)",
     )
     group.yes_or_no(
         "--allocate",
-        "design the regulator with base torque and force, and let thrusters produce the nearest "
-        "possible wrench. Allocation is the default if the thrusters can push in every direction. "
-        "With --no-allocate, negative thrust is set to zero",
+        "design the regulator with base torque and force as inputs, and allocate its commands to "
+        "the thrusters, which produce the nearest possible wrench. Allocation is the default if "
+        "the thrusters can push in every direction. With --no-allocate, the regulator commands "
+        "each thruster itself, and negative thrust is cut at zero",
     )
     group.switch(
         "--mpc",
@@ -135,7 +141,10 @@ def _add_controllers(group: parser.Group) -> None:
     group.add("--horizon", "number of samples in the horizon of --mpc", int, default=20)
     group.switch("--free", "simulate the robot without a regulator and without inputs")
     options.add_limits(group)
-    delay = "delay [s] from a sample until the command computed from this sample acts"
+    delay = (
+        "delay [s] between a sample and the application of the command that is computed from "
+        "this sample"
+    )
     group.add("--delay", delay, float, "T", default=0.0)
 
 
@@ -153,12 +162,19 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         "duration": arguments.duration,
     }
     if not arguments.controller:
-        refuse(arguments, ("negative_feedback",), "only --controller has a feedback sign")
+        refuse(
+            arguments,
+            ("negative_feedback",),
+            "the sign of the feedback can be chosen only for --controller",
+        )
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
         return Loop(policy, settings | start)
     if arguments.offset or arguments.hold:
-        raise InputError("--offset and --hold need a --trajectory; give one, or leave them out")
+        raise InputError(
+            "--offset and --hold apply only along a trajectory; add --trajectory FILE, or remove "
+            "--offset and --hold"
+        )
     if arguments.free:
         refuse_law(arguments)
         settings["q0"], settings["v0"] = start_of(robot, arguments)
@@ -205,7 +221,7 @@ def about_point(
     gain: Gain | None = None
     if arguments.mpc:
         names = ("allocate", "gain", "controller", "reduce")
-        refuse(arguments, names, "--mpc computes the inputs itself")
+        refuse(arguments, names, "--mpc replaces the regulator and its options")
         arguments.allocate = False
     allocate = (
         thrusters_give_every_wrench(robot) if arguments.allocate is None else arguments.allocate
@@ -214,7 +230,9 @@ def about_point(
         from fflin.control.gain import Gain
 
         refuse(
-            arguments, (*_WEIGHTS, *_TARGETS), "--gain contains its weights and its operating point"
+            arguments,
+            (*_WEIGHTS, *_TARGETS),
+            "the file of --gain already contains the weights and the operating point of the design",
         )
         gain = Gain.load(arguments.gain)
         # A gain designed for the motors and thrusters needs no allocation of a wrench.
@@ -226,7 +244,11 @@ def about_point(
         design = _without_thrusters(robot) if allocate else robot
         lin = _about_target(design, arguments)
     if arguments.controller:
-        refuse(arguments, (*_WEIGHTS, "gain", "reduce"), "--controller replaces the regulator")
+        refuse(
+            arguments,
+            (*_WEIGHTS, "gain", "reduce"),
+            "--controller replaces the regulator and its options",
+        )
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback: Any = LinearController(arguments.controller, lin, sign=sign)
     elif arguments.mpc:
@@ -263,16 +285,23 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
     refuse(
         arguments,
         ("free", "mpc", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS),
-        "the trajectory defines the target",
+        "the target and the regulator follow from the trajectory",
     )
     poses = ("joint", "rpy", "position", "velocity")
-    refuse(arguments, poses, "the start is on the trajectory, or displaced from it by --offset")
+    refuse(
+        arguments,
+        poses,
+        "the simulation starts on the trajectory, and only --offset displaces the start from it",
+    )
     design = _without_thrusters(robot) if arguments.allocate else robot
     if arguments.schedule is None:
         models = models_along(arguments, design)
         policy = TrajectoryFeedback(models, schedule_of(models, arguments))
     else:
-        why = "the file of --schedule contains the trajectory, weights and sample time"
+        why = (
+            "the file of --schedule already contains the trajectory, its hold, the weights and "
+            "the sample time"
+        )
         refuse(arguments, ("trajectory", "hold", *_WEIGHTS), why)
         schedule = GainSchedule.load(arguments.schedule)
         policy = TrajectoryFeedback(schedule.trajectory(design), schedule)
@@ -299,7 +328,11 @@ def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> Linea
         require_same(made, robot, kind, own, (there.names, there.units))
     q, v = state.to_pinocchio(gain.x0)
     if gain.x0[:6].any():
-        refuse(arguments, _POSE, "--gain contains the pose of the base")
+        refuse(
+            arguments,
+            _POSE,
+            "the operating point in the file of --gain already contains the pose of the base",
+        )
     else:
         q[:7] = target_of(robot, arguments)[0][:7]
     if number := arguments.relative_equilibrium:

@@ -83,7 +83,7 @@ def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(values) < len(pairs):
         names = [name for name, _ in pairs]
         double = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{option} gives '{double}' two values; give one value")
+        raise InputError(f"{option} is given more than once for '{double}'; give it once")
     return values
 
 

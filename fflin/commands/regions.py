@@ -48,8 +48,8 @@ def _add_validity(commands: parser.Commands) -> None:
     runs.add("--jobs", "number of processes; at most one per core", int, default=1)
     runs.add(
         "--limits",
-        "urdf: saturate the inputs at the limits of the robot; none (default): do not saturate the "
-        "inputs",
+        "saturate the inputs at the limits of the robot (urdf), or do not saturate them (none, "
+        "default)",
         choices=("urdf", "none"),
         default="none",
     )
@@ -74,11 +74,11 @@ def _add_funnel(commands: parser.Commands) -> None:
     runs, shown = funnel.group("runs"), funnel.group(parser.OUTPUT)
     funnel.group(parser.CONTROLLER).add(
         "--schedule",
-        "use gains saved by `fflin tvlqr`, and the trajectory that FILE contains, without "
-        "--trajectory",
+        "use the gains in FILE, which `fflin tvlqr` saved, and the trajectory that FILE also "
+        "contains. This option replaces --trajectory",
         Path,
     )
-    goal = f"largest error allowed at the end: {_ERRORS}"
+    goal = f"largest error allowed at the end of a run. NAME is {_ERRORS}"
     runs.add("--goal", goal, parser.assignment, repeatable=True)
     within = "largest error allowed at any time of a run. NAME is as in --goal"
     runs.add("--within", within, parser.assignment, repeatable=True)
@@ -86,7 +86,7 @@ def _add_funnel(commands: parser.Commands) -> None:
     runs.add("--knots", "number of knots to test", int, default=10)
     runs.add("--samples", "number of runs from each knot", int, default=100)
     runs.add("--seed", "random seed of the runs", parser.whole, "S", default=0)
-    runs.add("--confidence", "confidence level of the intervals", float, "P", default=0.95)
+    runs.add("--confidence", "confidence level of all intervals", float, "P", default=0.95)
     runs.add("--threads", "number of threads; by default one per core", int)
     options.add_step(runs)
     options.add_figure(funnel, "the funnel")
@@ -94,7 +94,7 @@ def _add_funnel(commands: parser.Commands) -> None:
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 
-_FREE = "not limited; --limits urdf saturates the inputs"
+_FREE = "not saturated; --limits urdf saturates them at the limits of the robot"
 
 
 def _validity(arguments: argparse.Namespace) -> Report:

@@ -43,7 +43,7 @@ def _add_lqr(commands: parser.Commands) -> None:
     options.add_point(lqr)
     add_weights(lqr)
     options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD, "Gain")
-    options.add_figure(lqr, "the poles, and the loop gain of each input with its margins,")
+    options.add_figure(lqr, "the poles, the loop gain of each input and the stability margins")
 
 
 def _add_tvlqr(commands: parser.Commands) -> None:
@@ -51,7 +51,7 @@ def _add_tvlqr(commands: parser.Commands) -> None:
         commands,
         "tvlqr",
         _tvlqr,
-        "design the time-varying regulator along a trajectory",
+        "design a time-varying linear quadratic regulator along a trajectory",
         example="fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 "
         "-o gains.npz",
         common="trajectory hold strict weights q r bryson sample qf inputs frame output-file",
@@ -86,14 +86,14 @@ def _add_export(commands: parser.Commands) -> None:
     group.add_argument("-o", "--output-folder", metavar="FOLDER", required=True, help=folder)
     group.add(
         "--robot",
-        "robot of the design: a name listed by `fflin robots`, or the path of a URDF or "
-        "robot.toml. The default is the robot named in FILE",
+        "robot for which FILE was designed: a name listed by `fflin robots`, or the path of a "
+        "URDF or robot.toml. The default is the robot that FILE names",
         metavar="ROBOT",
         type=parser.input_name,
     )
     limits = (
-        "urdf: saturate the inputs at the limits of the robot, as `fflin simulate` does; none "
-        "(default): do not saturate the inputs"
+        "saturate the inputs at the limits of the robot as `fflin simulate` does (urdf), or do "
+        "not saturate them (none, default)"
     )
     group.add("--limits", limits, choices=("urdf", "none"), default="none")
     group.add("--name", "prefix of all names in the C code", metavar="NAME", default="controller")
@@ -131,8 +131,9 @@ def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
     )
     group.add(
         "--bryson",
-        "largest acceptable value of a state, an input or a group. The weight is 1/VALUE^2, and "
-        "the weights of the rule are scaled to match",
+        "largest acceptable value of a state, an input or a group. Its weight is 1/VALUE^2, and "
+        "all weights set by the rule are multiplied by one factor, so that both kinds of weights "
+        "are comparable",
         parser.assignment,
         repeatable=True,
     )
@@ -151,10 +152,10 @@ def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
     )
     group.yes_or_no(
         "--wheel-speeds",
-        "regulate the speeds of reaction wheels to their values at the operating point, or not. By "
-        "default, wheel speeds are regulated if thrusters or a base torque can absorb the wheel "
-        "torque. --wheel-speeds also regulates combinations of wheel speeds without net torque on "
-        "the robot (redundant wheels)",
+        "whether to regulate the speeds of reaction wheels to their values at the operating "
+        "point. By default, wheel speeds are regulated if thrusters or a base torque can absorb "
+        "the wheel torque. --wheel-speeds also regulates the combinations of wheel speeds that "
+        "exert no net torque on the robot (redundant wheels)",
     )
 
 
@@ -235,7 +236,7 @@ def _export(arguments: argparse.Namespace) -> Report:
     )
     name, real = arguments.name, arguments.real
     test = f"cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm && ./{name}_test"
-    said = f"{law!r} in C99, with numbers of type {real}\nto test it in {folder}: {test}"
+    said = f"C99 code of {law!r}, with numbers of type {real}\nto test it in {folder}: {test}"
     return Report(law.robot, {"name": name, "real": real, "folder": str(folder)}, said)
 
 
@@ -244,15 +245,17 @@ def add_trajectory(command: parser.Command, *, required: bool = False) -> None:
     group = command.group(parser.TRAJECTORY)
     group.add(
         "--trajectory",
-        "use the trajectory in FILE: .npz, .mat, .json or .csv; see fflin.Trajectory.load. --frame "
-        "defines the axes of the data. The default of --frame is the frame named in FILE, or local",
+        "use the trajectory in FILE: .npz, .mat, .json or .csv; see fflin.Trajectory.load. "
+        "--frame states the axes in which FILE gives base velocities and wrenches. The default "
+        "of --frame is the frame named in FILE or, if there is none, local",
         Path,
         required=required,
     )
     group.add(
         "--hold",
         "inputs between the knots of FILE: linearly interpolated (linear), or constant from each "
-        "knot to the next (previous). The default is the setting in FILE, or linear",
+        "knot to the next (previous). The default is the setting in FILE or, if there is none, "
+        "linear",
         choices=("linear", "previous"),
     )
     group.switch(
@@ -266,7 +269,12 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
     from fflin.linear.trajectory import Trajectory
 
     point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
-    refuse(arguments, point, "--trajectory defines a motion, and no operating point applies")
+    refuse(
+        arguments,
+        point,
+        "with --trajectory, the models are about the points of the trajectory, not about an "
+        "operating point",
+    )
     robot = robot or load_robot(arguments)
     settings = {"hold": arguments.hold, "frame": arguments.frame}
     motion = Trajectory.load(arguments.trajectory, robot, **settings)
@@ -297,7 +305,12 @@ def checked(robot: Robot, found: Check, text: str, files: Any = MappingProxyType
 
 
 def _tvlqr(arguments: argparse.Namespace) -> Report:
-    refuse(arguments, ("reduce",), "the finite-horizon cost along a trajectory always exists")
+    refuse(
+        arguments,
+        ("reduce",),
+        "a regulator along a trajectory needs no reduced model, because its finite-horizon cost "
+        "always exists",
+    )
     along = models_along(arguments)
     schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
     return Report(along.robot.name, schedule, str(schedule), {arguments.output_file: schedule.save})

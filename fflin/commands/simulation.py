@@ -75,13 +75,13 @@ def _add_simulate(commands: parser.Commands) -> None:
     add_loop(simulate)
     simulate.group(parser.SIMULATION).add(
         "--every",
-        "save one row for every N integration steps; by default N is 1, or larger for long runs",
+        "save the state at every N-th integration step; by default N is 1, or larger for long runs",
         int,
     )
     simulate.group(parser.SIMULATION).add(
         "--engine",
-        "simulate in compiled code or in Python. The default is compiled for long runs, if numba "
-        "is installed",
+        "simulate in compiled code or in Python. By default, long runs use compiled code if "
+        "numba is installed, and all other runs use Python",
         choices=("compiled", "python"),
     )
     options.add_figure(simulate, "the nonlinear and the linear motion")
@@ -181,8 +181,8 @@ def _add_montecarlo(commands: parser.Commands) -> None:
     runs.add("--seed", "random seed", parser.whole, "S", default=0)
     runs.add(
         "--until",
-        "stop when the success rate of CONDITION, such as 'attitude < 1 deg', has a confidence "
-        "interval of at most --width",
+        "stop the runs when the confidence interval of the success rate is at most --width wide. "
+        "CONDITION defines success, such as 'attitude < 1 deg'",
         metavar="CONDITION",
     )
     width = "width of the confidence interval at which --until stops the runs"
@@ -195,14 +195,14 @@ def _add_montecarlo(commands: parser.Commands) -> None:
     shown.add(
         "--goal",
         "report the fraction of runs that meet CONDITION, such as 'attitude < 1 deg and settle < "
-        "60 s', and plot the bounds in CONDITION",
+        "60 s', and draw the bounds of CONDITION in --plot",
         metavar="CONDITION",
         repeatable=True,
     )
     shown.add("--worst", "list the K worst runs", parser.whole, "K", default=3)
     options.add_figure(montecarlo, "quantile bands over time, histograms and the worst runs")
     what = "the runs (with .h5, the same command resumes after an interruption)"
-    force = "replace the file of -o even if the file contains another campaign"
+    force = "replace the file of -o even if it contains the runs of another command"
     options.add_output_file(shown, what, parser.ROWS)
     shown.switch("--force", force)
     add_pictures(montecarlo, "that plays the worst run")

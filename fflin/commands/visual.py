@@ -35,7 +35,7 @@ def add_commands(commands: parser.Commands) -> None:
     frames = "orbital frame used as the world; lvlh by default"
     page.add("--frame", frames, choices=("lvlh", "hill"))
     _add_scene(page)
-    page.switch("--no-open", "do not open a browser, and print the address on stderr")
+    page.switch("--no-open", "do not open a browser; the address of the page is printed on stderr")
     port = "port on 127.0.0.1; a free port by default"
     page.add("--port", port, parser.whole, "N")
 
@@ -46,8 +46,8 @@ def add_pictures(command: parser.Command, page: str = "that plays the motion off
     group.add("--html", f"write a page {page}", parser.PAGE)
     group.add(
         "--png",
-        "write a picture with a strip of images at the times of --times (four images by default); "
-        "requires Chromium",
+        "write a picture that shows the motion as a strip of images at the times of --times "
+        "(four images by default); requires Chromium",
         parser.PICTURE,
     )
     group.add("--gif", "write an animation; requires Chromium", parser.ANIMATION)
@@ -61,15 +61,15 @@ def add_pictures(command: parser.Command, page: str = "that plays the motion off
 def _add_scene(group: parser.Group) -> None:
     group.add(
         "--scene",
-        "background: sky and planet (space), or a floor with a grid (lab). The default under "
-        "gravity is lab",
+        "background: sky and planet (space), or a floor with a grid (lab). The default is lab "
+        "under uniform gravity, otherwise space",
         choices=("space", "lab"),
     )
     group.add("--tool", "draw the axes and the path of this frame", metavar="FRAME")
     group.yes_or_no(
         "--follow",
-        "let the camera follow the base, or not. By default, the camera follows the base in long "
-        "motions",
+        "whether the camera follows the base. By default, the camera follows the base if the "
+        "robot moves far compared with its size",
     )
 
 

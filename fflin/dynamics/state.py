@@ -11,7 +11,7 @@ from fflin.base.errors import ChartError, InputError
 from fflin.base.validation import Array, instance, placement, vector
 from fflin.dynamics import coordinates as names
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, Chart, Frame
-from fflin.dynamics.orbital import field_of
+from fflin.dynamics.orbital import OrbitField
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
@@ -93,6 +93,8 @@ class StateMap:
         self.frame = names.frame_of(robot, frame)
         self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
+        # The field of the robot's orbit, if it has one.
+        self.field = OrbitField(robot, self.frame) if robot.orbit else None
         self.nx = 12 + 2 * n
         self.groups = names.Groups(
             q_b=slice(0, 3),
@@ -141,7 +143,7 @@ class StateMap:
         self._position, self.origin_quaternion = offset[:3], offset[3:]
         self._rotation = turning.rotation_matrix(self.origin_quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
-        field, R = field_of(self.robot, self.frame), oMref.rotation
+        field, R = self.field, oMref.rotation
         self.orbit = (R.T @ field.rate, R.T @ field.pull @ R) if field else None
 
     @property

@@ -17,7 +17,7 @@ from fflin.base.validation import Array, frozen, truth, vector
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import Chart, Standing, refuse_orbit, unknown_frame
 from fflin.dynamics.orbital import mean_motion
-from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, rotor_names
+from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
 from fflin.linear.model import LinearModel
@@ -25,7 +25,7 @@ from fflin.linear.state_equations import assemble, at_rest, drift, output_equati
 from fflin.linear.verification import certify, inertia_matrix
 from fflin.robot.joints import ROOT
 from fflin.robot.limits import magnitudes_of
-from fflin.robot.mass_properties import require_inertia
+from fflin.robot.mass_properties import require_inertia, rotor_names
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
