@@ -150,9 +150,9 @@ def equilibrium(
 
     Notes
     -----
-    If the robot has thrusters, the minimisation is a least-distance problem because of the bounds.
-    Non-negative least squares solve this problem exactly (C. Lawson and R. Hanson, Solving Least
-    Squares Problems, 1974, chapter 23).
+    The bounds of thrusters turn the minimisation into a least-distance problem, which non-negative
+    least squares solve exactly (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974,
+    chapter 23).
 
     Examples
     --------

@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 class LinearTrajectory(Trajectory):
     r"""Error dynamics along a motion, ``d(dx)/dt = A(t) dx + B(t) du``, ``dy = C dx + D du``.
 
-    The errors dx and du are the differences from the motion. The error dx is in the axes of the
-    moving base, see `Linearizer` (``moving=True``). Torques and forces on the base in du are also
-    in base axes. If ``dt`` is positive, the model is in discrete time: the left side of the first
-    equation is the error dx at the next knot. For a LinearTrajectory ``along``, ``along[k]`` is the
-    linear model at knot k.
+    The errors dx and du are the deviations of state and inputs from the motion. The error dx is in
+    the axes of the moving base, see `Linearizer` (``moving=True``). Torques and forces on the base
+    in du are also in base axes. If ``dt`` is positive, the model is in discrete time: the left side
+    of the first equation is then the error dx at the next knot. For a LinearTrajectory ``along``,
+    ``along[k]`` is the linear model at knot k.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class LinearTrajectory(Trajectory):
         return A, B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
-        """Return the values of arrays given at the knots, at one time.
+        """Return the values at time t [s] of arrays that are given at the knots.
 
         In continuous time, the values are interpolated between knots. In discrete time, they are
         held from the previous knot.

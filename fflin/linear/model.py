@@ -32,8 +32,8 @@ class Certificate:
     Attributes
     ----------
     condition : float
-        Condition number of the inertia matrix M, scaled to a unit diagonal. Residuals of about this
-        number times machine precision are expected.
+        Condition number of the inertia matrix M after scaling to a unit diagonal. Residuals of
+        about this number times machine precision are expected.
     inertia_residual : float
         Largest entry of M M^-1 - I, where M is scaled to a unit diagonal.
     route_A, route_B : float
@@ -122,7 +122,7 @@ class LinearModel(StateSpace):
     urdf_sha256 : str
         Hash of the URDF as it was read; empty if there is no URDF.
     locked : tuple of str
-        "joint=value" [rad|m] of each welded joint.
+        Text "joint=value" [rad|m] for each welded joint.
     fflin_version, pinocchio_version : str
         Versions of the packages that made the model.
     verified : bool
@@ -222,14 +222,14 @@ class LinearModel(StateSpace):
 
     @property
     def fingerprint(self) -> str:
-        """Hash of A, B and f0, which shows whether they changed since their certificate."""
+        """Hash of A, B and f0, by which later changes of these matrices are detected."""
         digest = sha256()
         for array in (self.A, self.B, self.f0):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
     def require(self, fingerprint: str) -> None:
-        """Raise `InputError` if A, B or f0 changed since their certificate."""
+        """Raise `InputError` if the hash of A, B and f0 differs from an earlier `fingerprint`."""
         if self.fingerprint != fingerprint:
             raise InputError(
                 "A, B or f0 were changed after they were certified; check them with "
@@ -260,7 +260,7 @@ class LinearModel(StateSpace):
 
     @cached_property
     def ignorable(self) -> tuple[str, ...]:
-        """Names of the states on which the dynamics do not depend, derived from the robot.
+        """Names of the states that do not affect the dynamics, as derived from the robot.
 
         The ignorable states are:
 
@@ -307,7 +307,7 @@ class LinearModel(StateSpace):
         return bool(np.abs(rate[judged]).max(initial=0.0) <= self.bound(number("tol", tol)))
 
     def bound(self, tol: float) -> float:
-        """Return `tol`, multiplied in orbit by the mean motion, as the tolerance of rates."""
+        """Return the tolerance of rates: `tol`, multiplied by the mean motion in orbit."""
         return tol * min(1.0, self.mean_motion or 1.0)
 
     def discretize(self, dt: float) -> LinearModel:

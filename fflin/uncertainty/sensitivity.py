@@ -59,36 +59,36 @@ class Derivatives(FrozenArrays):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivity:
-    """Derivatives of a linear model with respect to each robot parameter: ``S["arm.mass"].dA``.
+    """Derivatives of a linear model with respect to the parameters of the robot.
 
-    The name of a link is its name in the URDF. A body is a group of links fixed to each other,
-    and has the name of its joint or ``base``. The parameters of a link or body are:
+    ``S["arm.mass"].dA`` is the derivative of A with respect to one parameter. Parameters belong to
+    links or to bodies. A link has its name in the URDF. A body is a group of links that are fixed
+    to each other, and has the name of its joint or ``base``. The parameters of a link or body are
 
-    - ``LINK.mass`` [kg], with constant centre of mass and constant inertia about the centre of
-      mass;
-    - ``LINK.com.x`` [m] in the link's axes, with constant mass and inertia about the centre of
-      mass;
+    - ``LINK.mass`` [kg]; centre of mass and inertia about the centre of mass stay constant;
+    - ``LINK.com.x`` [m] in the link's axes; mass and inertia about the centre of mass stay
+      constant;
     - ``LINK.inertia.xx`` .. ``.yz`` [kg m^2] about the centre of mass, in the axes of the URDF's
-      <inertial>; for a body, in the axes of its joint;
-    - ``LINK.density``, a relative factor on mass and inertia.
+      <inertial> for a link, or in the axes of its joint for a body;
+    - ``LINK.density``, a factor that multiplies mass and inertia.
 
-    A pattern selects links. A pattern that matches no link selects bodies.
+    A pattern selects links, or bodies if the pattern matches no link.
 
-    Modes of flexible appendages and slosh have ``MODE.frequency`` [Hz] and ``MODE.damping``, the
-    damping ratio, both with the link clamped. A change of the frequency does not change the
-    damping ratio.
+    A mode of a flexible appendage or slosh has the parameters ``MODE.frequency`` [Hz] and
+    ``MODE.damping`` (the damping ratio), both for a clamped link. A change of the frequency does
+    not change the damping ratio.
 
     Other parameters are ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
-    ``THRUSTER.direction.x`` (a change of its length has no effect) and ``WHEEL.inertia``. The
-    inertia of a carrier includes its wheels. A larger wheel inertia therefore reduces the inertia
-    of the rest of the carrier.
+    ``THRUSTER.direction.x`` and ``WHEEL.inertia``. Only the direction of a thruster's vector
+    matters, not its length. The carrier's inertia includes its wheels, so a larger wheel inertia
+    reduces the inertia of the rest of the carrier.
 
     Attributes
     ----------
     lin : LinearModel
-        The linear model.
+        Linear model whose derivatives are computed.
     parameters : Parameters
-        {name: Parameter} in the robot's order.
+        Parameters of the robot by name, {name: Parameter}.
 
     Examples
     --------
@@ -130,13 +130,14 @@ class Sensitivity:
         return self.parameters[found[0]]
 
     def along(self, direction: Mapping[str, float]) -> Derivatives:
-        """Return the directional derivatives along a change of several parameters.
+        """Return the derivatives for a simultaneous change of several parameters.
 
         Parameters
         ----------
         direction : mapping
-            {parameter or pattern: change per unit of the direction, in the parameter's unit}.
-            ``{"payload.density": 0.1}`` increases mass and inertia of the payload by a tenth.
+            Changes {parameter or pattern: change}, each in the parameter's unit. The results are
+            the first-order changes of A, B and so on for these changes. For example,
+            ``{"payload.density": 0.1}`` increases mass and inertia of the payload by a tenth, and
             ``{"panel_*.stiffness": 1.0}`` changes all matching stiffnesses together.
         """
         given = numbers("direction", direction, "parameter", "change")
@@ -169,17 +170,18 @@ class Sensitivity:
         return self._all[4]
 
     def poles(self, gain: Any = None) -> tuple[Array, Array]:
-        """Return the poles (nx,) of A - B K and their derivatives (P, nx).
+        """Return the closed-loop poles (nx,) of A - B K and their derivatives (P, nx).
 
         Parameters
         ----------
         gain : Gain or array_like (nu, nx), optional
-            Gain K; zero by default.
+            Gain K; zero by default, for the poles of A.
 
         Returns
         -------
         poles, derivatives : ndarray
-            Derivatives of coincident poles are NaN, because such poles are not differentiable.
+            Poles, and one row of derivatives per parameter. Derivatives of coincident poles are
+            NaN, because such poles are not differentiable.
         """
         lin = self.lin
         K = np.zeros(lin.B.T.shape) if gain is None else getattr(gain, "K", gain)
@@ -198,8 +200,8 @@ class Sensitivity:
     def check(self, names: Sequence[str] | None = None) -> dict[str, float]:
         """Compare the derivatives of A and B with finite differences.
 
-        Each parameter is changed in small steps. At each step, A and B are computed independently
-        from the derivatives of ABA.
+        The finite differences are independent of the exact derivatives: each parameter is changed
+        by small steps, and A and B are computed at each step from Pinocchio's derivatives of ABA.
 
         Parameters
         ----------
@@ -209,8 +211,8 @@ class Sensitivity:
         Returns
         -------
         dict
-            {parameter: largest difference, relative to the derivatives}. The expected difference
-            is about 1e-9, the accuracy of the finite differences.
+            Largest differences {parameter: difference}, relative to the derivatives. Differences
+            of about 1e-9 are expected, because the finite differences are not more accurate.
         """
         if names is None:
             names = [name for name, one in self.parameters.items() if one.bodies]
@@ -225,16 +227,17 @@ class Sensitivity:
     def table(self, top: int = 15, only: str | None = None) -> str:
         """Return a table of the parameters with the largest effect on A and B.
 
-        The effect is the change of A and B if a parameter changes by 10 %, or a position or
-        centre of mass by 1 cm.
+        The effect of a parameter is the change of A and B if the parameter changes by 10 %, or by
+        1 cm for a position or a centre of mass.
 
         Parameters
         ----------
         top : int
             Number of rows.
         only : str, optional
-            Restriction to a kind, link or pattern: ``mass``, ``link_3``, ``*.density``. Bodies
-            whose links are listed are omitted.
+            Parameters to which the table is restricted: a kind such as ``mass``, a link such as
+            ``link_3``, or a pattern such as ``*.density``. Bodies whose links are listed are
+            omitted.
         """
         shown = self.parameters.ranked(only)
         lin, sizes = self.lin, [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
@@ -287,15 +290,16 @@ def sensitivity_record(found: Sensitivity) -> Record:
 def sensitivity(lin: LinearModel) -> Sensitivity:
     r"""Return the exact derivatives of a linear model with respect to the robot's parameters.
 
-    M and RNEA are linear in the dynamic parameters of the bodies. The derivatives of A, B and f0
-    therefore follow from the equations of the linear model itself, such as
+    The inertia matrix M and the inverse dynamics (RNEA) are linear in the dynamic parameters of the
+    bodies. Therefore the equations of the linear model can be differentiated exactly. For example,
+    the derivative of :math:`M^{-1}` with respect to a parameter p is
     :math:`(M^{-1})_p = -M^{-1} M_p M^{-1}`; see docs/derivation.md.
 
     Parameters
     ----------
     lin : LinearModel
-        Result of `linearize` in this session, about any point and in any frame. For a model
-        sampled by `discretize`, the sampled A, B and f0 are differentiated.
+        Result of `linearize` in this session, about any operating point and in any frame. If
+        `discretize` returned the model, the discrete-time A, B and f0 are differentiated.
 
     Returns
     -------
@@ -307,7 +311,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     InputError
         If the model was loaded from a file.
     ModelError
-        If the robot was changed after the model was made.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     Examples
     --------

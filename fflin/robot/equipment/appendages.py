@@ -160,14 +160,15 @@ class FlexibleAppendage(Appendage):
     ) -> FlexibleAppendage:
         r"""Read a Craig-Bampton model that Nastran wrote as an external superelement.
 
-        The boundary of the superelement is reduced to a rigid interface at `frame`. The index b
-        denotes the boundary, and q the modes in the file:
+        The boundary of the superelement is reduced to a rigid interface at `frame`. In the matrices
+        of the file, the index b denotes the boundary, and the index q denotes the modes. With these
+        matrices,
 
-        - :math:`\Phi` contains the rigid motions of the boundary, in the output coordinate systems
-          of its grids.
-        - V contains the eigenvectors of :math:`K_{qq}, M_{qq}`, scaled to unit modal mass.
-        - The participation is :math:`L = \Phi^T M_{bq} V`.
-        - The rigid inertia is :math:`M_{rr} = \Phi^T M_{bb} \Phi`.
+        - the participation is :math:`L = \Phi^T M_{bq} V`;
+        - the rigid inertia is :math:`M_{rr} = \Phi^T M_{bb} \Phi`.
+
+        :math:`\Phi` contains the rigid motions of the boundary, in the output coordinate systems of
+        its grids. V contains the eigenvectors of :math:`K_{qq}, M_{qq}`, scaled to unit modal mass.
 
         Parameters
         ----------
