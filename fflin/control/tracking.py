@@ -172,7 +172,7 @@ class TrajectoryFeedback(Feedback):
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
 
     def state_map(self, robot: Robot) -> StateMap:
-        """Return the robot's state map in base axes; `InputError` if the trajectory differs."""
+        """Return the robot's states in base axes; `InputError` if the robot does not fit."""
         origin = self.trajectory.robot
         state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
         made = f"the trajectory was made for '{origin.name}'"
