@@ -28,16 +28,16 @@ class StateMap:
     ----------
     robot : Robot
     reference : pin.SE3, optional
-        Placement oMref of the reference frame, in which the state gives the attitude and position
-        of the base; the identity by default.
+        Placement oMref relative to which the attitude and position of the base are measured; the
+        identity by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
         Axes of the angular velocity omega_b of the base and of the velocity v_b of its origin:
 
         - hybrid (default): omega_b in base axes, v_b = d r_b/dt in reference axes;
         - local: omega_b and v_b in base axes;
         - world: omega_b and v_b in reference axes;
-        - lvlh (default in orbit) or hill: the same axes as hybrid, for a robot in orbit only. The
-          world of Pinocchio is then the orbital frame with this name.
+        - lvlh (default in orbit) or hill: the same axes as hybrid, for a robot in orbit only.
+          Pinocchio's world is then the orbital frame, with the axes lvlh or hill.
 
     Attributes
     ----------
@@ -209,7 +209,8 @@ class StateMap:
         q : array_like (nq,)
             Configuration.
         v : array_like (nv,)
-            Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
+            Velocity in Pinocchio's order: linear and angular velocity of the base in base axes,
+            then joint rates.
         near : array_like (nx,), optional
             State for unwrapping the angles of continuous joints: each angle is shifted by the
             multiple of 2 pi that brings it closest to its value in `near`. By default, the angles

@@ -188,7 +188,7 @@ class Trajectory(Design):
         return self.flow.at(self._within(t))
 
     def resampled(self, dt: float) -> Trajectory:
-        """Return the same motion, interpolated by `point`, with knots every dt [s] and at the end.
+        """Return the motion with new knots every dt [s] and at the end, interpolated by `point`.
 
         Held inputs are reproduced exactly only if every old knot is also a new knot.
         """
