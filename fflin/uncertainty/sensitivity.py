@@ -22,6 +22,7 @@ from fflin.uncertainty.parameters import Parameter, Parameters
 
 # Poles closer than this, relative to the largest, have no derivative of their own.
 _EQUAL = 1e-6
+_ROUNDING = 1e-12  # effect relative to the largest entry
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -248,7 +249,7 @@ class Sensitivity:
             effect = [step * np.abs(d).max() / of for d, of in zip((dA, dB), sizes, strict=True)]
             if one.name in shown and max(effect) > 0.0:
                 unit = "." if one.unit == "1" else one.unit
-                percents = (f"{100.0 * x:.2g}" for x in effect)
+                percents = (f"{100.0 * x:.2g}" if x > _ROUNDING else "." for x in effect)
                 rows.append(
                     (max(effect), one.name, unit, f"{one.value:.5g}", f"{step:.3g}", *percents)
                 )
@@ -260,7 +261,7 @@ class Sensitivity:
         title = folded([f"{lin.robot}: {largest} of their largest entry, to first order"])
         heads = ("parameter", "unit", "value", "change", "A [%]", "B [%]")
         more = f"... and {len(rows) - top} more, see --top"
-        return "\n".join([title, grid([heads, *most], "ll"), *[more] * (len(rows) > top)])
+        return "\n".join([title, "", grid([heads, *most], "ll"), *[more] * (len(rows) > top)])
 
     def save(self, path: str | Path) -> None:
         """Write the derivatives to a .npz, .mat or .json file, atomically.
