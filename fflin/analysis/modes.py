@@ -202,7 +202,7 @@ class Modes:
             said.append(f"unstable: poles with a positive real part {poles}")
         said += [f"note: {note}" for note in self.notes]
         parts = [textwrap.fill(each, width()) for each in said]
-        rows = [["rad/s", "damping", "time [s]", "", "kinetic energy"]]
+        rows = [["rad/s", "damping", "decay [s]", "", "kinetic energy"]]
         rows += [
             [
                 f"{mode.frequency:.6g}" if mode.oscillates else ".",

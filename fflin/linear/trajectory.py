@@ -188,10 +188,9 @@ class Trajectory(Design):
         return self.flow.at(self._within(t))
 
     def resampled(self, dt: float) -> Trajectory:
-        """Return the same motion, interpolated by `point`, with knots every dt [s] and at the end.
+        """Return the motion with new knots every dt [s] and at the end, interpolated by `point`.
 
-        If inputs are held and every old knot is also a new knot, the inputs are the same functions
-        of time.
+        Held inputs are reproduced exactly only if every old knot is also a new knot.
         """
         times = self.samples(dt)
         if times[-1] < self.t[-1]:
@@ -202,7 +201,7 @@ class Trajectory(Design):
         return Trajectory(self.robot, times, q, v, u, **kept)  # type: ignore[arg-type]
 
     def samples(self, dt: float) -> Array:
-        """Return the times every dt [s] from the first knot to the last."""
+        """Return times from the first knot to the last, dt [s] apart."""
         dt, duration = number("dt", dt), float(self.t[-1] - self.t[0])
         if not dt >= 1e-7 * duration:
             raise InputError(
