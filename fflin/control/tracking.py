@@ -137,8 +137,8 @@ class TrajectoryFeedback(Feedback):
         Parameters
         ----------
         offset : mapping
-            {name, group or pattern of states: initial error, in the base axes at the start}. The
-            keys ``roll``, ``pitch`` and ``yaw`` [deg] can replace q_b.
+            Mapping {name, group or pattern of states: initial error}, in the base axes at the
+            start. The keys ``roll``, ``pitch`` and ``yaw`` [deg] can replace q_b.
 
         Raises
         ------
