@@ -49,7 +49,8 @@ def plot_poles(
     path : str or Path, optional
         File to write, .png, .pdf or .svg. See `plot_motion` for possible errors.
     dt : float
-        Sampling time [s] of poles given as numbers. If not 0, the unit circle is drawn.
+        Sampling time [s], if the poles are given as numbers. If it is not 0, the unit circle is
+        drawn.
     title : str
         Title of the figure.
 
