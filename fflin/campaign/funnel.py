@@ -94,8 +94,8 @@ class Funnel(Design):
         Lower bound, at confidence level `confidence`, on the success rate of runs that start at or
         below the level `rho`.
     rate : ndarray (m, 2)
-        Clopper-Pearson interval of the success rate of all runs. All runs start at or below the
-        level `tried`.
+        Clopper-Pearson interval of the success rate of all runs, which start at or below the level
+        `tried`.
     attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
         Half-axes of the ellipsoids in base attitude [deg], base position [m] and each joint
         [rad|m].
@@ -160,7 +160,7 @@ class Funnel(Design):
 
     @cached_property
     def rho(self) -> Array:
-        """Largest level (m,) up to which every run succeeded."""
+        """Largest level (m,) up to which every run reached the goal."""
         count = self.outcomes.shape[1]
         level: Array = self.tried * ((self.inside - 0.5).clip(min=0.0) / count) ** 2
         return level
@@ -327,7 +327,7 @@ def funnel(
     Raises
     ------
     InputError
-        If a size or value is wrong, or no time of the schedule is a knot of the trajectory.
+        If a size or value is wrong, or the schedule and the trajectory have no knot in common.
     UnknownNameError
         If a kind of error or an option is unknown.
     FflinError

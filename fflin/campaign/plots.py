@@ -40,10 +40,10 @@ _DECADES, _BARS, _BINS = 6, 10, 48
 def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: int = 3) -> Figure:
     """Draw the error histories, final errors, inputs and rank correlations of a campaign.
 
-    The bands contain 100 %, 90 % and 50 % of the runs. The worst runs, ranked by `Campaign.about`,
-    are drawn over the bands. Once a run has been stopped early, it ranks as worse than all other
-    runs. Dashed lines mark the bounds of the goals and the limits of the inputs. If the campaign
-    has no histories, the figure shows only the histograms and the correlations.
+    The bands contain 100 %, 90 % and 50 % of the runs. The worst runs, ranked by the figure
+    `Campaign.about`, are drawn over the bands. Once a run has been stopped early, it ranks as worse
+    than all other runs. Dashed lines mark the bounds of the goals and the limits of the inputs. If
+    the campaign has no histories, the figure shows only the histograms and the correlations.
 
     Parameters
     ----------

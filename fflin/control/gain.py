@@ -130,7 +130,7 @@ class Gain(Design):
         if self.K.size <= _LARGE:
             shown = f"\n\n{matrix(self.K, self.input_names, self.state_names)}"
         else:
-            shown = ": large, not shown; save() writes every entry"
+            shown = ": large, not shown; save() writes every entry (-o FILE)"
         fold = partial(textwrap.fill, width=width())
         more = {
             "not regulated": _unregulated(self),
@@ -269,8 +269,8 @@ def one_sided(gain: Gain) -> str:
     return (
         f"the design requires thrusters to pull ({listed(thrusters)}): negative thrust is cut at "
         "zero, so the poles and margins do not hold; design with torque and force on the base, "
-        "and allocate them to thrusters with fflin.Allocation. `fflin simulate` "
-        "allocates by default if the thrusters push in every direction"
+        "and allocate them to thrusters with fflin.Allocation. `fflin lqr` and `fflin "
+        "simulate` allocate by default if the thrusters push in every direction"
     )
 
 
@@ -281,7 +281,7 @@ def _unregulated(gain: Gain) -> str:
         return ""
     return (
         f"{listed(left)} (no input reaches them, or other states determine them; "
-        "wheel_speeds=True regulates all controllable wheel speeds)"
+        "wheel_speeds=True (--wheel-speeds) regulates all controllable wheel speeds)"
     )
 
 

@@ -46,7 +46,7 @@ class Estimator(Design):
     residual : float
         Residual of the Riccati equation, relative to the sum of the norms of its terms.
     margin : float
-        Distance of the poles to the stability boundary, as in `Gain`.
+        Distance of the poles from the stability boundary, as in `Gain`.
     A, B, C, D : ndarray
         Matrices of the model.
     W, V : ndarray

@@ -55,12 +55,13 @@ class CLaw:
     frame : str
         Axes of the inputs on the base, as in `LinearModel`.
     origin : pin.SE3 or None
-        Reference placement of the state and of the inputs on the base.
+        Placement relative to which the state and the inputs on the base are measured.
 
     Raises
     ------
     FileError
-        If the folder contains no law, or several laws without `name`, or the files were edited.
+        If the folder contains no law, contains several laws and `name` is omitted, or contains
+        edited files.
     MissingPackageError
         If there is no C compiler.
     InputError
@@ -130,7 +131,7 @@ class CLaw:
         Raises
         ------
         InputError
-            If the states, inputs or outputs of the robot differ from the C code.
+            If the robot and the C code have different states, inputs or outputs.
         """
         made = f"the C code '{self.name}' was made from the {self._about['title']}"
         state = StateMap(robot, reference=self.origin, frame=self.frame)
