@@ -105,8 +105,8 @@ class Motion(Design):
     engine : str
         Engine that ran the simulation, "compiled" or "python"; empty if the engine is not known.
     limits : ndarray (k, 2)
-        Lower and upper limits of the states and inputs in `limit_names`; infinite if a bound does
-        not exist. Limits that the simulation does not enforce are included.
+        Lower and upper limits of the states and inputs in `limit_names`. A missing limit is
+        infinite. Limits that the simulation does not enforce are included.
     phases, starts : tuple of str, ndarray (k,)
         Names and start times [s] of the phases, if `then` joined the motion from several phases.
 
@@ -247,9 +247,9 @@ class Motion(Design):
         Returns
         -------
         Motion
-            Joined motion on one time axis, with the states and the chart of this motion. A joint
-            that jams remains a state, and is at rest after the jam. The energy and momentum of each
-            phase are computed for the robot of that phase, for example with its payload.
+            Joined motion on one time axis, with the states and the chart of this motion. The states
+            of a jammed joint remain, with zero velocity after the jam. The energy and momentum of
+            each phase are computed for the robot of that phase, for example with its payload.
 
         Raises
         ------

@@ -225,8 +225,8 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
         - a number: the relative half width, such as 0.2 for plus or minus 20 % of the nominal
           value;
         - a pair: the smallest and the largest value;
-        - for a pattern whose parameters are tied: ``{"range": 0.2, "tied": True}``, in which the
-          range is a number or a pair.
+        - for a pattern whose parameters vary together, one of these ranges with ``"tied": True``,
+          such as ``{"range": 0.2, "tied": True}``.
 
         Several parameters of a link may be given as ``{link: {"mass": .., "inertia.xx": ..}}``. By
         default, the parameters that match a pattern vary independently. Tied parameters vary
