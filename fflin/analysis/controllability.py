@@ -59,9 +59,10 @@ class Controllability(FrozenArrays):
     stabilizable : bool
         Whether all fixed poles are stable.
     reach : dict
-        Numbers of independent directions that the inputs can control, with the keys "base
-        attitude", "base position" and "joints". The inputs can bring the position states to any
-        value along these directions, if the final values of all other states are left free.
+        Numbers of independent directions that the inputs can control, with the keys
+        ``"base attitude"``, ``"base position"`` and ``"joints"``. The inputs can bring the position
+        states to any value along these directions, if the final values of all other states are left
+        free.
     method : str
         Method that determined the dimension: "closed form", "modes" or "eigenvalues".
     margin : Margin
