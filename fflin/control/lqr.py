@@ -70,7 +70,7 @@ def lqr(
     no effect:
 
     - wheel angles, which are ignorable;
-    - wheel speeds that are determined by the body's rate, if only wheels rotate the body;
+    - wheel speeds, if only wheels rotate the body, because the body's rate then determines them;
     - the position and velocity of the base, if no input pushes the base.
 
     Parameters
