@@ -104,8 +104,8 @@ def lqr(
     EquilibriumError
         If the operating point is not a fixed point; the message lists the nonzero entries of f0.
     StabilizabilityError
-        If the inputs cannot stabilise a mode that does not decay by itself; the message names the
-        mode.
+        If a mode neither decays by itself nor can be stabilised by the inputs; the message names
+        the mode.
     InputError
         If a weight has a wrong size, is not positive (semi)definite, or is zero for a mode that
         does not decay by itself.
