@@ -95,7 +95,7 @@ class Mode(FrozenArrays):
 
     @property
     def time_constant(self) -> float:
-        """Time [s] in which the mode decays by a factor e, or grows if it is unstable."""
+        """Time [s] in which the mode decays, or grows if it is unstable, by a factor e."""
         return float("inf") if self.pole.real == 0.0 else 1.0 / abs(self.pole.real)
 
 
@@ -262,8 +262,8 @@ def modes(lin: LinearModel) -> Modes:
     The index E selects the coordinates on which the stiffness K acts. M* is a Schur complement of
     M: the effective inertia of these coordinates if all other coordinates are free to move. If
     other forces act, or the operating point is in motion, the modes are the eigenvectors of A. Zero
-    eigenvalues form Jordan blocks of size two or more, so they are first separated exactly from the
-    other eigenvalues.
+    eigenvalues form Jordan blocks of size two or more, which are sensitive to rounding, so these
+    eigenvalues are first separated exactly from all others.
 
     Parameters
     ----------

@@ -109,7 +109,7 @@ def relative_equilibria(
     robot : Robot
         Robot in orbit.
     q : array_like (nq,), optional
-        Configuration whose joint positions are used; neutral by default.
+        Configuration that provides the joint positions; neutral by default.
     frame : {"lvlh", "hill"}, optional
         Orbital frame in which `q` of each result is expressed; "lvlh" by default.
 

@@ -40,7 +40,7 @@ class Grid:
     ----------
     robot : Robot
     axes : mapping
-        {joint: values (k,) [rad|m]}.
+        Values of each varied joint, {joint: values (k,) [rad|m]}.
     start : ndarray (nq,)
         Configuration that contains the base pose and the positions of the joints that the grid does
         not vary.
@@ -84,7 +84,7 @@ class RandomConfigurations:
     count, seed : int
         Number of configurations, and seed of the draws.
     ranges : mapping
-        {joint: (low, high) [rad|m]}.
+        Range of each joint, {joint: (low, high) [rad|m]}.
     start : ndarray (nq,)
         Configuration that contains the base pose; random values replace its joint positions.
 
@@ -149,7 +149,8 @@ def grid(
     ----------
     robot : Robot
     axes : mapping
-        {joint: increasing values (k,) [rad|m]}. The last joint varies fastest.
+        Values of each varied joint in increasing order, {joint: values (k,) [rad|m]}. The last
+        joint varies fastest.
     joints, base : optional
         Values of the other joints and pose of the base, as in `configuration`.
 

@@ -73,7 +73,7 @@ class Funnel(Design):
 
     The error e relative to the trajectory is defined in `linearize_trajectory`. P(t) is the
     cost-to-go matrix of the gain schedule, and ``e' P e`` is the level of an error. Errors in the
-    null space of P are not tested.
+    null space of P are not tested, because they do not change the level.
 
     Attributes
     ----------
@@ -94,8 +94,8 @@ class Funnel(Design):
         Lower bound, at confidence level `confidence`, on the success rate of runs that start at or
         below the level `rho`.
     rate : ndarray (m, 2)
-        Clopper-Pearson interval of the success rate of all runs. All runs start at or below the
-        level `tried`.
+        Clopper-Pearson interval of the success rate of all runs, which start at or below the level
+        `tried`.
     attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
         Half-axes of the ellipsoids in base attitude [deg], base position [m] and each joint
         [rad|m].
@@ -160,7 +160,7 @@ class Funnel(Design):
 
     @cached_property
     def rho(self) -> Array:
-        """Largest level (m,) up to which every run succeeded."""
+        """Largest level (m,) up to which every run reached the goal."""
         count = self.outcomes.shape[1]
         level: Array = self.tried * ((self.inside - 0.5).clip(min=0.0) / count) ** 2
         return level
@@ -298,9 +298,10 @@ def funnel(
     schedule : GainSchedule or TrajectoryFeedback
         Schedule designed by `tvlqr`, continuous or sampled.
     goal : mapping or float
-        {"attitude" [deg], "position" [m], "joints" [rad|m], "omega_b" [rad/s], "v_b" [m/s],
-        "joint rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`. If
-        `goal` is a number, it bounds the final value of ``e' P e``.
+        Bounds on the final errors, {"attitude" [deg], "position" [m], "joints" [rad|m],
+        "omega_b" [rad/s], "v_b" [m/s], "joint rates" [rad/s|m/s]: largest final error}, with the
+        kinds of error of `Campaign`. If `goal` is a number, it bounds the final value of
+        ``e' P e``.
     within : mapping, optional
         Largest errors allowed at any time of a run, as a mapping with the same keys as `goal`.
     knots : int or sequence of float
@@ -327,11 +328,11 @@ def funnel(
     Raises
     ------
     InputError
-        If a size or value is wrong, or no time of the schedule is a knot of the trajectory.
+        If a size or value is wrong, or the schedule and the trajectory have no knot in common.
     UnknownNameError
         If a kind of error or an option is unknown.
     FflinError
-        If a worker process died.
+        If a worker process dies.
 
     References
     ----------

@@ -48,7 +48,7 @@ class Schedule(Design):
 
     @cached_property
     def interpolant(self) -> Interpolant:
-        """Gain and cost matrix over time."""
+        """Gain and matrix P over time."""
         raise NotImplementedError
 
 

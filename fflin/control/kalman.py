@@ -46,7 +46,7 @@ class Estimator(Design):
     residual : float
         Residual of the Riccati equation, relative to the sum of the norms of its terms.
     margin : float
-        Distance of the poles to the stability boundary, as in `Gain`.
+        Distance of the poles from the stability boundary, as in `Gain`.
     A, B, C, D : ndarray
         Matrices of the model.
     W, V : ndarray
@@ -212,8 +212,8 @@ def kalman(
     Raises
     ------
     DetectabilityError
-        If the outputs do not observe a mode that does not decay by itself; the message names the
-        mode.
+        If a mode neither decays by itself nor can be observed from the outputs; the message names
+        the mode.
     EquilibriumError
         If the operating point is not a fixed point.
     InputError

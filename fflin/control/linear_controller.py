@@ -162,7 +162,7 @@ class LinearController(Feedback):
         return Sample(A, B, C, D, lin.u0, lin.y0)
 
     def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot, with a separate state z for each call.
+        """Return policy(t, q, v) -> u for a robot; each call returns a policy with its own z.
 
         Raises
         ------

@@ -61,17 +61,16 @@ def lqr(
     of docs/derivation.md. The slowest closed-loop motion then has a bandwidth of 0.2 rad/s. The
     bandwidth is lower if the robot would otherwise exceed an effort or speed limit while it returns
     from a displacement of 30 deg of the base and 0.3 rad of each joint. Each input has a phase
-    margin of at least 60 deg and tolerates any gain factor above one half. Springs and gravity do
-    not slow down the decay of modes that the inputs can control well (10.8). ``gain.weights``
-    states the bandwidth, decay rate and damping of the loop, and lists all modes that decay more
-    slowly.
+    margin of at least 60 deg and tolerates any gain factor above one half. With springs or gravity,
+    the controllable modes decay as fast as without them (10.8). ``gain.weights`` states the
+    bandwidth, decay rate and damping of the loop, and lists any modes that still decay more slowly.
 
     For a model with reaction wheels, only the controllable states are regulated, see (9.4) of
     docs/derivation.md; ``gain.regulated`` lists these states. Weights on the following states have
     no effect:
 
     - wheel angles, which are ignorable;
-    - wheel speeds that are determined by the body's rate, if only wheels rotate the body;
+    - wheel speeds, if only wheels rotate the body, because the body's rate then determines them;
     - the position and velocity of the base, if no input pushes the base.
 
     Parameters
@@ -105,8 +104,8 @@ def lqr(
     EquilibriumError
         If the operating point is not a fixed point; the message lists the nonzero entries of f0.
     StabilizabilityError
-        If the inputs cannot stabilise a mode that does not decay by itself; the message names the
-        mode.
+        If a mode neither decays by itself nor can be stabilised by the inputs; the message names
+        the mode.
     InputError
         If a weight has a wrong size, is not positive (semi)definite, or is zero for a mode that
         does not decay by itself.

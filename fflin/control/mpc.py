@@ -71,8 +71,8 @@ def mpc(
     lin : LinearModel or LinearTrajectory
         Continuous model or trajectory, or a sampled model that `discretize` returned.
     Q, R : see `lqr`, optional
-        Weights of the integral. The default is the same as in `lqr` for a model, and as in
-        `tvlqr` for a trajectory. The argument `weights` selects the rule.
+        Weights of the integral. If both are omitted, a rule sets the weights, as in `lqr` for a
+        model and in `tvlqr` for a trajectory. The argument `weights` selects the rule.
     horizon : int
         Number N of samples in the horizon.
     dt : float

@@ -56,7 +56,7 @@ class Feedback:
 
 @dataclass(eq=False)
 class StateFeedback(Feedback):
-    """State feedback ``u = u0 - K (x - x0)`` about the point of a linear model.
+    """State feedback ``u = u0 - K (x - x0)`` about the operating point of a model.
 
     The angle of a continuous joint is unwrapped, so that it differs from x0 by at most half a turn.
 

@@ -50,9 +50,9 @@ class TrajectoryFeedback(Feedback):
     schedule : GainSchedule
         Result of `tvlqr`.
     held : bool
-        Whether commands are held between samples; commands of a sampled schedule are always held. A
-        held command at the last knot acts after the end of the trajectory, so it already contains
-        the holding inputs at the target.
+        Whether commands are held between samples; commands of a sampled schedule are always held.
+        The command of the last knot, if held, acts after the end of the trajectory, so it already
+        contains the holding inputs.
 
     Examples
     --------
@@ -127,7 +127,7 @@ class TrajectoryFeedback(Feedback):
 
     @cached_property
     def end_gain(self) -> Array:
-        """Gain K (nu, nx) of the regulator with the same weights about `end`."""
+        """Gain K (nu, nx) of the regulator about `end`, with the weights of the schedule."""
         by = self.schedule
         return steady_regulator(self.end, by.Q, by.R, by.dt)[1]
 
@@ -137,8 +137,8 @@ class TrajectoryFeedback(Feedback):
         Parameters
         ----------
         offset : mapping
-            {name, group or pattern of states: initial error, in the base axes at the start}. The
-            keys ``roll``, ``pitch`` and ``yaw`` [deg] can replace q_b.
+            Mapping {name, group or pattern of states: initial error}, in the base axes at the
+            start. The keys ``roll``, ``pitch`` and ``yaw`` [deg] can replace q_b.
 
         Raises
         ------
@@ -172,7 +172,7 @@ class TrajectoryFeedback(Feedback):
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
 
     def state_map(self, robot: Robot) -> StateMap:
-        """Return the robot's state map in base axes; `InputError` if the trajectory differs."""
+        """Return the robot's states in base axes; `InputError` if the robot does not fit."""
         origin = self.trajectory.robot
         state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
         made = f"the trajectory was made for '{origin.name}'"
@@ -300,7 +300,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
             )
 
     def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot, with a separate estimate for each call.
+        """Return policy(t, q, v) -> u for a robot; each call returns one with its own estimate.
 
         Raises
         ------

@@ -251,7 +251,7 @@ def tvkalman(
     computed forward from P0 by (10.4) of docs/derivation.md:
 
     .. math:: P_{k+1} = \Phi (P - P C^T (C P C^T + V)^{-1} C P)_k \Phi^T + W_k,\qquad
-              L = \Phi P C^T (C P C^T + V)^{-1},
+              L = \Phi P C^T (C P C^T + V)^{-1}.
 
     Here :math:`\Phi` is the transition matrix over one sample, and :math:`W_k` is the covariance of
     the disturbance integrated over this sample.

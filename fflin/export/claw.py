@@ -55,7 +55,7 @@ class CLaw:
     frame : str
         Axes of the inputs on the base, as in `LinearModel`.
     origin : pin.SE3 or None
-        Reference placement of the state and of the inputs on the base.
+        Placement relative to which the state and the inputs on the base are measured.
 
     Raises
     ------

@@ -91,7 +91,7 @@ class Check:
 
     @property
     def ok(self) -> bool:
-        """Whether no error exceeds its tolerance."""
+        """Whether all errors are within their tolerances."""
         return all(row.ok for row in self.rows)
 
     @property

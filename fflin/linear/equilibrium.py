@@ -36,10 +36,10 @@ class Equilibrium(FrozenArrays):
     Attributes
     ----------
     q : ndarray (nq,)
-        Equilibrium configuration, for the argument q of `linearize`. This configuration differs
-        from the given configuration by the spring deflections of joints without a motor.
+        Equilibrium configuration, to be given to `linearize` as q. This configuration differs from
+        the given configuration by the spring deflections of joints without a motor.
     u : ndarray (nu,)
-        Minimum-norm inputs, for the argument u of `linearize`.
+        Minimum-norm inputs, to be given to `linearize` as u.
     sag : ndarray (n,)
         Deflection of each joint from its given position [rad | m].
     residual : ndarray (6 + n,)
@@ -93,10 +93,10 @@ def equilibrium(
 ) -> Equilibrium:
     r"""Compute the spring deflections and the minimum-norm inputs that balance all forces.
 
-    The forces are the same as in `linearize`: springs, gravity, dampers, and the inertial forces of
-    a steady motion. In orbit, the base is at rest in the rotating orbital frame, and the forces
-    include the gravity gradient and the inertial forces of this frame. To find attitudes at which
-    the base needs no torque in orbit, use `relative_equilibria`.
+    The balanced forces are the forces that `linearize` also includes: springs, gravity, dampers,
+    and the inertial forces of a steady motion. In orbit, the base is at rest in the rotating
+    orbital frame, and the forces include the gravity gradient and the inertial forces of this
+    frame. To find attitudes at which the base needs no torque in orbit, use `relative_equilibria`.
 
     Let f be the generalised forces on the robot without the inputs u, and B the matrix from u to
     generalised forces. The inputs solve
@@ -132,8 +132,9 @@ def equilibrium(
     Returns
     -------
     Equilibrium
-        Result with q and u for ``linearize(robot, result.q, v, u=result.u)``, which needs the same
-        `frame` and `reference`.
+        Result whose q and u define the operating point of
+        ``linearize(robot, result.q, v, u=result.u)``. Give `linearize` the same `frame` and
+        `reference`.
 
     Raises
     ------
@@ -151,7 +152,7 @@ def equilibrium(
     Notes
     -----
     The bounds of thrusters turn the minimisation into a least-distance problem, which non-negative
-    least squares solve exactly (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974,
+    least squares solve exactly (Lawson and Hanson, Solving Least Squares Problems, 1974,
     chapter 23).
 
     Examples

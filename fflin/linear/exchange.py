@@ -98,7 +98,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     dt : float, optional
         Time step [s] of MuJoCo; only for "mujoco". If `dt` is given, A and B are the discrete-time
         matrices that ``mjd_transitionFD`` returns for the Euler integrator. If the robot has
-        dampers, these matrices agree only if ``eulerdamp`` is disabled in MuJoCo.
+        dampers, disable ``eulerdamp`` in MuJoCo, because its matrices otherwise differ.
 
     Returns
     -------
@@ -218,8 +218,9 @@ def from_tool(
     tool, dt
         See `transform`; dt is the time step for which A and B were computed.
     q, v : array_like
-        Configuration and velocity in the tool's coordinates; v is zero by default. For "spart", q
-        consists of R0 (column by column), r0 and qm, and v consists of u0 and um.
+        Configuration and velocity in the tool's coordinates; v is zero by default. For "spart", in
+        SPART's notation, q consists of R0 (column by column), r0 and qm, and v consists of u0 and
+        um.
     u : array_like (nu,), optional
         Inputs of the robot in the tool's order and axes; zero by default.
     A, B : array_like, optional

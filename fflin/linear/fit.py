@@ -92,8 +92,8 @@ def outputs(
     Parameters
     ----------
     robot : Robot
-        Robot with the same states, inputs and outputs as the model. Its masses may differ from the
-        robot that was linearised.
+        Robot with the same states, inputs and outputs as the model. Its masses may differ from
+        those with which the model was computed.
     lin : LinearModel
         Model that defines the reference and the operating point.
     q, v : array_like (nq,), (nv,)

@@ -128,10 +128,9 @@ class LinearTrajectory(Trajectory):
         return A, B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
-        """Return the values at time t [s] of arrays that are given at the knots.
+        """Interpolate arrays that are given at the knots to the time t [s].
 
-        In continuous time, the values are interpolated between knots. In discrete time, they are
-        held from the previous knot.
+        If the model is in discrete time, the values at the previous knot are returned instead.
         """
         k, fraction = interval_of(self.t, self._within(t))
         if self.dt or not fraction:
@@ -197,8 +196,8 @@ def linearize_trajectory(
     t : Trajectory or array_like (N,)
         The motion as a `Trajectory`, or the times of its knots [s].
     q, v, u : array_like, optional
-        Configurations, velocities and inputs at the knots, see `Trajectory`. Give these arguments
-        only if t contains times.
+        Configurations, velocities and inputs at the knots, see `Trajectory`. Give q, v and u only
+        if t contains times.
     strict : bool
         Whether to raise an error, instead of a warning, if the knots violate the robot's dynamics
         with a residual above 1e-2.

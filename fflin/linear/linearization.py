@@ -187,7 +187,7 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
 
 
 class Linearizer:
-    r"""Linearise one robot about many operating points, with preparations made only once.
+    r"""Linearise one robot about many operating points; common data are computed only once.
 
     Threads may share a `Linearizer`, but only one thread computes at a time. To compute in
     parallel, copy or pickle the `Linearizer`: every copy has a separate work space.
@@ -217,9 +217,9 @@ class Linearizer:
         Axes of the base velocities and wrenches, see `StateMap`. The default is "hybrid". For a
         robot in orbit, the frames are "lvlh" (default) and "hill".
     reference : pin.SE3, optional
-        Reference placement, relative to which the state gives the base attitude and position. The
-        default is the base placement at each operating point, so that q_b and r_b are zero there.
-        For a robot in orbit, the default is the orbital frame.
+        Placement relative to which the attitude and position of the base are measured. The default
+        is the base placement at each operating point, so that q_b and r_b are zero there. For a
+        robot in orbit, the default is the orbital frame.
     moving : bool
         Whether to return the error dynamics about a moving reference, which passes through the
         operating point and obeys the dynamics of the robot. The frame is then "local", and f0 is
@@ -408,8 +408,8 @@ def linearize(
         Axes of the base's velocities and wrenches, see `StateMap`; by default
         "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
-        Reference pose, relative to which the state gives the base attitude and position. The
-        default is the base pose at the operating point, or the orbital frame in orbit.
+        Pose relative to which the attitude and position of the base are measured. The default is
+        the base pose at the operating point, or the orbital frame if the robot is in orbit.
     moving : bool
         Whether to return the error dynamics about a reference that moves through the operating
         point; see `Linearizer`.
@@ -417,7 +417,8 @@ def linearize(
     Returns
     -------
     LinearModel
-        Linear model. See `Linearizer` for its equations, and for many operating points.
+        Linear model, with the equations in `Linearizer`. To linearise about many operating points,
+        use `Linearizer`.
 
     Raises
     ------

@@ -37,7 +37,7 @@ class Certificate:
     inertia_residual : float
         Largest entry of M M^-1 - I, where M is scaled to a unit diagonal.
     route_A, route_B : float
-        Largest difference of A (or B) from the same matrix computed from Pinocchio's ABA
+        Largest difference between A (or B) and the matrix that follows from Pinocchio's ABA
         derivatives, relative to the largest entry of the same block.
     f0 : float
         Largest entry of the state derivative at the operating point; 0 at a fixed point.
@@ -196,7 +196,7 @@ class LinearModel(StateSpace):
 
     @property
     def reference(self) -> pin.SE3:
-        """Placement oMref of the reference, relative to which the state gives the base pose."""
+        """Placement oMref relative to which the attitude and position of the base are measured."""
         import pinocchio as pin
 
         return pin.XYZQUATToSE3(self.placement)
@@ -222,7 +222,7 @@ class LinearModel(StateSpace):
 
     @property
     def fingerprint(self) -> str:
-        """Hash of A, B and f0, by which later changes of these matrices are detected."""
+        """Hash of A, B and f0, used to detect later changes of these matrices."""
         digest = sha256()
         for array in (self.A, self.B, self.f0):
             digest.update(np.ascontiguousarray(array).tobytes())
@@ -292,22 +292,22 @@ class LinearModel(StateSpace):
         zero, so the motion of the reference is tested instead:
 
         - the velocities of the reference in base axes must be constant;
-        - no joint except rotors may move;
+        - all joints except rotors must be at rest;
         - under gravity, the base may rotate only about the vertical.
 
         Parameters
         ----------
         tol : float
             Largest permitted rate, in SI units, of a coordinate that is not ignorable. In orbit
-            the tolerance is multiplied by the mean motion, because accelerations by the gravity
-            gradient are small.
+            the tolerance is multiplied by the mean motion, because the gravity gradient causes only
+            small accelerations.
         """
         rate = self.f0 if self.drift is None else self.drift
         judged = [name not in self.ignorable for name in self.state_names]
         return bool(np.abs(rate[judged]).max(initial=0.0) <= self.bound(number("tol", tol)))
 
     def bound(self, tol: float) -> float:
-        """Return the tolerance of rates: `tol`, multiplied by the mean motion in orbit."""
+        """Return the largest rate at an equilibrium: `tol`, or `tol` times mean motion in orbit."""
         return tol * min(1.0, self.mean_motion or 1.0)
 
     def discretize(self, dt: float) -> LinearModel:

@@ -37,7 +37,9 @@ _CAUSES = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Design):
-    """Motion of a robot, given at knots; the arrays are copied and read-only.
+    """Motion of a robot, given by configurations, velocities and inputs at knots.
+
+    The arrays are copied and read-only.
 
     Parameters
     ----------
@@ -166,10 +168,10 @@ class Trajectory(Design):
     def residual(self) -> Array:
         """Residual (N,) at each knot, which shows how well the motion obeys the robot's dynamics.
 
-        From each knot, the dynamics are integrated to the next knot under the given inputs. The
-        error of this interval is the difference between the integrated state and the next knot,
-        divided by the duration of the interval and by the largest rate of the motion; see `Flow`.
-        The residual of a knot is the larger error of its two adjacent intervals.
+        In each interval, the dynamics are integrated from the first knot under the given inputs.
+        The error of the interval is the difference between the integrated state and the second
+        knot, divided by the duration of the interval and by the largest rate of the motion; see
+        `Flow`. The residual of a knot is the larger error of its two adjacent intervals.
         """
         found = self.flow.residual
         return np.maximum(np.append(found, 0.0), np.append(0.0, found))
@@ -188,7 +190,7 @@ class Trajectory(Design):
         return self.flow.at(self._within(t))
 
     def resampled(self, dt: float) -> Trajectory:
-        """Return the same motion, interpolated by `point`, with knots every dt [s] and at the end.
+        """Return the motion with new knots every dt [s] and at the end, interpolated by `point`.
 
         Held inputs are reproduced exactly only if every old knot is also a new knot.
         """
@@ -213,7 +215,7 @@ class Trajectory(Design):
         return times
 
     def require(self, *, strict: bool = False) -> None:
-        """Warn if the residual of the motion exceeds 1e-2, or raise `InputError` if `strict`.
+        """Warn if the residual of the motion exceeds 1e-2; raise `InputError` instead if `strict`.
 
         The message gives the interval with the largest error, this error, and the number of
         intervals with errors above 1e-2. If the integration overflows, `InputError` is raised even

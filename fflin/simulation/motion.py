@@ -46,7 +46,7 @@ class Motion(Design):
         not wrapped at a full turn.
     u : ndarray (N, nu)
         Inputs just after each time t, in the axes of `frame`. The last row repeats the inputs of
-        the row before it, because no inputs follow the last time.
+        the row before it, because no inputs are applied after the last time.
     target : ndarray (nx,) or (N, nx)
         Target state; or, if the robot follows a trajectory, the trajectory's state at each time.
         The array is empty if no target is known.
@@ -74,9 +74,9 @@ class Motion(Design):
         `energy`: the difference from the expected energy, divided by the largest terms of the
         energy. The expected energy is the initial energy plus the work of inputs and disturbances.
     com_drift : ndarray (N,)
-        Distance [m] of the centre of mass from the position that follows from its initial
-        velocity and the impulse of external forces. The array is empty in orbit, or if the motion
-        was read from a file without these data.
+        Distance [m] between the centre of mass and its expected position, which follows from the
+        initial velocity and the impulse of external forces. The array is empty in orbit, or if the
+        motion was read from a file without these data.
     state_names, input_names, state_units, input_units : tuple of str
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
     robot, urdf_sha256 : str
@@ -105,8 +105,8 @@ class Motion(Design):
     engine : str
         Engine that ran the simulation, "compiled" or "python"; empty if the engine is not known.
     limits : ndarray (k, 2)
-        Lower and upper limits of the states and inputs in `limit_names`; infinite if a bound does
-        not exist. Limits that the simulation does not enforce are included.
+        Lower and upper limits of the states and inputs in `limit_names`. A missing limit is
+        infinite. Limits that the simulation does not enforce are included.
     phases, starts : tuple of str, ndarray (k,)
         Names and start times [s] of the phases, if `then` joined the motion from several phases.
 
@@ -189,7 +189,7 @@ class Motion(Design):
 
     @property
     def reference(self) -> pin.SE3:
-        """Reference placement, relative to which the state gives the base pose."""
+        """Placement relative to which the attitude and position of the base are measured."""
         return pin.XYZQUATToSE3(self.placement)
 
     @property
@@ -247,9 +247,9 @@ class Motion(Design):
         Returns
         -------
         Motion
-            Joined motion on one time axis, with the states and the chart of this motion. A joint
-            that jams remains a state, and is at rest after the jam. The energy and momentum of each
-            phase are computed for the robot of that phase, for example with its payload.
+            Joined motion on one time axis, with the states and the chart of this motion. The states
+            of a jammed joint remain, with zero velocity after the jam. The energy and momentum of
+            each phase are computed for the robot of that phase, for example with its payload.
 
         Raises
         ------

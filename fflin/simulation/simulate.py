@@ -77,7 +77,8 @@ def simulate(
         ``StateFeedback(lin, gain.K)``. A `GainSchedule` is also accepted, and then tracks its
         trajectory. By default all inputs are zero.
     x0 : array_like (nx,), optional
-        Initial state in the chart of the policy's model, or of `frame` and `reference`.
+        Initial state in the chart defined by `frame` and `reference`, which is by default the chart
+        of the policy's model.
     q0 : array_like (nq,), optional
     v0 : array_like (nv,), optional
         Initial configuration and velocity in Pinocchio's order, instead of `x0`. If only v0 is
@@ -108,10 +109,10 @@ def simulate(
           largest wheel speeds, `Robot.limits`);
         - a number: the largest magnitude of every input;
         - a mapping {input, group or pattern: magnitude, or (lower, upper)};
-        - a list such as ``["urdf", {"tau_m": 5.0}]``, in which explicit limits take precedence
-          over "urdf".
+        - a list in which explicit limits take precedence over "urdf", such as
+          ``["urdf", {"tau_m": 5.0}]``.
 
-        On-off thrusters fire in pulses for any `limits`. `Motion.passed` lists violated limits.
+        On-off thrusters fire in pulses, whatever the limits. `Motion.passed` lists violated limits.
     disturbance : callable, optional
         Function disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order.
     events : sequence of callable

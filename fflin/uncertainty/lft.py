@@ -47,8 +47,8 @@ class LFT(Design):
     middle, half : ndarray (k,)
         Middle and half width of each range: a parameter has the value ``middle + half * delta``.
         For tied parameters, ``middle + half * delta`` is their common value if their range was
-        given as a pair. If their range is relative, it is the factor that multiplies their nominal
-        values.
+        given as a pair. If their range is relative, ``middle + half * delta`` is the factor that
+        multiplies their nominal values.
     units : tuple of str
         Units of the parameters; "1" for a factor.
     state_names, input_names, output_names : tuple of str
@@ -116,7 +116,7 @@ class LFT(Design):
         return found
 
     def at(self, values: Mapping[str, float] | Array) -> tuple[Array, Array, Array, Array]:
-        r"""Return A, B, C and D at values of the parameters.
+        r"""Return A, B, C and D at given values of the parameters.
 
         Parameters
         ----------

@@ -61,9 +61,10 @@ class Derivatives(FrozenArrays):
 class Sensitivity:
     """Derivatives of a linear model with respect to the parameters of the robot.
 
-    ``S["arm.mass"].dA`` is the derivative of A with respect to one parameter. Parameters belong to
-    links or to bodies. A link has its name in the URDF. A body is a group of links that are fixed
-    to each other, and has the name of its joint or ``base``. The parameters of a link or body are
+    ``S["arm.mass"].dA`` is the derivative of A with respect to one parameter. Most parameters
+    belong to a link or to a body. The name of a link is its name in the URDF. A body is a group of
+    links that are fixed to each other; its name is the name of its joint, or ``base``. The
+    parameters of a link or body are
 
     - ``LINK.mass`` [kg]; centre of mass and inertia about the centre of mass stay constant;
     - ``LINK.com.x`` [m] in the link's axes; mass and inertia about the centre of mass stay
@@ -75,12 +76,12 @@ class Sensitivity:
     A pattern selects links, or bodies if the pattern matches no link.
 
     A mode of a flexible appendage or slosh has the parameters ``MODE.frequency`` [Hz] and
-    ``MODE.damping`` (the damping ratio), both for a clamped link. A change of the frequency does
-    not change the damping ratio.
+    ``MODE.damping`` (the damping ratio), both for a clamped link. The damping ratio stays constant
+    if the frequency is changed.
 
     Other parameters are ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
-    ``THRUSTER.direction.x`` and ``WHEEL.inertia``. Only the direction of a thruster's vector
-    matters, not its length. The carrier's inertia includes its wheels, so a larger wheel inertia
+    ``THRUSTER.direction.x`` and ``WHEEL.inertia``. A change of the length of ``THRUSTER.direction``
+    has no effect. The inertia of a wheel's carrier includes the wheel, so a larger wheel inertia
     reduces the inertia of the rest of the carrier.
 
     Attributes
@@ -88,7 +89,7 @@ class Sensitivity:
     lin : LinearModel
         Linear model whose derivatives are computed.
     parameters : Parameters
-        Parameters of the robot by name, {name: Parameter}.
+        Mapping from names to the parameters of the robot.
 
     Examples
     --------
@@ -136,9 +137,9 @@ class Sensitivity:
         ----------
         direction : mapping
             Changes {parameter or pattern: change}, each in the parameter's unit. The results are
-            the first-order changes of A, B and so on for these changes. For example,
-            ``{"payload.density": 0.1}`` increases mass and inertia of the payload by a tenth, and
-            ``{"panel_*.stiffness": 1.0}`` changes all matching stiffnesses together.
+            the first-order changes of A, B and so on for these changes. For example, the change
+            0.1 of ``payload.density`` increases mass and inertia of the payload by a tenth, and
+            the change 1.0 of ``panel_*.stiffness`` changes all matching stiffnesses together.
         """
         given = numbers("direction", direction, "parameter", "change")
         named = {name: value for key, value in given.items() for name in self.parameters.find(key)}
@@ -212,7 +213,7 @@ class Sensitivity:
         -------
         dict
             Largest differences {parameter: difference}, relative to the derivatives. Differences
-            of about 1e-9 are expected, because the finite differences are not more accurate.
+            of about 1e-9 are expected, which is the accuracy of the finite differences.
         """
         if names is None:
             names = [name for name, one in self.parameters.items() if one.bodies]
@@ -304,7 +305,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     Returns
     -------
     Sensitivity
-        Derivatives are computed at first access.
+        Derivatives of the model, which are computed at first access.
 
     Raises
     ------

@@ -97,9 +97,9 @@ class Uncertain:
     def at(self, values: Mapping[str, float]) -> Robot:
         """Return the robot with the given parameter values {parameter or pattern: value}.
 
-        All other parameters keep their nominal values. For the pattern of tied parameters, give
-        their common value, or, if their range is relative, the common factor that multiplies their
-        nominal values.
+        All other parameters keep their nominal values. Tied parameters are named by their pattern.
+        The value given for a pattern is their common value or, if their range is relative, the
+        factor that multiplies their nominal values.
 
         Raises
         ------
@@ -183,9 +183,9 @@ class Uncertain:
 
         The result also contains the central fraction of each range in which stability is
         guaranteed. The worst loop is at least as bad as the loop at every tried corner of the
-        ranges and at every random draw. The gains of the worst case are accurate to five digits.
-        With more samples and the same seed, the result cannot be better, because the search first
-        repeats the search with fewer samples.
+        ranges and at every random draw. The reported gains of the worst loop are accurate to five
+        digits. With more samples and the same seed, the result cannot be better, because the search
+        first repeats the search with fewer samples.
 
         Parameters
         ----------
@@ -194,9 +194,8 @@ class Uncertain:
         q : array_like (nq,), optional
             Configuration, as in `lft`.
         samples : int
-            Number of random draws from the ranges, which are tried after the corners. From each
-            loop that is worse than all loops before it, a local search looks for an even worse
-            loop.
+            Number of random draws from the ranges. They are tried after the corners. If a loop is
+            worse than all loops before it, a local search starts from this loop.
         seed : int
             The same seed gives the same draws.
 
@@ -226,7 +225,8 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
         - a number: the relative half width, such as 0.2 for plus or minus 20 % of the nominal
           value;
         - a pair: the smallest and the largest value;
-        - ``{"range": 0.2, "tied": True}`` for a pattern whose parameters are tied.
+        - for a pattern whose parameters vary together, one of these ranges with ``"tied": True``,
+          such as ``{"range": 0.2, "tied": True}``.
 
         Several parameters of a link may be given as ``{link: {"mass": .., "inertia.xx": ..}}``. By
         default, the parameters that match a pattern vary independently. Tied parameters vary

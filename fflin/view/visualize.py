@@ -87,7 +87,8 @@ def visualize(
         Files for a picture (.png) and an animation (.gif); both need Chromium.
     times : sequence of float, optional
         Times [s] of the images in the picture `png`; four times by default. With one time, the
-        picture shows one image with its panel. With several times, it is a strip of images.
+        picture shows one image with its panel. With several times, the picture is a strip of
+        images.
     open : bool, optional
         Whether to open a browser. By default, a browser is opened if no output file is given.
     scene : {"space", "lab"}, optional

@@ -39,7 +39,7 @@ class Appendage(FrozenArrays):
 
     @property
     def title(self) -> str:
-        """Name with which the names of the modes begin."""
+        """Prefix of the names of the modes."""
         return self.name or self.frame
 
     @property
@@ -63,10 +63,10 @@ class FlexibleAppendage(Appendage):
     r"""Flexible part of a link, such as a solar array, described by its modes when clamped.
 
     Each mode adds a coordinate to q_m, with the name NAME_mode_1, NAME_mode_2 and so on. The
-    coordinate is the modal amplitude in kg^0.5 m, for unit modal mass. For a mode of angular
-    frequency :math:`\omega` and damping ratio :math:`\zeta`, the coordinate has the stiffness
-    :math:`\omega^2`, the damping :math:`2 \zeta \omega` and no motor. The link's inertia in the
-    URDF must include the appendage as if it were rigid.
+    coordinate is the modal amplitude, in kg^0.5 m because the modal mass is 1. For a mode of
+    angular frequency :math:`\omega` and damping ratio :math:`\zeta`, the coordinate has the
+    stiffness :math:`\omega^2`, the damping :math:`2 \zeta \omega` and no motor. The link's inertia
+    in the URDF must include the appendage as if it were rigid.
 
     Parameters
     ----------
@@ -84,15 +84,15 @@ class FlexibleAppendage(Appendage):
     damping : float or sequence of float (k,)
         Damping ratios, from 0 to 1.
     name : str, optional
-        Name with which the names of the coordinates begin; the frame's name by default.
+        Prefix of the names of the coordinates; the frame's name by default.
 
     Raises
     ------
     InputError
         If a shape is wrong, a value is not finite, a frequency is not positive, or a damping ratio
         is not between 0 and 1. `load` also raises the error if the participation L is too large for
-        the rigid inertia :math:`M_{rr}` of the carrying body, such that :math:`M_{rr} - L L^T` is
-        not positive semidefinite.
+        the rigid inertia :math:`M_{rr}` of the carrying body, because :math:`M_{rr} - L L^T` must
+        be positive semidefinite.
 
     Examples
     --------
@@ -176,7 +176,8 @@ class FlexibleAppendage(Appendage):
             Output4 file with the mass and stiffness matrix (mxx, maa or maax; kxx, kaa or kaax).
         asm : path
             Assembly file with the boundary grids and the points of the modes. A .pch file in the
-            same folder defines which degrees of freedom of the grids are kept.
+            same folder defines which degrees of freedom of the grids belong to the boundary;
+            without this file, all six do.
         frame : str
             Frame of the robot's model at the interface. Its axes must be parallel to the basic
             axes of the Nastran file.
@@ -292,8 +293,7 @@ class Slosh(Appendage):
     damping : float
         Damping ratio, from 0 to 1.
     name : str, optional
-        Name with which the names of the coordinates begin; by default the frame's name, followed by
-        "_slosh".
+        Prefix of the names of the coordinates; by default the frame's name, followed by "_slosh".
 
     Raises
     ------
@@ -428,7 +428,7 @@ class Slosh(Appendage):
 
     @property
     def title(self) -> str:
-        """Name with which the names of the coordinates begin."""
+        """Prefix of the names of the coordinates."""
         return self.name or f"{self.frame}_slosh"
 
     @property
