@@ -36,38 +36,39 @@ _LOOPS = (
 
 @dataclass(frozen=True, eq=False)
 class Controllability(FrozenArrays):
-    """Controllability of a linear model; prints in words.
+    """Controllability of a linear model; ``print`` shows a summary.
 
     Attributes
     ----------
     dimension : int
         Dimension of the controllable subspace.
     controllable : tuple of str
-        Names of ``dimension`` states that the inputs can set independently. In the controllable
-        subspace, their values determine all other states through `basis`.
+        Names of states that the inputs can set independently; there are `dimension` of them. Within
+        the controllable subspace, their values determine the whole state, ``x = basis @ values``.
     uncontrollable : tuple of str
         Names of the uncontrollable combinations of states.
     rows : ndarray (nx - dimension, nx)
-        Coefficients of the uncontrollable combinations. The controllable subspace is the set of all
-        x with ``rows @ x = 0``.
+        Coefficients of the uncontrollable combinations, one row for each. The controllable subspace
+        is the set of all x with ``rows @ x = 0``.
     basis : ndarray (nx, dimension)
-        Basis of the controllable subspace. Column i changes ``controllable[i]`` by 1, and no other
-        state in `controllable`.
+        Basis of the controllable subspace. Column i is the state in which ``controllable[i]`` is 1
+        and the other states named in `controllable` are 0.
     fixed_poles : ndarray (nx - dimension,)
         Poles that no feedback can move: [1/s] for a continuous model, discrete-time poles z for a
         sampled one.
     stabilizable : bool
         Whether all fixed poles are stable.
     reach : dict
-        {"base attitude", "base position", "joints": number of independent directions}. The inputs
-        can bring the state to any value along each of these directions, with the final values of
-        all other states left free.
+        Numbers of independent directions that the inputs can control, with the keys "base
+        attitude", "base position" and "joints". The inputs can bring the position states to any
+        value along these directions, if the final values of all other states are left free.
     method : str
         Method that determined the dimension: "closed form", "modes" or "eigenvalues".
     margin : Margin
-        Certainty of the rank decisions: the smallest singular value counted as nonzero and the
-        largest counted as zero, each divided by its tolerance. The decision is clear if the first
-        ratio is far above 1 and the second ratio far below 1.
+        Certainty of the rank decisions, as two ratios: the smallest singular value counted as
+        nonzero, divided by its tolerance, and the largest singular value counted as zero, divided
+        by its tolerance. The decisions are certain if the first ratio is far above 1 and the second
+        ratio is far below 1.
     notes : tuple of str
         Remarks on the result, such as ranks that rounding error leaves undecided.
 
@@ -110,24 +111,32 @@ class Controllability(FrozenArrays):
 def controllability(lin: LinearModel) -> Controllability:
     r"""Determine the controllable subspace from the structure of the model.
 
-    - At rest, the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved. The conserved
-      momenta and the coordinates :math:`W M N^{-1} x_1` driven by these momenta are separated
-      exactly. Without springs and dampers, all other states are controllable, and the dimension
-      is 2 rank(B).
-    - With symmetric springs and dampers, the remaining part is tested in second-order form,
-      :math:`M a + D v + K s = S u`, by the rank of :math:`[p^2 M + p D + K, S]` at each pole p.
-      Entries within rounding error are set to zero, and each row is scaled by its entries.
+    Let :math:`x_1` be the positions and :math:`\nu` the velocities, with :math:`\dot x_1 = N \nu`,
+    and let :math:`A_{ij}` and :math:`B_i` be the corresponding blocks of A and B. The method
+    depends on the model:
+
+    - At rest, the momenta :math:`W M \nu` with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved;
+      each row of W defines one momentum. These momenta, and the coordinates :math:`W M N^{-1} x_1`
+      whose rates are these momenta, are uncontrollable and are separated exactly from the other
+      states. Without springs and dampers, all other states are controllable, so the dimension is 2
+      rank(B).
+    - At rest with symmetric springs and dampers, the other states are tested in second-order form,
+      :math:`M a + D v + K s = S u` with positions s, damping D and stiffness K, by the rank of
+      :math:`[p^2 M + p D + K, S]` at each pole p. Entries within rounding error are set to zero,
+      and each row is scaled by its entries.
     - At nonzero velocity, or if springs or dampers are not symmetric, the Popov-Belevitch-Hautus
-      test is applied: the rank of :math:`[A - p E, B]` is found from its singular values, with
-      states scaled to units of energy.
+      test is applied: the rank of :math:`[A - p I, B]` at each pole p is found from its singular
+      values, with the states scaled to units of energy.
 
-    A sampled model has the structure of its continuous model, with one exception: sampling may
-    map two poles to one. For example, a vibration is uncontrollable if the sample time is a
-    multiple of half its period. For a sampled model from a file, only the sampled matrices are
-    analysed.
+    A sampled model has the controllable subspace of its continuous model, with one exception:
+    sampling may map two poles to one, and the inputs may then control only one of the two modes.
+    For example, a vibration is uncontrollable if the sample time is a multiple of half its period.
+    A sampled model that was loaded from a file lacks the continuous model, so only the sampled
+    matrices are analysed.
 
-    Every tolerance is a small multiple of the rounding error. `margin` compares the decisions with
-    their tolerances, and `notes` lists decisions within rounding error.
+    The tolerance of every rank decision is a small multiple of the rounding error. In the result,
+    `margin` compares the singular values with their tolerances, and `notes` lists ranks that
+    rounding error leaves undecided.
 
     Parameters
     ----------
@@ -138,19 +147,20 @@ def controllability(lin: LinearModel) -> Controllability:
     Returns
     -------
     Controllability
-        Dimension, basis, and named controllable and uncontrollable states.
+        Dimension and basis of the controllable subspace, and names of controllable and
+        uncontrollable states.
 
     Raises
     ------
     InputError
-        If `lin` is not a linear model of positions and their rates.
+        If `lin` is not a `LinearModel`, or its states are not positions followed by their rates.
 
     Notes
     -----
     All inputs, including thrusters, are assumed to act in both directions. At a nonzero angular
-    velocity, the result applies to the model with A and B frozen at the point. Controllability of
-    the frozen model does not prove that the motion is controllable. At nonzero velocity, poles
-    with a modulus below about 1e-8 times the largest modulus are treated as zero.
+    velocity, the result applies to the model with A and B frozen at the operating point. The motion
+    itself may be uncontrollable even if this frozen model is controllable. At nonzero velocity,
+    poles with a modulus below about 1e-8 times the largest modulus are treated as zero.
 
     References
     ----------

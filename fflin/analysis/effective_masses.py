@@ -24,7 +24,7 @@ _ROUNDING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class EffectiveMasses(FrozenArrays):
-    """Effective masses of the vibration modes with the base clamped; prints as a table.
+    """Effective masses of the vibration modes with the base clamped; ``print`` shows a table.
 
     All quantities refer to the origin of the base frame and are expressed in its axes. Entries for
     translation come before entries for rotation.
@@ -37,11 +37,13 @@ class EffectiveMasses(FrozenArrays):
         Modal participation factors L for unit modal mass; rows 0 to 2 [kg^1/2], rows 3 to 5
         [kg^1/2 m].
     free : ndarray (6, 6)
-        Part of the inertia that joints without a spring do not transmit to the base.
+        Part of the rigid robot's inertia that the base does not feel, because joints without a
+        spring do not transmit it.
     residual : ndarray (6, 6)
         Apparent inertia of the base if all joints are free to move.
     total : ndarray (6, 6)
-        Inertia of the rigid robot, the sum of all parts.
+        Inertia of the rigid robot: the sum of `free`, `residual` and the contributions of all
+        modes.
     robot : str
         Name of the robot.
 
@@ -95,32 +97,34 @@ class EffectiveMasses(FrozenArrays):
 def effective_masses(lin: LinearModel) -> EffectiveMasses:
     r"""Return the effective masses of a robot's vibration modes with its base clamped.
 
-    K is the stiffness of the joint springs. M is the mass matrix in base axes, with the base
-    before the joints. Joints without a spring are condensed out of M, which gives :math:`\tilde
-    M`. With the base at rest the modes are
+    Let K be the stiffness of the joint springs, and M the mass matrix in base axes with the
+    subscripts b for the base and m for the joints. Joints without a spring are condensed out of M,
+    which gives :math:`\tilde M`. With the base at rest, the frequencies, shapes and participation
+    factors of the modes follow from
 
     .. math::
         K \phi_i = \omega_i^2 \tilde M_{mm} \phi_i, \qquad \phi_i^T \tilde M_{mm} \phi_i = 1,
         \qquad L_i = \tilde M_{bm} \phi_i.
 
-    If the base is accelerated along axis d, mode i exerts the same force on it as a mass
-    :math:`L_{di}^2` [kg] on a spring, the effective mass. For rotation about d, :math:`L_{di}^2` is
-    the effective moment of inertia [kg m^2]. The contributions of all modes, of the joints without
-    springs (free) and of the residual add up to the inertia of the rigid robot,
+    If the base is accelerated along axis d, mode i exerts the same force on the base as a single
+    mass :math:`L_{di}^2` [kg] on a spring. This mass is the effective mass of mode i. For rotation
+    about d, :math:`L_{di}^2` is the effective moment of inertia [kg m^2]. The contributions of all
+    modes, the joints without springs (free) and the residual add up to the inertia of the rigid
+    robot:
 
     .. math::
         \textstyle\sum_i L_i L_i^T + M_{free} + M_{res} = M_{bb}, \qquad
         M_{res} = M_{bb} - M_{bm} M_{mm}^{-1} M_{mb}.
 
-    With a free base, the natural frequencies are higher, as listed by `modes`. If several modes
-    have the same frequency, only the sum of their masses is unique. The first of these modes is
-    then given the largest possible mass.
+    The natural frequencies with the base clamped are lower than with a free base, for which `modes`
+    computes them. If several modes have the same frequency, only the sum of their effective masses
+    is unique, so the first of these modes is given the largest possible mass.
 
     Parameters
     ----------
     lin : LinearModel
-        Full model about any operating point; only its configuration matters. K excludes gravity,
-        dampers and inputs.
+        Full model about any operating point. Only the springs and the configuration affect the
+        result: velocity, gravity, dampers and inputs are ignored.
 
     Returns
     -------
@@ -130,10 +134,9 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     Raises
     ------
     InputError
-        If the model is reduced or was loaded from a file, and therefore lacks the robot's
-        springs.
+        If the model lacks the robot's springs because it is reduced or was loaded from a file.
     ModelError
-        If the robot's model was changed after the linear model was made.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     References
     ----------

@@ -25,7 +25,7 @@ _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
 
 def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
-    """Draw the magnitudes of all entries of A and B that exceed rounding error, by state groups.
+    """Draw the magnitudes of the entries of A and B; entries within rounding error stay blank.
 
     Parameters
     ----------

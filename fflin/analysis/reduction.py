@@ -39,22 +39,21 @@ _DRIFT = 1e-9
 class ReducedModel(LinearModel):
     """Linear model reduced to the coordinates on which inputs, springs and dampers act.
 
-    Let z be the reduced state and x the full state; then ``z = S x`` for all motions. For motions
-    with zero conserved momenta, ``x - x0 = T (z - z0)``. A saved file contains the model, but not
-    the maps T and S.
+    Let x be the full state, z the reduced state, and x0 and z0 their values at the operating point.
+    Then ``z = S x`` for all motions, and ``x - x0 = T (z - z0)`` for motions whose conserved
+    momenta are zero. `save` writes the reduced model, but not the maps T and S.
 
     Attributes
     ----------
     T : ndarray (nx, nz)
         Map from the reduced state to the full state.
     S : ndarray (nz, nx)
-        Map from the full state to the reduced state, which selects the states with the same
-        names.
+        Map from the full state to the reduced state: selects the states of x that z also contains.
     momenta : ndarray (k, nx)
-        Rows L1 of the conserved momenta, which are zero in the reduced model.
+        Matrix L1 of the conserved momenta ``L1 (x - x0)``, which are zero in the reduced model.
     coordinates : ndarray (k, nx)
-        Rows L2 of the coordinates whose rates are the momenta. These coordinates are zero in the
-        reduced model.
+        Matrix L2 of the coordinates ``L2 (x - x0)`` whose rates are the conserved momenta. These
+        coordinates are also zero in the reduced model.
     margin : Margin
         Certainty of the rank decision on the conserved momenta, as in `Controllability`.
     notes : tuple of str
@@ -82,10 +81,10 @@ class ReducedModel(LinearModel):
 def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) -> ReducedModel:
     r"""Remove the conserved momenta from a model, exactly.
 
-    A conserved momentum :math:`W M \nu`, which no input, spring or damper changes, stays zero if
-    its initial value is zero. The reduction removes each conserved momentum and the coordinate
-    driven by this momentum. For an unactuated base, all six momenta are removed. With :math:`G =
-    -M_{bb}^{-1} M_{bm}`, the reduced model is
+    A momentum :math:`W M \nu` is conserved if no input, spring or damper changes it. If its initial
+    value is zero, it stays zero. The reduction therefore removes each conserved momentum and the
+    coordinate whose rate is this momentum. If the base is unactuated, all six momenta are removed.
+    With :math:`G = -M_{bb}^{-1} M_{bm}`, the reduced model is then
 
     .. math::
         \nu_b = G \dot q_m, \quad M^* \ddot q_m = \tau_m - K q_m - D \dot q_m, \quad
@@ -93,13 +92,13 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
     See equations (9.2) and (9.3) of docs/derivation.md.
 
-    The base attitude is kept if inputs act on the attitude, and the base position if inputs act
-    on the position. Without springs, the reduced model is minimal. With springs, the reduced
-    model may contain vibrations that no input drives. The reduced and the full model have the
-    same transfer function from inputs to joint states.
+    If inputs act on the base attitude, the reduced model keeps the attitude. If inputs act on the
+    base position, the reduced model keeps the position. Without springs, the reduced model is
+    minimal. With springs, it may still contain vibrations that no input drives. The reduced model
+    and the full model have the same transfer function from inputs to joint states.
 
-    Reaction wheels are also removed, even if they store momentum (9.4), but the attitude
-    controlled by wheels is kept. Three kinds of wheels are kept with their angles:
+    Reaction wheels are also removed, even if they store momentum (9.4), but the attitude that they
+    control is kept. The speeds and angles of three kinds of wheels are kept:
 
     - wheels whose speeds are to be controlled (9.5);
     - wheels on a carrier that rotates at the operating point;
@@ -108,25 +107,26 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     Parameters
     ----------
     lin : LinearModel
-        Model about rest, continuous or sampled.
+        Model about an operating point at rest, continuous or sampled.
     wheel_speeds : bool, optional
-        Whether to keep wheels whose speeds the inputs can control. By default, such wheels are
-        kept if other inputs can rotate the base.
+        Whether to keep wheels whose speeds the inputs can control. By default, such wheels are kept
+        if inputs other than the wheels can rotate the base.
 
     Returns
     -------
     ReducedModel
         `LinearModel` with the maps ``T`` and ``S``. The model has 2 r states, where r is nv minus
         the number of conserved momenta. ``M`` is the inertia of the kept coordinates, with the
-        removed coordinates free to move. The outputs are the outputs of `lin`, except that
-        outputs of removed wheels are zero, as in ``T``.
+        removed coordinates free to move. The outputs are the outputs of `lin`. An output that
+        measures a removed wheel is zero, because ``T`` sets the states of removed wheels to zero.
 
     Raises
     ------
     InputError
-        If f0 is nonzero in a removed direction, or `lin` is not a linear model.
+        If the state derivative f0 at the operating point is nonzero in a direction that the
+        reduction removes, or `lin` is not a linear model.
     ModelError
-        If the robot's model was changed after the linear model was made.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     References
     ----------
@@ -166,11 +166,12 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
 
 def generalized_inertia(lin: LinearModel) -> Array:
-    r"""Return the generalized inertia: the joints' inertia while the base is free (9.3).
+    r"""Return the generalized inertia matrix: the inertia of the joints with the base free.
 
     .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
 
-    The definition is by Umetani and Yoshida, see `momentum_reduction`.
+    Umetani and Yoshida defined this matrix, see (9.3) of docs/derivation.md and the reference in
+    `momentum_reduction`.
 
     Parameters
     ----------
@@ -202,13 +203,14 @@ def generalized_inertia(lin: LinearModel) -> Array:
 
 
 def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") -> Array:
-    r"""Return the generalized Jacobian from joint rates to a frame's velocity (9.3).
+    r"""Return the generalized Jacobian from joint rates to a frame's velocity.
 
-    The base is free, and the momentum of the robot is zero.
+    This Jacobian is valid if the base is free and the momentum of the robot is zero.
 
     .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
 
-    The definition is by Umetani and Yoshida, see `momentum_reduction`.
+    Umetani and Yoshida defined this matrix, see (9.3) of docs/derivation.md and the reference in
+    `momentum_reduction`.
 
     Parameters
     ----------
@@ -221,8 +223,8 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     Returns
     -------
     ndarray (6, n)
-        Jacobian from joint rates to angular velocity [rad/s], then velocity of the frame's origin
-        [m/s], both in Pinocchio's world axes.
+        Jacobian from the joint rates to the angular velocity of the frame [rad/s] (rows 0 to 2) and
+        the velocity of its origin [m/s] (rows 3 to 5), both in Pinocchio's world axes.
 
     Raises
     ------

@@ -26,7 +26,7 @@ def _cut(text: str, size: int) -> str:
 
 
 class FflinError(Exception):
-    """Base class of every error that fflin raises deliberately. Each message is one line.
+    """Base class of all errors that fflin defines. Each message is one line.
 
     Examples
     --------
@@ -54,7 +54,7 @@ class InputError(FflinError, ValueError):
 
 
 class UnknownNameError(FflinError, LookupError):
-    """Error for the name of a robot, joint, frame or other item that does not exist.
+    """Error for an unknown name, for example of a robot, joint or frame.
 
     Examples
     --------
@@ -92,7 +92,10 @@ class UrdfError(FflinError, ValueError):
 
 
 class ModelError(FflinError, ValueError):
-    """Error for a model that is not one free-flying tree of one-degree-of-freedom joints.
+    """Error for a Pinocchio model that fflin cannot use.
+
+    The model must be a single tree of one-degree-of-freedom joints on a free-flyer root joint. It
+    must not be modified after the robot was created.
 
     Examples
     --------
@@ -133,7 +136,7 @@ class ChartError(FflinError, ValueError):
 
 
 class EquilibriumError(FflinError, ValueError):
-    """Error for an operating point that is not an equilibrium, or that no inputs can hold.
+    """Error for an operating point that is not an equilibrium, or where no inputs hold the robot.
 
     Examples
     --------
@@ -146,12 +149,12 @@ class EquilibriumError(FflinError, ValueError):
 
 
 class StabilizabilityError(FflinError, ValueError):
-    """Error for modes that do not decay by themselves and that the inputs do not control.
+    """Error for modes that neither decay by themselves nor can be controlled by the inputs.
 
     Attributes
     ----------
     margin : Margin or None
-        Certainty of the rank decisions that led to the error; None if no rank was decided.
+        Certainty of the rank decisions that led to the error; None if no rank decision was needed.
 
     Examples
     --------
@@ -166,12 +169,12 @@ class StabilizabilityError(FflinError, ValueError):
 
 
 class DetectabilityError(FflinError, ValueError):
-    """Error for modes that do not decay by themselves and that the outputs do not observe.
+    """Error for modes that neither decay by themselves nor can be observed from the outputs.
 
     Attributes
     ----------
     margin : Margin or None
-        Certainty of the rank decisions that led to the error; None if no rank was decided.
+        Certainty of the rank decisions that led to the error; None if no rank decision was needed.
 
     Examples
     --------
@@ -202,7 +205,8 @@ class SweepError(FflinError, RuntimeError):
     Attributes
     ----------
     failed : tuple
-        (start, stop, reason) of each failed chunk; its points are start to stop - 1.
+        Tuple (start, stop, reason) for each failed chunk. The chunk contains the points start to
+        stop - 1.
     batch : LinearBatch or None
         Results of the other chunks, in order; None if the sweep was written to a file.
 

@@ -62,7 +62,7 @@ def _on_terminal() -> bool:
 
 
 def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
-    """Align cells in columns, "l" or "r" each, "r" beyond the end of `align`; dim a cell "."."""
+    """Align columns left or right by the letters of `align`, by default right; dim cells "."."""
     sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
     align = align.ljust(len(sizes), "r")
     lines = []

@@ -40,10 +40,10 @@ class Grid:
     ----------
     robot : Robot
     axes : mapping
-        {joint: values (k,) [rad|m]}.
+        Values of each varied joint, {joint: values (k,) [rad|m]}.
     start : ndarray (nq,)
-        Configuration with the base pose, and with the values of the joints that the grid does not
-        vary.
+        Configuration that contains the base pose and the positions of the joints that the grid does
+        not vary.
 
     Examples
     --------
@@ -59,7 +59,7 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of values of each joint."""
+        """Number of values of each joint in `axes`."""
         return tuple(len(values) for values in self.axes.values())
 
     def __len__(self) -> int:
@@ -84,9 +84,9 @@ class RandomConfigurations:
     count, seed : int
         Number of configurations, and seed of the draws.
     ranges : mapping
-        {joint: (low, high) [rad|m]}.
+        Range of each joint, {joint: (low, high) [rad|m]}.
     start : ndarray (nq,)
-        Configuration with the base pose.
+        Configuration that contains the base pose; random values replace its joint positions.
 
     Examples
     --------
@@ -149,7 +149,8 @@ def grid(
     ----------
     robot : Robot
     axes : mapping
-        {joint: increasing values (k,) [rad|m]}. The last joint varies fastest.
+        Values of each varied joint in increasing order, {joint: values (k,) [rad|m]}. The last
+        joint varies fastest.
     joints, base : optional
         Values of the other joints and pose of the base, as in `configuration`.
 
@@ -214,10 +215,10 @@ def random_configurations(
     count : int
         Number of configurations.
     seed : int
-        The same seed gives the same configurations.
+        Random seed. The same seed gives the same configurations.
     ranges : mapping, optional
-        {joint or pattern: (low, high) [rad|m]} instead of the joint limits. Revolute joints
-        without limits are drawn from one full turn.
+        Ranges {joint or pattern: (low, high) [rad|m]} that replace the joint limits. The angle of a
+        revolute joint with neither limits nor a range is drawn from one full turn.
     base : pin.SE3, optional
         Pose of the base; the identity by default.
 
@@ -230,8 +231,8 @@ def random_configurations(
     UnknownNameError
         If a joint does not exist.
     InputError
-        If the count or seed is not a whole number, a range is empty, or a prismatic joint has no
-        limits and no range is given.
+        If the count or seed is not a whole number, a range is empty, or a prismatic joint has
+        neither limits nor a range.
 
     Examples
     --------

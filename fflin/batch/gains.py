@@ -77,7 +77,7 @@ class GainBatch(Design):
 
     @property
     def grid(self) -> dict[str, Array]:
-        """Axes of the grid: {joint: values [rad|m]}, for the joints that vary.
+        """Axes of the grid as {joint: values [rad|m]}; only joints that vary are included.
 
         Raises
         ------
@@ -94,8 +94,8 @@ class GainBatch(Design):
         Raises
         ------
         InputError
-            If the positions are not n finite numbers, or the points are not on a grid or are all
-            the same.
+            If `joints` does not contain n finite numbers, or if the points of the batch are all the
+            same or not on a grid.
         """
         return self._between(vector("joints", joints, len(self.joint_names), "the joint positions"))
 
@@ -139,8 +139,9 @@ class GainBatch(Design):
 def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     r"""Return the linear quadratic regulator about every point of a batch.
 
-    Each gain is computed as by `lqr`. For fully actuated models at rest, the computation takes half
-    the time of a call of `lqr`, because no model and no `Gain` are made for the point.
+    Each gain is computed by the method of `lqr`. For fully actuated models at rest, the computation
+    takes half the time of a call of `lqr` per point, because no model and no `Gain` are created for
+    the point.
 
     Parameters
     ----------
@@ -211,15 +212,17 @@ class ScheduledFeedback(Feedback):
     Parameters
     ----------
     lin : LinearModel
-        Model about the target.
+        Linear model about the target state.
     gains : GainBatch
         Gains of the same robot, on a grid of its joint positions. If the robot has captured or
-        released an object since the gains were designed, `line_up` matches states and inputs.
+        released an object since the gains were designed, `line_up` matches the states and inputs of
+        `gains` with those of `lin`.
 
     Raises
     ------
     InputError
-        If states and inputs cannot be matched, or the gains are not on a grid.
+        If the states and inputs of `gains` and `lin` cannot be matched, or the gains are not on a
+        grid.
 
     Examples
     --------

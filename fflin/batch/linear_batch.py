@@ -37,9 +37,10 @@ class LinearBatch(FrozenArrays):
     r"""Batch of linear models ``dx/dt = f0 + A (x - x0) + B (u - u0)``, made by `sweep`.
 
     ``batch[i]`` is the `LinearModel` about point i. ``batch[2:9]`` and ``batch[mask]`` are smaller
-    batches. Every array has N rows. An array that is the same at all points, such as A at rest, is
-    stored once (its stride over the points is zero). The upper half of B is zero and is not
-    stored. Arrays are read-only. Arrays of a batch in an HDF5 file are read on demand.
+    batches. All arrays have N rows and are read-only. If an array is the same at all points, such
+    as A at rest, it is stored once, and its stride over the points is zero. The upper half of B is
+    always zero, so it is not stored. If the batch is in an HDF5 file, its arrays are read on
+    demand.
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class LinearBatch(FrozenArrays):
     u0 : ndarray (N, nu)
     q : ndarray (N, nq)
     v : ndarray (N, nv)
-        The points in Pinocchio's order.
+        Configurations q and velocities v of the points, in Pinocchio's order.
     state_names, input_names, output_names : tuple of str
     state_units, input_units, output_units : tuple of str
     frame : str
@@ -65,9 +66,9 @@ class LinearBatch(FrozenArrays):
     locked : tuple of str
         Names of the locked joints.
     columns : tuple of (int, int, float)
-        Indices of each joint's entries in q: (index, -1) for one angle or length, or the indices
-        of cos and sin for a continuous joint. The third number is the entry of q per unit of q_m;
-        it differs from 1 only for modal amplitudes.
+        Two indices into q and a factor for each joint. The indices are (index, -1) for a joint with
+        one angle or length, and the indices of cos and sin for a continuous joint. The factor is
+        the entry of q divided by the entry of q_m; it differs from 1 only for modal amplitudes.
     verified : bool
         Whether the data are known to be unchanged. The value is False for a file without a
         checksum, or if the checksum was not verified.
@@ -189,7 +190,7 @@ class LinearBatch(FrozenArrays):
     def nearest(self, joints: Mapping[str, float]) -> LinearModel:
         """Return the model nearest to the given joint values [rad|m].
 
-        Joints that are not named are ignored.
+        The distance ignores joints that are not named.
 
         Raises
         ------
@@ -237,7 +238,7 @@ class LinearBatch(FrozenArrays):
         Parameters
         ----------
         path : str or Path
-            File ending in .npz or .h5. An HDF5 file can later be read even if it does not fit in
+            Path that ends in .npz or .h5. An HDF5 file can later be read even if it does not fit in
             memory.
 
         Raises
@@ -262,8 +263,8 @@ class LinearBatch(FrozenArrays):
             The robot of the batch. Without `robot`, the models have no inertia M and no
             certificate.
         verify : bool
-            Whether to verify the SHA-256 checksums, which reads all rows. If False, an HDF5 file
-            opens at once, and the batch is not `verified`.
+            Whether to verify the SHA-256 checksums, for which all rows must be read. If False, an
+            HDF5 file opens immediately, but `verified` is False in the result.
 
         Raises
         ------
@@ -309,7 +310,7 @@ class LinearBatch(FrozenArrays):
         return {key: value for key, value in held.items() if value is not None}
 
     def header(self, count: int) -> dict[str, str]:
-        """Return the header of a file with a given number of points, as one JSON document."""
+        """Return the header for a file with `count` points, as one JSON document."""
         first = self[0]
         header = {key: getattr(self, key) for key in _TEXTS}
         header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}

@@ -69,10 +69,11 @@ def sweep(
     r"""Linearise a robot about many points.
 
     If numba is installed (``pip install 'fflin[fast]'``), a compiled kernel processes groups of
-    eight points on all threads. At rest M depends only on the joint positions, and
-    :math:`B = [0;\, M^{-1}]`. The kernel also supports operating points in motion. Without numba,
-    or if the robot has outputs other than its state, a `Linearizer` processes the points one by
-    one. The points can be distributed over worker processes.
+    eight points on all threads. If the robot is at rest and no springs, gravity or other forces
+    act, only :math:`B = [0;\, M^{-1}]` depends on the point, so the kernel computes nothing else.
+    The kernel also supports operating points in motion. Without numba, or if the robot has outputs
+    other than its state, a `Linearizer` processes the points one by one. With `executor` or
+    `workers`, the points are distributed over worker processes.
 
     Parameters
     ----------
@@ -86,18 +87,20 @@ def sweep(
     frame, reference, moving : optional
         See `Linearizer`. By default the reference is the base pose at each point.
     engine : {"python", "compiled"}, optional
-        Compiled by default if numba is installed and the outputs are the state.
+        Engine that linearises the points. The default is "compiled" if numba is installed and the
+        robot's outputs are its state; otherwise the default is "python".
     executor : concurrent.futures.Executor, optional
-        Executor whose workers process the chunks: processes, dask (``Client.get_executor()``) or
-        mpi4py.futures. The executor is not shut down.
+        Executor whose workers process the chunks: a process pool, a dask executor
+        (``Client.get_executor()``) or an executor of mpi4py.futures. `sweep` does not shut down the
+        executor.
     workers : int, optional
         Number of worker processes to start, at most one per core. With workers, call `sweep` under
         ``if __name__ == "__main__":``.
     threads : int, optional
         Number of threads of the compiled code; by default one for each available core.
     chunk : int, optional
-        Number of points in a chunk. By default the result of a chunk takes about 4 MB. A resumed
-        sweep uses the chunk size of its unfinished file.
+        Number of points in a chunk. By default, the number is chosen such that the result of a
+        chunk takes about 4 MB. A resumed sweep uses the chunk size of its unfinished file.
     progress : callable, optional
         Function ``progress(done, total)``, called after every chunk with the numbers of finished
         points and of all points.
@@ -121,13 +124,16 @@ def sweep(
     SweepError
         If a point cannot be linearised, or a worker dies. The message names the chunks;
         `SweepError.batch` or the file contains the results of the other chunks.
-    FileError, MissingPackageError
+    FileError
         If the file cannot be written.
+    MissingPackageError
+        If h5py is needed and not installed.
 
     Warns
     -----
     FflinWarning
-        If M is ill-conditioned; one warning states at how many points.
+        If M is ill-conditioned at some points. A single warning states how many points are
+        affected.
 
     Examples
     --------

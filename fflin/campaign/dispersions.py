@@ -27,12 +27,11 @@ from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, loads_of
 from fflin.robot.equipment.appendage_bodies import first_impossible
 from fflin.robot.joints import ROOT
-from fflin.robot.mass_properties import Piece, varied, with_changed
+from fflin.robot.mass_properties import Piece, bodies_named, varied, with_changed
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
-from fflin.uncertainty.parameters import bodies_named
 
 _BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
@@ -262,14 +261,18 @@ class Dispersions:
             except ChartError as error:
                 said = f"an invalid initial attitude is drawn in the runs from {start} on"
                 raise InputError(f"{said}: {error}; use a smaller dispersion") from None
-            appendages = self._plant.robot.appendages
-            refused = first_impossible(self._model, appendages, self.bodies(drawn))
-            if refused is not None:
-                try:
-                    self.one(drawn[refused])
-                except InputError as error:
-                    said = f"run {start + refused} draws an invalid mass or inertia"
-                    raise InputError(f"{said}: {error}; use a smaller dispersion") from None
+            if appendages := self._plant.robot.appendages:
+                self._require_realisable(appendages, drawn, start)
+
+    def _require_realisable(self, appendages: Any, drawn: Array, start: int) -> None:
+        """Raise `InputError` if a body cannot have the participation of its modes."""
+        refused = first_impossible(self._model, appendages, self.bodies(drawn))
+        if refused is not None:
+            try:
+                self.one(drawn[refused])
+            except InputError as error:
+                said = f"run {start + refused} draws an invalid mass or inertia"
+                raise InputError(f"{said}: {error}; use a smaller dispersion") from None
 
     def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
         """Return the draws (N, size, axes) of a kind; zero if not dispersed."""
@@ -320,7 +323,10 @@ class Dispersions:
             return _OF_SPRINGS
         return tuple(kind for kind in _OF_SPRINGS if kind in self._kinds)
 
-    def _faults(self, drawn: Array) -> ActuatorFaults:
+    def _faults(self, drawn: Array) -> ActuatorFaults | None:
+        """Return the faults of the inputs in each run (N,), or None if none is dispersed."""
+        if not self._kinds & {*_OF_INPUTS, "misalignment"}:
+            return None
         gain, bias, until = (
             self._of(kind, drawn, len(self._plant.faults.gain))[..., 0] for kind in _OF_INPUTS
         )
@@ -346,7 +352,9 @@ class Dispersions:
     def in_lanes(self, drawn: Array, tree: Tree) -> dict[str, Array]:
         """Return the arrays of the compiled loop that differ from run to run."""
         plant, (q, v) = self._plant, self.starts(drawn)
-        runs = {"q": q, "nu": plant.state.velocities(v), **self._faults(drawn)._asdict()}
+        runs = {"q": q, "nu": plant.state.velocities(v)}
+        if faults := self._faults(drawn):
+            runs |= faults._asdict()
         if self._kinds & {*_OF_BODIES}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (len(drawn), 1, 1))
             for at, body in self.bodies(drawn).items():
@@ -399,9 +407,9 @@ class Dispersions:
                 given = policy
                 policy = Bound(lambda _: bound(given, plant.robot))
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
-        faults = ActuatorFaults(*(x[0] for x in self._faults(rows)))
-        faulty = faults if self._kinds & {*_OF_INPUTS, "misalignment"} else None
-        return Plant(state, plant.disturbance, faulty), policy, q[0], v[0]
+        faults = self._faults(rows)
+        own = None if faults is None else ActuatorFaults(*(x[0] for x in faults))
+        return Plant(state, plant.disturbance, own), policy, q[0], v[0]
 
 
 def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: float) -> Any:

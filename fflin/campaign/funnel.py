@@ -69,36 +69,38 @@ def ellipsoid_axes(P: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Funnel(Design):
-    """Ellipsoids ``e' P(t) e <= rho`` of errors relative to a trajectory; prints as a table.
+    """Ellipsoids ``e' P(t) e <= rho`` of errors around a trajectory; ``print`` shows a table.
 
-    The definition of errors is in `linearize_trajectory`; P is the cost to go of the schedule.
-    Errors in the null space of P are not tested.
+    The error e relative to the trajectory is defined in `linearize_trajectory`. P(t) is the
+    cost-to-go matrix of the gain schedule, and ``e' P e`` is the level of an error. Errors in the
+    null space of P are not tested.
 
     Attributes
     ----------
     t : ndarray (m,)
         Times [s] of the knots.
     tried : ndarray (m,)
-        Largest level rho of the tested initial errors. The square roots of the levels of all tested
-        errors are evenly spread.
+        Largest level of the tested initial errors. The square roots of the tested levels are evenly
+        spaced.
     outcomes : ndarray (m, N)
-        Outcome of each run, sorted by ascending level: 0 goal reached, 1 stopped early, 2 bounds
-        `within` exceeded, 3 goal missed.
+        Outcome of each run, in ascending order of the level of the initial error: 0 if the goal was
+        reached, 1 if the run was stopped early, 2 if the bounds `within` were exceeded, 3 if the
+        goal was missed.
     rho : ndarray (m,)
-        Level up to which every run succeeded.
+        Level up to which every run reached the goal; the size of the ellipsoid at the knot.
     inside : ndarray (m,)
         Number of runs that start at or below the level `rho`.
     inside_rate : ndarray (m,)
         Lower bound, at confidence level `confidence`, on the success rate of runs that start at or
         below the level `rho`.
     rate : ndarray (m, 2)
-        Clopper-Pearson interval of the success rate of all runs. All runs start at or below the
-        level `tried`.
+        Clopper-Pearson interval of the success rate of all runs, which start at or below the level
+        `tried`.
     attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
         Half-axes of the ellipsoids in base attitude [deg], base position [m] and each joint
         [rad|m].
     goal, within : str
-        Bounds on the final errors of a run, and on its errors at any time.
+        Bounds on the final errors of a run (`goal`) and on its errors at any time (`within`).
     confidence : float
         Confidence level of the intervals.
     at, P : ndarray (M,), (M, nx, nx)
@@ -158,7 +160,7 @@ class Funnel(Design):
 
     @cached_property
     def rho(self) -> Array:
-        """Largest level (m,) up to which every run succeeded."""
+        """Largest level (m,) up to which every run reached the goal."""
         count = self.outcomes.shape[1]
         level: Array = self.tried * ((self.inside - 0.5).clip(min=0.0) / count) ** 2
         return level
@@ -206,7 +208,7 @@ class Funnel(Design):
         return P
 
     def root(self, t: float) -> Array:
-        """Return W (nx, nx): the ellipsoid at time t is the set of all W z with norm(z) <= 1."""
+        """Return W (nx, nx), which maps norm(z) <= 1 to the ellipsoid e = W z at time t."""
         size = np.sqrt(self.level(t))
         return size * ellipsoid_axes(self.cost(t))
 
@@ -261,7 +263,7 @@ class Funnel(Design):
 
     @classmethod
     def load(cls, path: str | Path, robot: Robot) -> Funnel:  # type: ignore[override]
-        """Read a funnel of a robot from a file that `save` wrote; raises as `Gain.load`."""
+        """Read a funnel of a robot from a file that `save` wrote; see `Gain.load` for errors."""
         return cls._read(as_path(path), robot=robot)
 
 
@@ -289,12 +291,12 @@ def funnel(
 ) -> Funnel:
     r"""Estimate the initial errors from which a trajectory tracking loop reaches a goal.
 
-    At each knot, errors are drawn from an ellipsoid :math:`e^T P(t)\,e \le \rho` of the schedule's
-    cost to go. The directions of the errors are uniformly distributed, and the square roots of
-    the levels are evenly spaced. The nonlinear robot is simulated from each error to the end of
-    the trajectory. The largest level tried is the level at which about one run in sixteen fails,
-    or at which the attitude error reaches 170 deg. The result is a statistical estimate, not a
-    proof.
+    At each knot, initial errors e are drawn from an ellipsoid :math:`e^T P(t)\,e \le \rho`, where P
+    is the cost-to-go matrix of the schedule. The directions of the errors are uniformly
+    distributed. The square roots of their levels :math:`e^T P e` are evenly spaced. The nonlinear
+    robot is simulated from each error to the end of the trajectory. The largest level tested is
+    either the level at which about one run in sixteen fails, or the level at which the attitude
+    error reaches 170 deg, whichever is smaller. The result is a statistical estimate, not a proof.
 
     Parameters
     ----------
@@ -303,12 +305,12 @@ def funnel(
         Schedule designed by `tvlqr`, continuous or sampled.
     goal : mapping or float
         {"attitude" [deg], "position" [m], "joints" [rad|m], "omega_b" [rad/s], "v_b" [m/s],
-        "joint rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`.
-        A number is the largest final value of ``e' P e``.
+        "joint rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`. If
+        `goal` is a number, it bounds the final value of ``e' P e``.
     within : mapping, optional
         Largest errors allowed at any time of a run, as a mapping with the same keys as `goal`.
     knots : int or sequence of float
-        Number of knots to test, or times [s]. The knot nearest to each time is tested.
+        Number of knots to test, or a list of times [s]. For each time, the nearest knot is tested.
     samples : int
         Number of runs from each knot.
     seed : int
@@ -331,7 +333,7 @@ def funnel(
     Raises
     ------
     InputError
-        If a size or value is wrong, or no time of the schedule is a knot of the trajectory.
+        If a size or value is wrong, or the schedule and the trajectory have no knot in common.
     UnknownNameError
         If a kind of error or an option is unknown.
     FflinError

@@ -44,7 +44,8 @@ def placed(dispersions: Any) -> AbstractContextManager[None]:
 def load_dispersions(path: str | Path) -> dict[str, Any]:
     """Read the dispersions of `monte_carlo` from a TOML file.
 
-    The file has one table ``[dispersions]`` of names, groups or patterns, each with its spread:
+    The file has one table ``[dispersions]``. Its keys are names, groups or patterns; each value is
+    a spread in one of these forms:
 
     ==========================================  ==================================================
     ``0.05`` or ``{normal = 0.05}``             normal about 0 with this standard deviation
@@ -64,8 +65,8 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        {name: spread}, the argument `dispersions` of `monte_carlo`. If a name or spread is
-        invalid, `monte_carlo` raises an error with the file and the line.
+        {name: spread}, the argument `dispersions` of `monte_carlo`. If a name or spread is not
+        valid for the robot, `monte_carlo` raises an error that names the file and the line.
 
     Raises
     ------

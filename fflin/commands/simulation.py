@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import InputError
 from fflin.base.names import chosen, input_keys
+from fflin.base.tables import folded
 from fflin.commands import DONE, FELL_SHORT, options, parser
 from fflin.commands.loops import add_loop, loop_of, target_of
 from fflin.commands.points import configuration_of, limits_of_options, load_robot, once, velocity_of
@@ -212,6 +213,7 @@ def _montecarlo(arguments: argparse.Namespace) -> Report:
     from fflin.campaign.monte_carlo import monte_carlo
     from fflin.campaign.report import campaign_record, worst_runs
     from fflin.campaign.spreads import load_dispersions
+    from fflin.control.policies import bound
 
     path = arguments.output_file
     dispersions = load_dispersions(arguments.dispersions)
@@ -230,5 +232,8 @@ def _montecarlo(arguments: argparse.Namespace) -> Report:
         arguments.plot: figure_of("plot_campaign", campaign),
         **pictures(robot, worst, arguments),
     }
-    text = "\n".join([str(campaign), *worst_runs(campaign, arguments.worst)])
-    return Report(robot.name, campaign_record(campaign, arguments.worst), text, files)
+    notes = getattr(bound(loop.policy, robot), "notes", ()) if loop.policy else ()
+    shown = [str(campaign), *(folded([note]) for note in notes)]
+    text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
+    result = {**campaign_record(campaign, arguments.worst), "notes": notes}
+    return Report(robot.name, result, text, files)

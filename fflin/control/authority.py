@@ -111,7 +111,7 @@ def wheel_report(properties: Mapping[str, Any]) -> str:
     total, least = properties["total"], properties["least"]
     text = (
         f"{counted(properties['wheels'], 'wheel')}: total momentum {_vector(total)} N m s, "
-        f"magnitude {np.linalg.norm(total):.4g} N m s; they span "
+        f"magnitude {np.linalg.norm(total):.4g}; they span "
         f"{('no', 'only one', 'only two', 'three')[properties['axes']]} axes"
     )
     if least is not None:

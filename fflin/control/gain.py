@@ -52,31 +52,32 @@ class Gain(Design):
     residual : float
         Norm of the Riccati equation's residual, relative to the sum of the norms of its terms.
     margin : float
-        Distance of the poles to the stability boundary: the slowest decay rate [1/s] for a
+        Distance of the poles from the stability boundary: the slowest decay rate [1/s] for a
         continuous model, 1 minus the largest modulus for a sampled model.
     method : str
-        Solver: "structured" (half-size), "general" (SciPy) or "closed form".
+        Method that computed K: "structured" (eigenproblem of half the usual size), "general"
+        (SciPy's Riccati solver) or "closed form" (`acceleration_lqr`).
     A, B, Q, R, N : ndarray
         Matrices of the model, and weights on the deviations x - x0 and u - u0. N is zero if no
         cross weight was given.
     x0 : ndarray (nx,)
     u0 : ndarray (nu,)
-        State and inputs at the point.
+        State and inputs at the operating point.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, state_units, input_units : tuple of str
     frame, robot : str
         Frame of the model and name of the robot.
     weights : str
-        Description of the rule that made the weights.
+        Description of the rule that set the weights.
     regulated : tuple of str (nz,)
-        States that are fed back; if empty, all states are fed back. K, P, Q and N are zero for
-        states that are not fed back.
+        Names of the states that are fed back; empty if all states are fed back. The entries of K,
+        P, Q and N are zero for states that are not fed back.
     placement : ndarray (7,)
-        Reference of the model: position [m] and quaternion x, y, z, w. The array is empty if a
-        file of an older version lacks the reference.
+        Pose of the model's reference: position [m] and quaternion x, y, z, w. The array is empty if
+        the gain was loaded from a file of an older version, which lacks the pose.
     urdf_sha256 : str
-        Hash of the robot of the design, see `Robot`.
+        SHA-256 of the URDF of the robot that the gain was designed for, see `Robot`.
 
     Examples
     --------
@@ -176,7 +177,7 @@ class Gain(Design):
         Raises
         ------
         InputError
-            If the gain is from a file, or its model lacks states of the robot.
+            If the gain was loaded from a file, or its model lacks some states of the robot.
         UnknownNameError
             If there is no such tool.
         """
@@ -272,8 +273,8 @@ def one_sided(gain: Gain) -> str:
     return (
         f"the gain commands negative thrust ({listed(thrusters)}), which is cut at zero, so the "
         "poles and margins do not hold; design with torque and force on the base, and allocate "
-        "them to the thrusters with fflin.Allocation. `fflin simulate` does so by default if "
-        "the thrusters can push in every direction"
+        "them to the thrusters with fflin.Allocation. `fflin lqr` and `fflin simulate` do so by "
+        "default if the thrusters can push in every direction"
     )
 
 
@@ -284,7 +285,7 @@ def _unregulated(gain: Gain) -> str:
         return ""
     return (
         f"{listed(left)} (not reached by any input, or determined by other states; "
-        "wheel_speeds=True regulates all controllable wheel speeds)"
+        "wheel_speeds=True (--wheel-speeds) regulates all controllable wheel speeds)"
     )
 
 

@@ -35,7 +35,7 @@ _SPEEDS = 0.1
 def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) -> Array:
     r"""Return the diagonal of a weight by Bryson's rule: :math:`1/\text{largest}^2` per entry.
 
-    The largest acceptable deviation of each signal then contributes 1 to the cost.
+    With this weight, each signal contributes 1 to the cost at its largest acceptable deviation.
 
     Parameters
     ----------
@@ -179,9 +179,9 @@ class SampledCost(NamedTuple):
 def sampled_cost(
     lin: LinearModel, dt: float, Q: Weight, R: Weight, N: ArrayLike | None = None
 ) -> SampledCost:
-    r"""Return discrete-time weights that sum up to a continuous-time cost.
+    r"""Return discrete-time weights whose summed cost equals a continuous-time cost.
 
-    For inputs with zero-order hold, the cost summed over samples equals the integral cost.
+    The sum over the samples equals the integral if the inputs are held between samples.
 
     By (10.1) of docs/derivation.md, the weights are
 
@@ -189,8 +189,9 @@ def sampled_cost(
               \begin{bmatrix} Q & N \\ N^T & R \end{bmatrix} e^{F t}\,dt,\qquad
               F = \begin{bmatrix} A & B \\ 0 & 0 \end{bmatrix}
 
-    At rest F^3 = 0, and the integral is an exact polynomial in h. In motion, the integral is
-    computed over a short step (van Loan), which is then doubled repeatedly.
+    At rest F^3 = 0, so the integral is a polynomial in h and is computed exactly. In motion, the
+    integral is computed over a short step by van Loan's method, and the step is then doubled until
+    it equals h.
 
     Parameters
     ----------

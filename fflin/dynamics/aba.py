@@ -7,7 +7,6 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import PIN_ANGULAR
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT
 
@@ -25,7 +24,7 @@ class Aba:
         self._model.gravity.linear = np.array(robot.gravity)
         # M^-1 in base axes as ABA has it, of the last slopes.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
-        self.field = field_of(robot, state.frame)
+        self.field = state.field
         self._resists = bool(np.any(robot.springs))
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 

@@ -98,14 +98,14 @@ def jam(
     ----------
     robot : Robot
     joints : str or sequence of str
-        Names of the joints to jam, or patterns. Mimic joints of a jammed joint are also jammed.
+        Names or patterns of the joints to jam. Mimic joints of a jammed joint are also jammed.
     q, v : array_like (nq,), (nv,), optional
         Configuration and velocity just before the impact; neutral and at rest by default.
 
     Returns
     -------
     Impact
-        Result of the impact. In its `robot`, the jammed joints are welded and have no inputs.
+        Result of the impact. The jammed joints of `Impact.robot` are welded and have no inputs.
 
     Raises
     ------
@@ -268,8 +268,9 @@ def capture(
     robot. G is the Jacobian that maps the velocity of the combined robot to the velocities of robot
     and payload.
 
-    The solution is the projection of the velocities onto the motions that the rigid grasp permits,
-    orthogonal with respect to the inertia. The impact conserves linear and angular momentum.
+    The solution projects the velocities just before the impact onto the motions that the rigid
+    grasp permits. The projection is orthogonal with respect to the inertia matrix. The impact
+    conserves linear and angular momentum.
 
     Parameters
     ----------
@@ -290,7 +291,7 @@ def capture(
     payload_v : array_like (6,) or (nv,), optional
         Velocity of the payload; at rest by default. The first six entries are the twist of the
         payload's frame in its own axes (Pinocchio's LOCAL): linear [m/s], then angular [rad/s].
-        The joint rates of the payload follow.
+        The remaining entries are the joint rates of the payload.
     prefix : str
         Name of the payload's frame. The payload's joints and links are named PREFIX.NAME.
 
@@ -315,8 +316,8 @@ def capture(
 
     References
     ----------
-    The impact is a perfectly inelastic collision of two bodies. For the dynamics of a robot with
-    free joints, see Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
+    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989, for a robot with free
+    joints. The impact itself is the perfectly inelastic collision of two bodies.
 
     Examples
     --------

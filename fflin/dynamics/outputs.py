@@ -11,7 +11,6 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT, Carried, by_joint, find_frame
 from fflin.robot.outputs import BasePose, FullState, JointOutput, JointPositions, Output
@@ -330,7 +329,7 @@ class Measuring:
 
     def __init__(self, state: StateMap, q: Array) -> None:
         self.state = state
-        robot, field = state.robot, field_of(state.robot, state.frame)
+        robot, field = state.robot, state.field
         self._world = world = World(
             model=robot.model,
             data=robot.create_data(),

@@ -22,7 +22,7 @@ LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
 def configuration(
     robot: Robot, joints: Mapping[str, float] | None = None, base: pin.SE3 | None = None
 ) -> Array:
-    """Return the Pinocchio configuration with the named joint values and base placement.
+    """Return the Pinocchio configuration for joint values given by name and a base placement.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def point_of(
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:
-            raise InputError("x0 is given together with q0 or v0; give x0 alone, or q0 and v0")
+            raise InputError("x0 is given together with q0 or v0; give either x0, or q0 and v0")
         return state.to_pinocchio(x0)
     if q0 is None and v0 is None:
         return default()
@@ -102,7 +102,7 @@ def point_of(
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
-    """Return the Pinocchio velocity with the named joint rates and base velocities.
+    """Return the Pinocchio velocity for joint rates and base velocities given by name.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
 
 
 def effort(robot: Robot, values: Mapping[str, float]) -> Array:
-    """Return the input vector u with the named values.
+    """Return the input vector u for values given by name.
 
     Parameters
     ----------

@@ -11,11 +11,9 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR
-from fflin.dynamics.orbital import GravityGradient, field_of
+from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.state import StateMap
-from fflin.robot.joints import Joint
 from fflin.robot.mass_properties import coordinate_names
-from fflin.robot.robot import Robot
 
 # The coupling of a coordinate, M_ii (M^-1)_ii, is 1 where it is decoupled and grows as it loses
 # inertia of its own; times the rounding unit it is the relative error of (M^-1)_ii. Where the sum
@@ -34,8 +32,6 @@ STROKE = 1.0  # [m] that a sliding joint is taken to be out at most, for those m
 # From this size on LAPACK is quicker than a sparse factor.
 _DENSE_SIZE = 64
 
-# Relative rounding error that numbers of a URDF leave of an exact symmetry.
-_ASYMMETRY = 1e-12
 
 # Bound once: the look-up of a name in a module costs as much as a small matrix.
 _crba, _decompose, _invert_factor, _compute_inverse = (
@@ -110,14 +106,14 @@ class Inertia:
         involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
         if lost:
             raise SingularInertiaError(
-                f"the mass matrix of '{name}' is singular at this configuration: a motion of "
-                f"{involved} moves no mass; choose another configuration, give the links an "
-                "inertia, or lock one of the joints"
+                f"the mass matrix of '{name}' is singular at this configuration, because a "
+                f"motion of {involved} moves no mass; choose another configuration, give the "
+                "links an inertia, or lock a joint"
             )
         warnings.warn(
-            f"the mass matrix of '{name}' is ill-conditioned, so that A and B have a relative "
-            f"error of about {coupling * _EPS:.0e}: {involved} move almost no mass relative to "
-            "each other; check the inertias of the links",
+            f"the mass matrix of '{name}' is ill-conditioned, so A and B have a relative error "
+            f"of about {coupling * _EPS:.0e}. A joint motion of {involved} moves almost no mass; "
+            "check the inertias of the links",
             FflinWarning,
             stacklevel=6,
         )
@@ -160,39 +156,6 @@ def inertia_bounds(model: pin.Model) -> Array | None:
         moments[parents[index]] += moments[index]
     bounds[:3], bounds[3:6] = masses[1], moments[1]
     return bounds
-
-
-def rotor_names(robot: Robot) -> tuple[str, ...]:
-    """Return the names of rotors: symmetric joints that carry no other joint."""
-    model = robot.model
-    index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
-    named = set(robot.used_frames)
-    # What carries another joint, leads one, has a spring, or has something fixed on it.
-    busy = set(model.parents.tolist())
-    busy |= {index_of[follower.leader.name] for follower in robot.followers}
-    busy |= {index_of[name] for name, stiffness in robot.stiffness.items() if stiffness}
-    if named:
-        busy |= {frame.parentJoint for frame in model.frames if frame.name in named}
-    free = (joint for joint in robot.joints if index_of[joint.name] not in busy)
-    return tuple(joint.name for joint in free if _is_symmetric(robot, joint, index_of[joint.name]))
-
-
-def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
-    """Return whether the body of a joint is symmetric about the joint axis."""
-    if joint.prismatic:
-        return False
-    pin_joint = robot.model.joints[index]
-    data = pin_joint.createData()
-    pin_joint.calc(data, robot.neutral())
-    linear, axis = np.split(np.asarray(data.S).ravel(), 2)
-    if linear.any():  # a screw
-        return False
-    body, turn = robot.model.inertias[index], skew(axis)
-    inertia = body.inertia
-    uneven = float(np.abs(turn @ inertia - inertia @ turn).max())
-    largest = float(np.abs(inertia).max())
-    offset = body.mass * float(np.square(turn @ body.lever).sum())
-    return uneven <= _ASYMMETRY * largest and offset <= _ASYMMETRY**2 * largest
 
 
 class AccelerationDerivatives(NamedTuple):
@@ -251,7 +214,7 @@ class Accelerations:
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
-        self._field = field_of(robot, state.frame)
+        self._field = state.field
         self._still = np.zeros(robot.nq), np.zeros(robot.nv)
 
     def invert(self, q: Array, out: Array) -> None:

@@ -11,7 +11,7 @@ from fflin.base.errors import ChartError, InputError
 from fflin.base.validation import Array, instance, placement, vector
 from fflin.dynamics import coordinates as names
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, Chart, Frame
-from fflin.dynamics.orbital import field_of
+from fflin.dynamics.orbital import OrbitField
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
@@ -21,23 +21,23 @@ class StateMap:
 
     The state is :math:`X = (q_b, r_b, q_m, \omega_b, v_b, \dot q_m)` of dimension 12 + 2n. The base
     placement relative to the reference is :math:`{}^{ref}M_b = {}^oM_{ref}^{-1}\,{}^oM_b`. Its
-    translation is r_b, and the vector part of its unit quaternion is q_b. The sign of the
-    quaternion is chosen such that the scalar part is not negative.
+    translation is r_b, and the vector part of its unit quaternion is q_b. Of the two quaternions
+    of an attitude, the one with a scalar part of at least 0 is used.
 
     Parameters
     ----------
     robot : Robot
     reference : pin.SE3, optional
-        Placement oMref of the reference frame, in which the state gives the attitude and position
-        of the base; the identity by default.
+        Placement oMref relative to which the attitude and position of the base are measured; the
+        identity by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
         Axes of the angular velocity omega_b of the base and of the velocity v_b of its origin:
 
         - hybrid (default): omega_b in base axes, v_b = d r_b/dt in reference axes;
         - local: omega_b and v_b in base axes;
         - world: omega_b and v_b in reference axes;
-        - lvlh (default in orbit) or hill: the same axes as hybrid, for a robot in orbit only. The
-          world of Pinocchio is then the orbital frame with this name.
+        - lvlh (default in orbit) or hill: the same axes as hybrid, for a robot in orbit only.
+          Pinocchio's world is then the orbital frame, with the axes lvlh or hill.
 
     Attributes
     ----------
@@ -50,8 +50,8 @@ class StateMap:
     axes : tuple of bool
         Whether omega_b is in reference axes, and whether v_b is in reference axes.
     in_reference : tuple of slice
-        Rows in reference axes of a vector nu = (omega_b, v_b, qdot_m), or of a wrench in the same
-        order.
+        Slices of nu = (omega_b, v_b, qdot_m), or of generalised forces in the same order, whose
+        components are in reference axes.
     S : ndarray (nv, 6 + n) or None
         Matrix S of v = S nu, with nu = (omega_b, v_b, qdot_m) in base axes, if the robot has mimic
         joints or modes. Otherwise S is None, because v is only a permutation of nu.
@@ -93,6 +93,8 @@ class StateMap:
         self.frame = names.frame_of(robot, frame)
         self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
+        # The field of the robot's orbit, if it has one.
+        self.field = OrbitField(robot, self.frame) if robot.orbit else None
         self.nx = 12 + 2 * n
         self.groups = names.Groups(
             q_b=slice(0, 3),
@@ -141,7 +143,7 @@ class StateMap:
         self._position, self.origin_quaternion = offset[:3], offset[3:]
         self._rotation = turning.rotation_matrix(self.origin_quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
-        field, R = field_of(self.robot, self.frame), oMref.rotation
+        field, R = self.field, oMref.rotation
         self.orbit = (R.T @ field.rate, R.T @ field.pull @ R) if field else None
 
     @property
@@ -177,7 +179,7 @@ class StateMap:
         return Chart.of(q[..., 3:7] @ turning.product_matrix(self.origin_quaternion).T)
 
     def rotation(self, q: Array) -> Array:
-        """Return the rotation matrix (3, 3) of refMb at a valid configuration.
+        """Return the rotation matrix (3, 3) of the base relative to the reference, at a valid q.
 
         Unlike the chart, the rotation matrix is regular at an attitude 180 deg from the reference.
         """
@@ -195,7 +197,7 @@ class StateMap:
     def scalar(self, q: Array) -> float:
         """Return the scalar part q0 of the base quaternion relative to the reference.
 
-        The sign of q0 follows from the sign of the quaternion in the valid configuration q (nq,).
+        The sign of q0 changes with the sign of the quaternion in the valid configuration q (nq,).
         """
         return float(turning.quaternion_product(self.origin_quaternion, q[3:7])[3])
 
@@ -207,7 +209,8 @@ class StateMap:
         q : array_like (nq,)
             Configuration.
         v : array_like (nv,)
-            Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
+            Velocity in Pinocchio's order: linear and angular velocity of the base in base axes,
+            then joint rates.
         near : array_like (nx,), optional
             State for unwrapping the angles of continuous joints: each angle is shifted by the
             multiple of 2 pi that brings it closest to its value in `near`. By default, the angles
@@ -237,7 +240,7 @@ class StateMap:
         return x if near is None else names.unwound(self, x, near)
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
-        """Return the state (.., nx) from its parts, with velocities nu (.., 6 + n) in base axes."""
+        """Assemble the state (.., nx) from parts; velocities nu (.., 6 + n) are in base axes."""
         in_frame = nu
         if not chart.standing:
             in_frame = self.to_frame(chart, nu[..., None])[..., 0]

@@ -10,7 +10,6 @@ from fflin.base.errors import InputError
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, instance, share
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same, sensed
@@ -70,7 +69,7 @@ _LOOSEST = 1e-2
 
 @dataclass(frozen=True)
 class Check:
-    """Result of `check`: the errors of a linear model; prints as a table.
+    """Result of `check`: the errors of a linear model; ``print`` shows a table.
 
     Attributes
     ----------
@@ -92,7 +91,7 @@ class Check:
 
     @property
     def ok(self) -> bool:
-        """Whether no error exceeds its tolerance."""
+        """Whether all errors are within their tolerances."""
         return all(row.ok for row in self.rows)
 
     @property
@@ -134,7 +133,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     - Pinocchio's ABA derivatives, mapped into the attitude chart of the model (relative tolerance
       1e-9);
     - sixth-order central differences of the nonlinear model :math:`\dot x = f(x, u)` in the same
-      chart (relative tolerance 1e-8). The function f is itself compared with integrated motions.
+      chart (relative tolerance 1e-8). The function f is itself verified against integrated motions.
 
     For an ill-conditioned inertia matrix M, the tolerances are larger, because round-off errors
     grow with the condition number of M.
@@ -152,7 +151,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     Returns
     -------
     Check
-        Result, which prints as a table; ``ok`` is True if no error exceeds its tolerance.
+        Result, in which ``ok`` is True if no error exceeds its tolerance.
 
     Raises
     ------
@@ -255,7 +254,7 @@ def _point_errors(
     mobility, input_mobility = mobilities(M, lin.B)
     rate = model(lin.x0, lin.u0)
     # In an orbit it is the absolute velocity whose terms cancel.
-    field = field_of(state.robot, state.frame)
+    field = state.field
     _, rate_of_turn, momentum = speeds(state, field.absolute(q, v) if field else v)
     push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
     push += rate_of_turn**2 * float((1.0 / mobility).max())

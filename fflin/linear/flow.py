@@ -13,8 +13,8 @@ from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.integrators import CommutatorFree4
-from fflin.dynamics.rnea import rotor_names
 from fflin.dynamics.state import StateMap
+from fflin.robot.mass_properties import rotor_names
 
 # Steps are halved until the end of an interval is this accurate, relative to the largest rates.
 _ACCURACY, _MOST_STEPS = 1e-8, 128

@@ -23,7 +23,6 @@ from fflin.dynamics.coordinates import (
     state_history,
     times,
 )
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.rnea import Inertia
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import Certificate, LinearModel
@@ -115,7 +114,7 @@ def compare(
     errors, errors_B = _blocks(difference_A, groups, groups), _blocks(difference_B, groups, inputs)
     if errors.any():
         # In an orbit it is the absolute velocity whose terms cancel.
-        field = field_of(state.robot, state.frame)
+        field = state.field
         v = field.absolute(lin.q, lin.v) if field else lin.v
         terms = _cancelling_terms(state, lin, v, mobility, input_mobility)
         if steps is not None:

@@ -53,7 +53,9 @@ def _example_robot_data() -> dict[str, RobotFile]:
 
 
 def list_robots() -> tuple[str, ...]:
-    """Return all robot names that `load` accepts: bundled, then from example-robot-data.
+    """Return all robot names that `load` accepts.
+
+    The bundled robots come first, then the robots of the package example-robot-data.
 
     Returns
     -------

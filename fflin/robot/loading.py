@@ -35,21 +35,21 @@ def load(
     Parameters
     ----------
     robot : str or Path
-        Name of a bundled robot or of example-robot-data, or path to a URDF or to a robot file. A
-        robot file is a TOML file that names a URDF and sets fields of the robot; see the guide.
-        No mesh is loaded.
+        Name of a bundled robot or of a robot in example-robot-data, or path of a URDF or robot
+        file. A robot file is a TOML file that names a URDF and sets fields of the robot; see the
+        guide. No mesh is loaded.
     lock : mapping or iterable of str, optional
-        Joints to weld: {joint: value [rad|m]} (None: at the neutral position), or names of
-        joints. A name may be a pattern, ``hinge_*``. The mimic joints of a locked joint are also
-        welded.
+        Joints to weld, as names or as {joint: value [rad|m]}. A joint given only by its name, or
+        with the value None, is welded at its neutral position. A name may be a pattern such as
+        ``hinge_*``. Mimic joints of a locked joint are also welded.
     package_dirs : sequence of path
-        Folders to search for ``package://`` meshes when the robot is drawn. The given folders are
-        searched before the folders that contain the URDF.
+        Folders to search for ``package://`` meshes when the robot is drawn. They are searched
+        before the folders that contain the URDF.
     **fields
-        inputs, outputs, stiffness, damping, rest, gravity, orbit, limits, passive, weights, start:
-        see `Robot.replace`. Fields given here take precedence over the robot file. Locks, limits,
-        springs and dampers given here are added to the entries of the robot file, and replace
-        entries of the same name.
+        Fields of the robot: inputs, outputs, appendages, stiffness, damping, rest, gravity, orbit,
+        limits, passive, weights, point, target and start; see `Robot.replace`. Fields given here
+        take precedence over the robot file. Locks, limits, springs and dampers are merged with the
+        robot file: an entry given here replaces only the entry with the same name.
 
     Returns
     -------
@@ -64,14 +64,14 @@ def load(
     FileError, UrdfError
         If the file cannot be read or is malformed.
     MissingPackageError
-        If the file is written in xacro and the package that expands it is not installed.
+        If the file is written in xacro, but the package that expands xacro is not installed.
     ModelError
         If a joint has more than one degree of freedom.
 
     Warns
     -----
     FflinWarning
-        If the model does not contain a part of the file, or the file contains likely errors.
+        If a part of the file is ignored, or the file contains likely errors.
 
     Examples
     --------
@@ -161,13 +161,15 @@ def from_model(
     Parameters
     ----------
     model : pin.Model
-        Model whose only root joint is a free-flyer. The model is copied; the copy has no gravity.
+        Model whose only root joint is a free-flyer. The robot contains a copy of the model with
+        zero gravity.
     name : str, optional
         Name of the robot; the model's name by default.
     lock : mapping or iterable of str, optional
-        As in `load`.
+        Joints to weld, as in `load`.
     **fields
-        As in `load`. With damping="urdf", the ``damping`` of the model is used.
+        Fields of the robot, as in `load`. With damping="urdf", the ``damping`` of the model is
+        used.
 
     Returns
     -------
@@ -180,8 +182,9 @@ def from_model(
 
         - the root is not a single free-flyer;
         - a joint has more than one degree of freedom;
-        - the joints are not in depth-first order, so that CRBA would be silently wrong;
-        - a placement, a body or an armature is not physical.
+        - the joints are not in depth-first order, in which case the inertia matrix of Pinocchio's
+          CRBA would be wrong without an error;
+        - a placement, the inertia of a body or an armature is not physically realisable.
 
     Examples
     --------

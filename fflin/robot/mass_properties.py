@@ -17,11 +17,11 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, SingularInertiaError, listed, require_known
-from fflin.base.names import by_name
+from fflin.base.names import by_name, matching
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, number, positive, shaped, vector, whole
 from fflin.base.validation import by_name as mapping
-from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.urdf.links import TRIANGLE_SLACK, Link, is_impossible
 
 if TYPE_CHECKING:
@@ -38,6 +38,9 @@ _ZERO = 1e-12
 
 # A coordinate is named where its share in a motion is larger than this.
 _INVOLVED = 0.1
+
+# Relative rounding error that numbers of a URDF leave of an exact symmetry.
+_ASYMMETRY = 1e-12
 
 
 def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
@@ -200,6 +203,23 @@ def pieces_of(
     return found, also
 
 
+def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
+    """Return the links and bodies that match a name or pattern, by names in `pieces`."""
+    pieces, link_of = robot.pieces, robot.link_of
+    if key in pieces or key in link_of:
+        return [key if key in pieces else link_of[key]]
+    sums = sums_of(pieces)
+    names = [*(name for name in pieces if name not in sums), *link_of]
+    found = [names[i] for i in matching(kind, key, names)]
+    return list(dict.fromkeys(link_of.get(name, name) for name in found))
+
+
+def sums_of(pieces: Mapping[str, Piece]) -> set[str]:
+    """Return the bodies that consist of several links, which are pieces themselves."""
+    linked = {each.joint for each in pieces.values() if not each.whole}
+    return {name for name, each in pieces.items() if each.whole and each.joint in linked}
+
+
 def as_inertia(piece: Piece) -> pin.Inertia:
     """Return a piece as an inertia in its joint's frame."""
     return piece.placement.act(pin.Inertia(piece.mass, np.zeros(3), piece.inertia))
@@ -315,3 +335,36 @@ def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Ar
         turning = values > _NO_MOMENT * values[2]
         rows.append(axes[:, turning].T @ J[3:])
     return np.vstack(rows)
+
+
+def rotor_names(robot: Robot) -> tuple[str, ...]:
+    """Return the names of rotors: symmetric joints that carry no other joint."""
+    model = robot.model
+    index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
+    named = set(robot.used_frames)
+    # What carries another joint, leads one, has a spring, or has something fixed on it.
+    busy = set(model.parents.tolist())
+    busy |= {index_of[follower.leader.name] for follower in robot.followers}
+    busy |= {index_of[name] for name, stiffness in robot.stiffness.items() if stiffness}
+    if named:
+        busy |= {frame.parentJoint for frame in model.frames if frame.name in named}
+    free = (joint for joint in robot.joints if index_of[joint.name] not in busy)
+    return tuple(joint.name for joint in free if _is_symmetric(robot, joint, index_of[joint.name]))
+
+
+def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
+    """Return whether the body of a joint is symmetric about the joint axis."""
+    if joint.prismatic:
+        return False
+    pin_joint = robot.model.joints[index]
+    data = pin_joint.createData()
+    pin_joint.calc(data, robot.neutral())
+    linear, axis = np.split(np.asarray(data.S).ravel(), 2)
+    if linear.any():  # a screw
+        return False
+    body, turn = robot.model.inertias[index], skew(axis)
+    inertia = body.inertia
+    uneven = float(np.abs(turn @ inertia - inertia @ turn).max())
+    largest = float(np.abs(inertia).max())
+    offset = body.mass * float(np.square(turn @ body.lever).sum())
+    return uneven <= _ASYMMETRY * largest and offset <= _ASYMMETRY**2 * largest

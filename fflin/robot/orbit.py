@@ -33,24 +33,23 @@ _FOLLOWS: Any = None  # from the others
 class CircularOrbit:
     r"""Circular orbit about a central body.
 
-    The robot is described relative to a frame whose origin moves along the orbit in free fall.
-    The frame rotates with the orbit. The axes of the rotating frame are one of
+    The orbital frame has its origin on the orbit, in free fall, and rotates once per revolution.
+    Its axes are one of
 
     - ``lvlh``: x along the orbit, y opposite to the orbit normal, z towards the central body;
     - ``hill``: x away from the central body, y along the orbit, z along the orbit normal.
 
-    The rotating frame is Pinocchio's world, so that velocities are relative to the rotating
-    frame. The gravity gradient is linear in the position x relative to the origin: the force per
-    mass is
-    :math:`n^2 (3 r r^T - E) x`, with the unit vector r away from the central body and the
-    identity E. The relative error of this linearisation is of the order of ``|x|`` divided by the
-    orbit's radius.
+    The orbital frame is the world of Pinocchio, so that velocities are relative to this rotating
+    frame. The gravity gradient is modelled as linear in the position x relative to the origin: the
+    force per mass is :math:`n^2 (3 r r^T - E) x`, with the mean motion n, the unit vector r away
+    from the central body, and the identity E. The relative error of this linearisation is of the
+    order of ``|x|`` divided by the orbit's radius.
 
     Parameters
     ----------
     altitude : float, optional
-        Height above the surface [m]. An `FflinWarning` is issued for less than 80 km over the
-        earth, which is probably a value in km.
+        Height above the surface [m]. An altitude of less than 80 km over the earth causes an
+        `FflinWarning`, because the value was probably given in km.
     mean_motion : float, optional
         Mean motion n [rad/s], instead of the altitude.
     body : str
@@ -156,7 +155,7 @@ class CircularOrbit:
 
     @classmethod
     def from_json(cls, text: str) -> CircularOrbit:
-        """Return the orbit that `to_json` wrote, bit for bit."""
+        """Return the orbit from the JSON text of `to_json`, with bit-for-bit equal values."""
         parts = json.loads(text)
         n = parts.pop("mean_motion")
         orbit = cls(**parts)

@@ -94,30 +94,32 @@ def _flat(key: str, value: Any) -> Any:
 def load_inputs(path: str | Path) -> tuple[Input, ...]:
     """Read the inputs of a robot from a TOML file.
 
-    The file is an array of tables ``[[input]]``, in the order of u. In each table,
-    ``type`` selects the class of the input. The other keys are the parameters of this class:
+    The file is an array of tables ``[[input]]``, one table per input, in the order of u. In each
+    table, ``type`` selects the class of the input. The other keys are the parameters of this class:
 
-    ==================  =========================================================
-    ``type``            keys
-    ==================  =========================================================
-    ``base_torque``     none: `BaseTorque`
-    ``base_force``      none: `BaseForce`
-    ``joint_torque``    ``joint``: `JointTorque`
-    ``thruster``        ``frame``, ``position`` [m], ``direction``; optional:
-                        ``name``, ``on_off`` (true: pulses of ``max``),
-                        ``least_impulse`` [N s]: `Thruster`
-    ``reaction_wheel``  ``axis``; optional: ``frame``, ``name``, and either
-                        ``inertia`` [kg m^2] with ``max_speed`` [rad/s] or
-                        ``momentum`` [N m s]: `ReactionWheel`
-    every type          optional: ``max`` and ``min`` [N m | N], the largest and
-                        the least value. The default of ``min`` is -max, for a
-                        thruster 0. For base inputs: one number, or three
-    ==================  =========================================================
+    ==================  ===============  =========================================
+    ``type``            class            keys
+    ==================  ===============  =========================================
+    ``base_torque``     `BaseTorque`     no other keys
+    ``base_force``      `BaseForce`      no other keys
+    ``joint_torque``    `JointTorque`    ``joint``
+    ``thruster``        `Thruster`       ``frame``, ``position`` [m] and
+                                         ``direction``; optional: ``name``,
+                                         ``on_off``, ``least_impulse`` [N s]
+    ``reaction_wheel``  `ReactionWheel`  ``axis``; optional: ``frame``, ``name``,
+                                         and either ``inertia`` [kg m^2] with
+                                         ``max_speed`` [rad/s], or ``momentum``
+                                         [N m s]
+    ==================  ===============  =========================================
+
+    Every type also accepts ``max`` and ``min`` [N m | N], the largest and the smallest value of the
+    input. For base inputs, each limit is one number, or three numbers. If ``min`` is omitted, it is
+    -max, or 0 for a thruster. With ``on_off = true``, a thruster fires in pulses of ``max``.
 
     Parameters
     ----------
     path : str or Path
-        Path of the file, or the name of a bundled one: ``"cubesat"``, ``"servicer_7dof"``.
+        Path of the file, or the name of a bundled file: ``"cubesat"`` or ``"servicer_7dof"``.
 
     Returns
     -------
@@ -128,10 +130,10 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     FileError
         If the path is not a regular file, or the file cannot be read or is too large.
     UnknownNameError
-        If there is no such type or key; the message names file and line.
+        If a type or key is unknown; the message names the file and line.
     InputError
-        If the file is not TOML, a key is missing or a value is wrong; the message names file and
-        line.
+        If the file is not TOML, a key is missing or a value is wrong; the message names the file
+        and line.
 
     Examples
     --------
@@ -148,7 +150,8 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
         position = [-0.9, 0.0, 0.65]
         direction = [1, 0, 0]
 
-    gives ``(JointTorque("joint_1"), Thruster("base", (-0.9, 0, 0.65), (1, 0, 0), "nozzle"))``.
+    gives the inputs
+    ``(JointTorque("joint_1"), Thruster("base", (-0.9, 0, 0.65), (1, 0, 0), "nozzle"))``.
 
     >>> inputs = fflin.load_inputs("cubesat")  # bundled
     >>> len(inputs), inputs[-1].name

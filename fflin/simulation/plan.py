@@ -24,11 +24,11 @@ from fflin.control.tracking import (
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import Integrator, integrator
-from fflin.dynamics.rnea import rotor_names
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
 from fflin.robot.limits import chosen_limits
+from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 from fflin.simulation.plant import Disturbance, Plant
 from fflin.simulation.prediction import Predictor, predictor
@@ -179,7 +179,7 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
     follows = reference_of(policy)
     state = _state_of(robot, policy, options.frame, options.reference)
     plant = Plant(state, options.disturbance)
-    foresees = predictor(plant, policy, options.linear)
+    foresees = None if options.linear is False else predictor(plant, policy, options.linear)
     method = integrator(options.method)
     if times.fastest * times.dt > method.reach:
         raise InputError(

@@ -17,7 +17,7 @@ from fflin.base.validation import Array
 from fflin.robot.equipment.mounting import carrier
 from fflin.robot.inputs import ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, Joint, find_frame
-from fflin.robot.mass_properties import Piece, as_inertia
+from fflin.robot.mass_properties import Piece, as_inertia, sums_of
 from fflin.robot.robot import Robot
 
 AXES = "xyz"
@@ -60,7 +60,7 @@ class Parameters(dict[str, Parameter]):
 
     def __init__(self, robot: Robot) -> None:
         pieces, self._link_of = robot.pieces, robot.link_of
-        self._sums = _sums(pieces)
+        self._sums = sums_of(pieces)
         of_pieces = (each for name, piece in pieces.items() for each in _of_piece(name, piece))
         found = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
         super().__init__((each.name, each) for each in found)
@@ -80,23 +80,6 @@ class Parameters(dict[str, Parameter]):
         found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
         found = found or self.find(str(only))
         return [name for name in found if self[name].of not in self._sums] or found
-
-
-def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
-    """Return the links and bodies that match a name or pattern, by names in `pieces`."""
-    pieces, link_of = robot.pieces, robot.link_of
-    if key in pieces or key in link_of:
-        return [key if key in pieces else link_of[key]]
-    sums = _sums(pieces)
-    names = [*(name for name in pieces if name not in sums), *link_of]
-    found = [names[i] for i in matching(kind, key, names)]
-    return list(dict.fromkeys(link_of.get(name, name) for name in found))
-
-
-def _sums(pieces: Mapping[str, Piece]) -> set[str]:
-    """Return the bodies that consist of several links, which are pieces themselves."""
-    linked = {each.joint for each in pieces.values() if not each.whole}
-    return {name for name, each in pieces.items() if each.whole and each.joint in linked}
 
 
 def moments(mass: float, first: Array, inertia: Array) -> Array:
