@@ -58,7 +58,7 @@ class Equilibrium(FrozenArrays):
     >>> soft = fflin.load("planar_detumble", passive=["joint_1"], stiffness={"joint_1": 50.0})
     >>> print(fflin.equilibrium(soft, fflin.configuration(soft, {"joint_1": 0.2})))
     u: all zero
-    sags: joint_1 = -0.2 rad
+    deflections: joint_1 = -0.2 rad
     """
 
     q: Array
@@ -80,7 +80,7 @@ class Equilibrium(FrozenArrays):
             return said
         names = [name.partition(".")[2] for name in self.force_names[6:]]
         units = ["m" if unit == "N" else "rad" for unit in self.force_units[6:]]
-        return f"{said}\n{signals('sags', shown, names, units)}"
+        return f"{said}\n{signals('deflections', shown, names, units)}"
 
 
 def equilibrium(
