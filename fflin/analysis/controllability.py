@@ -59,9 +59,10 @@ class Controllability(FrozenArrays):
     stabilizable : bool
         Whether all fixed poles are stable.
     reach : dict
-        Numbers of independent directions that the inputs can control, with the keys "base
-        attitude", "base position" and "joints". The inputs can bring the position states to any
-        value along these directions, if the final values of all other states are left free.
+        Numbers of independent directions that the inputs can control, with the keys
+        ``"base attitude"``, ``"base position"`` and ``"joints"``. The inputs can bring the position
+        states to any value along these directions, if the final values of all other states are left
+        free.
     method : str
         Method that determined the dimension: "closed form", "modes" or "eigenvalues".
     margin : Margin
@@ -123,7 +124,7 @@ def controllability(lin: LinearModel) -> Controllability:
     - At rest with symmetric springs and dampers, the other states are tested in second-order form,
       :math:`M a + D v + K s = S u` with positions s, damping D and stiffness K, by the rank of
       :math:`[p^2 M + p D + K, S]` at each pole p. Entries within rounding error are set to zero,
-      and each row is scaled by its entries.
+      and each row is scaled to at most unit length.
     - At nonzero velocity, or if springs or dampers are not symmetric, the Popov-Belevitch-Hautus
       test is applied: the rank of :math:`[A - p I, B]` at each pole p is found from its singular
       values, with the states scaled to units of energy.

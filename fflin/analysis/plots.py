@@ -32,7 +32,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     lin : LinearModel
         Model to draw.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -90,7 +90,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     modes : Modes
         Result of `fflin.modes`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -158,7 +158,7 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     check : Check
         Result of `fflin.check`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------

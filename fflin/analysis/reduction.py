@@ -94,8 +94,8 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
     If inputs act on the base attitude, the reduced model keeps the attitude. If inputs act on the
     base position, the reduced model keeps the position. Without springs, the reduced model is
-    minimal. With springs, it may still contain vibrations that no input drives. The reduced model
-    and the full model have the same transfer function from inputs to joint states.
+    minimal. With springs, the reduced model may still contain vibrations that no input drives. The
+    reduced model and the full model have the same transfer function from inputs to joint states.
 
     Reaction wheels are also removed, even if they store momentum (9.4), but the attitude that they
     control is kept. The speeds and angles of three kinds of wheels are kept:

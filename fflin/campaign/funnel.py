@@ -73,7 +73,7 @@ class Funnel(Design):
 
     The error e relative to the trajectory is defined in `linearize_trajectory`. P(t) is the
     cost-to-go matrix of the gain schedule, and ``e' P e`` is the level of an error. Errors in the
-    null space of P are not tested.
+    null space of P are not tested, because they do not change the level.
 
     Attributes
     ----------
@@ -304,9 +304,10 @@ def funnel(
     schedule : GainSchedule or TrajectoryFeedback
         Schedule designed by `tvlqr`, continuous or sampled.
     goal : mapping or float
-        {"attitude" [deg], "position" [m], "joints" [rad|m], "omega_b" [rad/s], "v_b" [m/s],
-        "joint rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`. If
-        `goal` is a number, it bounds the final value of ``e' P e``.
+        Bounds on the final errors, {"attitude" [deg], "position" [m], "joints" [rad|m],
+        "omega_b" [rad/s], "v_b" [m/s], "joint rates" [rad/s|m/s]: largest final error}, with the
+        kinds of error of `Campaign`. If `goal` is a number, it bounds the final value of
+        ``e' P e``.
     within : mapping, optional
         Largest errors allowed at any time of a run, as a mapping with the same keys as `goal`.
     knots : int or sequence of float
@@ -337,7 +338,7 @@ def funnel(
     UnknownNameError
         If a kind of error or an option is unknown.
     FflinError
-        If a worker process died.
+        If a worker process dies.
 
     References
     ----------

@@ -82,8 +82,8 @@ def monte_carlo(
     policy : policy, GainSchedule or None
         Policy as in `simulate`.
     dispersions : mapping
-        {name, group or pattern: spread}, or dispersions read by `load_dispersions`. A spread is one
-        of
+        Mapping {name, group or pattern: spread}, or the result of `load_dispersions`. A spread is
+        one of
 
         - a number: the standard deviation of a normal distribution about 0;
         - a tuple (least, largest): a uniform distribution;
@@ -145,7 +145,7 @@ def monte_carlo(
         Width and confidence level of the interval for `until`. The report uses the same
         confidence level.
     executor, workers, threads, progress : optional
-        As in `sweep`. The workers of an executor must be able to import the policy's modules.
+        As in `sweep`. The workers of an executor must be able to import the modules of the policy.
     chunk : int, optional
         Number of runs per chunk: a multiple of 8, and a divisor of 256 if `until` is given.
     histories : int, optional
@@ -169,7 +169,8 @@ def monte_carlo(
     Returns
     -------
     Campaign
-        Runs in their order. If `out` is given, arrays are read from the file on demand.
+        Results in the order of the runs. If `out` is given, arrays are read from the file on
+        demand.
 
     Raises
     ------

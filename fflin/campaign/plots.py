@@ -107,7 +107,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     validity : Validity
         Result of `fflin.validity`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -169,7 +169,7 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
     funnel : Funnel
         Result of `fflin.funnel`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------

@@ -214,7 +214,7 @@ def validity(
         - the poles are so far apart that a run would take a million steps;
         - an argument has a wrong size or value.
     FflinError
-        If a worker process died.
+        If a worker process dies.
 
     References
     ----------

@@ -47,9 +47,10 @@ def plot_poles(
     poles : array_like or Gain or LinearModel
         Poles [1/s], an object with poles, or several sets {label: poles}.
     path : str or Path, optional
-        File to write, .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to write, .png, .pdf or .svg. See `plot_motion` for possible errors.
     dt : float
-        Sampling time [s] of poles given as numbers. If not 0, the unit circle is drawn.
+        Sampling time [s], if the poles are given as numbers. If it is not 0, the unit circle is
+        drawn.
     title : str
         Title of the figure.
 
@@ -82,7 +83,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     ----------
     gain : Gain
     path : str or Path, optional
-        File to write, .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to write, .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Returns
     -------

@@ -41,7 +41,7 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     ----------
     lin : LinearModel or LinearTrajectory
     largest : mapping
-        {name: largest acceptable value}, for states or for inputs. A name is one of
+        Mapping {name: largest acceptable value}, for states or for inputs. A name is one of
 
         - a single name in ``lin.state_names`` or ``lin.input_names``;
         - a group such as ``q_b``, ``r_b``, ``q_m``, ``omega_b``, ``v_b``, ``qdot_m``, ``tau_b``,

@@ -60,7 +60,7 @@ class Impact(FrozenArrays):
     momentum: Array
     momentum_after: Array
     event: str
-    # Of the robot that it was, just before.
+    # Robot, configuration and velocity just before the impact.
     _before: tuple[Robot, Array, Array] = field(kw_only=True)
 
     def __repr__(self) -> str:
@@ -153,7 +153,7 @@ def jam(
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> tuple[dict[str, Any], Array]:
-    """Return the fields of `Impact` for robots at q, v that become one (13.1), and the impulses."""
+    """Join robots at (q, v) to one (13.1); return the fields of `Impact`, and the impulses."""
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))
@@ -200,7 +200,7 @@ def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
 
 
 def joint_called(robot: Robot, name: str) -> Any:
-    """Return the joint of Pinocchio's model of that name."""
+    """Return the joint of Pinocchio's model with a name."""
     return robot.model.joints[robot.model.getJointId(name)]
 
 
@@ -334,7 +334,7 @@ def capture(
         other = replace(alone, gravity=robot.gravity, orbit=robot.orbit)
     else:
         instance("payload", payload, Robot, "a pin.Inertia or a fflin.Robot").require_unchanged()
-        other = replace(payload)  # which may be the robot's twin, the same object
+        other = replace(payload)  # a copy, since the payload may be the same object as the robot
     for name in ("gravity", "orbit") if isinstance(payload, Robot) else ():
         own, theirs = (getattr(each, name) for each in (robot, other))
         if own != theirs:
@@ -362,7 +362,7 @@ def capture(
 
 
 def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:
-    """Return configuration and velocity of a payload whose base is at a placement."""
+    """Return the checked configuration and velocity of a payload with its base at a placement."""
     configuration = other.neutral() if q is None else other.checked_configuration(q).copy()
     root = other.model.jointPlacements[ROOT]
     configuration[:7] = pin.SE3ToXYZQUAT(root.actInv(at))

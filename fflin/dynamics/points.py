@@ -16,7 +16,7 @@ from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, by_joint
 from fflin.robot.robot import Robot
 
-LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
+LARGEST_SPEED = 1e50  # [rad/s|m/s], so that squares and their sums do not overflow
 
 
 def configuration(
@@ -65,7 +65,7 @@ def configuration(
 
 
 def require_slow(what: str, v: Array) -> None:
-    """Raise `InputError` if the square of a velocity overflows."""
+    """Raise `InputError` if a velocity exceeds `LARGEST_SPEED`."""
     if not np.abs(v).max(initial=0.0) < LARGEST_SPEED:
         raise InputError(
             f"{what} has an entry of {np.abs(v).max():.3g}, expected less than {LARGEST_SPEED:g} "
@@ -80,7 +80,7 @@ def base_of(state: Mapping[str, Any]) -> pin.SE3:
 
 
 def start_of(robot: Robot) -> tuple[Array, Array]:
-    """Return the configuration (nq,) and velocity (nv,) at which a robot starts."""
+    """Return the initial configuration (nq,) and velocity (nv,) of a robot."""
     start = combined(robot.point, robot.start)
     q = configuration(robot, start.get("joints"), base_of(start))
     return q, velocity(robot, start.get("velocity", {}))
@@ -136,7 +136,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     state = StateMap(robot)
     for name, _ in named_wheels(robot.inputs):
         if name in checked and name not in robot.joint_names:
-            robot.joint(name)  # says why it has no speed
+            robot.joint(name)  # its error says why the joint has no velocity
     rates = rates_by_name(robot.joint_names, checked)
     return state.spread(np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]]))
 

@@ -93,7 +93,7 @@ class StateMap:
         self.frame = names.frame_of(robot, frame)
         self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
-        # The field of the robot's orbit, if it has one.
+        # Acceleration field of the robot's orbit, or None.
         self.field = OrbitField(robot, self.frame) if robot.orbit else None
         self.nx = 12 + 2 * n
         self.groups = names.Groups(
@@ -106,16 +106,16 @@ class StateMap:
         )
         self.names, self.units = zip(*names.state_units(robot).items(), strict=True)
         joints = robot.joints
-        # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
+        # Index in Pinocchio's v of each velocity of the state.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
-        # And back; what a joint that mimics another has is written after.
+        # The inverse map. Entries of mimic joints are written afterwards (`spread`).
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
-        # Entry of v for a unit of each velocity of the state: 1, but for modal amplitudes.
+        # Pinocchio's v per unit of each velocity of the state: 1 except for modal amplitudes.
         self._scale = np.array([1.0] * 6 + [joint.scale for joint in joints])
         self._scaled = bool((self._scale != 1.0).any())
-        # v = S nu; where no joint mimics another and none is scaled S is the permutation above.
+        # S of v = S nu; None if S is the permutation `_order` (no mimic joints and no scaling).
         self.S: Array | None = None
         if robot.followers or self._scaled:
             self.S = np.column_stack([self.spread(e) for e in np.eye(6 + n)])
@@ -125,7 +125,7 @@ class StateMap:
         self._sin = self._cos + 1
         root = robot.model.jointPlacements[ROOT].rotation
         self._gravity, self._pulled = root.T @ np.array(robot.gravity), any(robot.gravity)
-        # Whether anything accelerates the base's origin against the reference.
+        # Whether gravity or an orbit accelerates the base's origin relative to the reference.
         self.falls = self._pulled or robot.orbit is not None
         self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
 
@@ -137,8 +137,8 @@ class StateMap:
 
     def _refer(self, oMref: pin.SE3) -> None:
         self._reference = oMref
-        # The free-flyer joint may itself stand somewhere in the world. Composed as quaternions:
-        # their entries survive to the last digit near a turn of pi.
+        # The model may place its free-flyer joint away from the world's origin. Rotations are
+        # composed as quaternions, which stay accurate to machine precision near 180 deg.
         offset = pin.SE3ToXYZQUAT(oMref.actInv(self.robot.model.jointPlacements[ROOT]))
         self._position, self.origin_quaternion = offset[:3], offset[3:]
         self._rotation = turning.rotation_matrix(self.origin_quaternion)
@@ -175,7 +175,7 @@ class StateMap:
         return chart
 
     def charts(self, q: Array) -> Chart:
-        """Return the attitude charts at valid configurations q (.., nq), for any base attitude."""
+        """Return the attitude charts at valid q (.., nq), without the check against 180 deg."""
         return Chart.of(q[..., 3:7] @ turning.product_matrix(self.origin_quaternion).T)
 
     def rotation(self, q: Array) -> Array:
@@ -234,7 +234,7 @@ class StateMap:
         return self.read(q, v, near=near)
 
     def read(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
-        """Return the same state as `to_state`, but without checking the arguments."""
+        """Return the same state as `to_state`, without checking the arguments."""
         q_m, nu = self.joint_positions(q), self.velocities(v)
         x = self.compose(self.chart(q), self.positions(q), q_m, nu)
         return x if near is None else names.unwound(self, x, near)
