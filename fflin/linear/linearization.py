@@ -98,8 +98,8 @@ def prepare(
         raise unknown_frame(frame)
     if moving and (reference is not None or frame != "local"):
         raise InputError(
-            "moving=True gives the error in the moving base's own axes, but a reference or a frame "
-            "other than 'local' is given; leave both out"
+            "moving=True measures the error in the axes of the moving base, so no reference and "
+            "no frame other than 'local' can be given; leave out reference and frame"
         )
     state = StateMap(robot, reference=reference, frame=frame)
     own = reference is None and robot.orbit is None  # in orbit it is the orbit's frame
