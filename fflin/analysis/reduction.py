@@ -94,8 +94,8 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
     If inputs act on the base attitude, the reduced model keeps the attitude. If inputs act on the
     base position, the reduced model keeps the position. Without springs, the reduced model is
-    minimal. With springs, it may still contain vibrations that no input drives. The reduced model
-    and the full model have the same transfer function from inputs to joint states.
+    minimal. With springs, the reduced model may still contain vibrations that no input drives. The
+    reduced model and the full model have the same transfer function from inputs to joint states.
 
     Reaction wheels are also removed, even if they store momentum (9.4), but the attitude that they
     control is kept. The speeds and angles of three kinds of wheels are kept:
@@ -305,7 +305,8 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     rest = [name for name in part.state_names if name not in angles]
     if len(rest) == len(part.M):
         raise StabilizabilityError(
-            "the model contains wheel speeds alone; remove the damping of the wheels"
+            "wheel speeds would be the only states of the reduced model; remove the damping of "
+            "the wheels"
         )
     return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
 

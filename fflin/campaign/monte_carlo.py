@@ -82,8 +82,8 @@ def monte_carlo(
     policy : policy, GainSchedule or None
         Policy as in `simulate`.
     dispersions : mapping
-        {name, group or pattern: spread}, or dispersions read by `load_dispersions`. A spread is one
-        of
+        Mapping {name, group or pattern: spread}, or the result of `load_dispersions`. A spread is
+        one of
 
         - a number: the standard deviation of a normal distribution about 0;
         - a tuple (least, largest): a uniform distribution;
@@ -145,7 +145,7 @@ def monte_carlo(
         Width and confidence level of the interval for `until`. The report uses the same
         confidence level.
     executor, workers, threads, progress : optional
-        As in `sweep`. The workers of an executor must be able to import the policy's modules.
+        As in `sweep`. The workers of an executor must be able to import the modules of the policy.
     chunk : int, optional
         Number of runs per chunk: a multiple of 8, and a divisor of 256 if `until` is given.
     histories : int, optional
@@ -169,7 +169,8 @@ def monte_carlo(
     Returns
     -------
     Campaign
-        Runs in their order. If `out` is given, arrays are read from the file on demand.
+        Results in the order of the runs. If `out` is given, arrays are read from the file on
+        demand.
 
     Raises
     ------
@@ -297,8 +298,8 @@ def _earlier(path: Path, request: str) -> Campaign | None:
         if read_rows(path, verify=False)[2].get("request") == request:
             return Campaign.load(path)
     raise FileError(
-        f"{path} exists, and this call did not make it; name another file, or replace it with "
-        "overwrite=True (--force)"
+        f"{path} exists and was not written by this call; name another file, or replace the file "
+        "with overwrite=True (--force)"
     )
 
 
@@ -318,7 +319,9 @@ def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
         return chunk_size(min(_STAGE, runs) if staged else runs, workers)
     size = -(-given // LANES) * LANES
     if staged and _STAGE % size:
-        raise InputError(f"chunk is {given}, expected a divisor of {_STAGE} with until, such as 32")
+        raise InputError(
+            f"chunk is {given}, but with until it must be a divisor of {_STAGE}, such as 32"
+        )
     return size
 
 

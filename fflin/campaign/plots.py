@@ -107,7 +107,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     validity : Validity
         Result of `fflin.validity`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -169,7 +169,7 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
     funnel : Funnel
         Result of `fflin.funnel`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -202,8 +202,8 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
         axes[-1].set(xlabel="t [s]", ylabel="success rate [%]", ylim=(0.0, 102.0))
         figure.legend(loc="outside lower center", ncols=2)
         figure.suptitle(
-            f"{funnel.robot.name}: errors from which every run ends with {funnel.goal}\n"
-            f"half-axes; {percent * funnel.confidence:g} % confidence",
+            f"{funnel.robot.name}: initial errors from which every run ends with "
+            f"{funnel.goal}\nhalf-axes; {percent * funnel.confidence:g} % confidence",
             fontsize=10,
         )
     return figure

@@ -212,8 +212,8 @@ def kalman(
     Raises
     ------
     DetectabilityError
-        If the outputs do not observe a mode that does not decay by itself; the message names the
-        mode.
+        If a mode neither decays by itself nor can be observed from the outputs; the message names
+        the mode.
     EquilibriumError
         If the operating point is not a fixed point.
     InputError

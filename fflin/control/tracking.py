@@ -50,9 +50,9 @@ class TrajectoryFeedback(Feedback):
     schedule : GainSchedule
         Result of `tvlqr`.
     held : bool
-        Whether commands are held between samples; commands of a sampled schedule are always held. A
-        held command at the last knot acts after the end of the trajectory, so it already contains
-        the holding inputs at the target.
+        Whether commands are held between samples; commands of a sampled schedule are always held.
+        The command of the last knot, if held, acts after the end of the trajectory, so it already
+        contains the holding inputs.
 
     Examples
     --------
@@ -137,8 +137,8 @@ class TrajectoryFeedback(Feedback):
         Parameters
         ----------
         offset : mapping
-            {name, group or pattern of states: initial error, in the base axes at the start}. The
-            keys ``roll``, ``pitch`` and ``yaw`` [deg] can replace q_b.
+            Mapping {name, group or pattern of states: initial error}, in the base axes at the
+            start. The keys ``roll``, ``pitch`` and ``yaw`` [deg] can replace q_b.
 
         Raises
         ------
