@@ -238,13 +238,19 @@ class Funnel(Design):
 
     def __str__(self) -> str:
         count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
-        head = f"{self.robot.name}: errors from which every run ends with {self.goal}"
-        head += f", and on the way {self.within}" * bool(self.within) + f"; {count} runs per knot"
+        head = f"{self.robot.name}: initial errors from which every run ends with {self.goal}"
+        head += (
+            f", and with {self.within} at all times" * bool(self.within)
+            + f"; {count} runs per knot"
+        )
         tail = [
-            "base, joint: largest half-axes",
-            "runs: number of starts inside, all of which succeeded (+: all starts that were tried)",
-            f"inside: lower bound of the success rate of starts inside ({sure} confidence)",
-            "tried: interval of the success rate of starts up to the largest level that was tried",
+            "base, joint: largest half-axes of the ellipsoid of initial errors",
+            "runs: number of runs that start inside the ellipsoid, all of which succeeded (+: "
+            "all runs start inside)",
+            f"inside: lower bound of the success rate of runs that start inside ({sure} "
+            "confidence)",
+            "tried: confidence interval of the success rate of runs that start up to the largest "
+            "level tried",
         ]
         rows = [["t [s]", "rho", "base [deg]", "base [m]", "joint", "runs", "inside", "tried"]]
         wide = (self.attitude, self.position, self.joints)
@@ -502,7 +508,8 @@ def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int
     both = both[both < len(t) - 1]
     if not len(both):
         raise InputError(
-            "no time of the schedule is a knot of the trajectory; design it on this trajectory"
+            "no time of the schedule is a knot of the trajectory; design the schedule on this "
+            "trajectory"
         )
     if dimension("knots", knots) == 0:
         chosen = both[np.linspace(0, len(both) - 1, whole("knots", knots, 1)).round().astype(int)]

@@ -169,7 +169,8 @@ def monte_carlo(
     Returns
     -------
     Campaign
-        Runs in their order. If `out` is given, arrays are read from the file on demand.
+        Results in the order of the runs. If `out` is given, arrays are read from the file on
+        demand.
 
     Raises
     ------
@@ -297,8 +298,8 @@ def _earlier(path: Path, request: str) -> Campaign | None:
         if read_rows(path, verify=False)[2].get("request") == request:
             return Campaign.load(path)
     raise FileError(
-        f"{path} exists, and this call did not make it; name another file, or replace it with "
-        "overwrite=True (--force)"
+        f"{path} exists and was not written by this call; name another file, or replace the file "
+        "with overwrite=True (--force)"
     )
 
 
@@ -318,7 +319,9 @@ def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
         return chunk_size(min(_STAGE, runs) if staged else runs, workers)
     size = -(-given // LANES) * LANES
     if staged and _STAGE % size:
-        raise InputError(f"chunk is {given}, expected a divisor of {_STAGE} with until, such as 32")
+        raise InputError(
+            f"chunk is {given}, but with until it must be a divisor of {_STAGE}, such as 32"
+        )
     return size
 
 

@@ -121,17 +121,17 @@ class Validity(FrozenArrays):
         order = "the order of the error cannot be determined"
         if np.isfinite(self.slope):
             order = f"the error grows with the displacement to the power {self.slope:.3f}"
-        beyond = " and beyond" if self.trusted == self.largest else ""
+        beyond = ", the largest displacement tested" if self.trusted == self.largest else ""
         first = shown(_scaled(self.largest, float(self.sampled[0])), self.joint_unit)
         lines = [
             f"{self.robot}: the linear loop predicts the nonlinear loop within "
             f"{100.0 * TRUSTED:g} % up to {trusted}{beyond}; {order}",
-            f"every run settled up to {holds}: {self.inside} of {self.inside} runs, "
-            f"so at least {100.0 * self.inside_rate:.1f} % settle there ({sure} confidence)"
+            f"up to {holds}, every run settled ({self.inside} of {self.inside}), so at least "
+            f"{100.0 * self.inside_rate:.1f} % of such displacements settle ({sure} confidence)"
             if self.inside
             else f"the run from the smallest displacement tried, {first}, did not settle",
-            f"up to {largest}: {self.settled} of {count} runs settled, "
-            f"so {100.0 * low:.1f} to {100.0 * high:.1f} % settle there ({sure} confidence)"
+            f"up to {largest}, {self.settled} of {count} runs settled, so {100.0 * low:.1f} to "
+            f"{100.0 * high:.1f} % of such displacements settle ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]
         return folded(lines)

@@ -70,7 +70,7 @@ def lqr(
     no effect:
 
     - wheel angles, which are ignorable;
-    - wheel speeds that are determined by the body's rate, if only wheels rotate the body;
+    - wheel speeds, if only wheels rotate the body, because the body's rate then determines them;
     - the position and velocity of the base, if no input pushes the base.
 
     Parameters
@@ -137,9 +137,7 @@ def lqr(
     if Q is None and R is None and N is None:
         Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
     elif weights is not None or Q is None or R is None:
-        raise InputError(
-            "give the weights either by both Q and R, or by weights='urdf' or 'identity' alone"
-        )
+        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     Q, R, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:

@@ -113,9 +113,7 @@ def tvlqr(
     steady = asks_steady(Qf)
     given, by_rule = list[Any]((Q, R)), Q is None and R is None
     if not by_rule and (weights is not None or Q is None or R is None):
-        raise InputError(
-            "give the weights either by both Q and R, or by weights='urdf' or 'identity' alone"
-        )
+        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     end: Any = steady_end(traj) if steady or by_rule else None
     if by_rule:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)

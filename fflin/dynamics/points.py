@@ -93,7 +93,7 @@ def point_of(
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:
-            raise InputError("x0 is given together with q0 or v0; give x0 alone, or q0 and v0")
+            raise InputError("x0 is given together with q0 or v0; give either x0, or q0 and v0")
         return state.to_pinocchio(x0)
     if q0 is None and v0 is None:
         return default()

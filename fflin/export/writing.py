@@ -275,7 +275,9 @@ class _Texts:
             with np.errstate(over="ignore"):
                 narrow = values.astype(np.float32)
             if (np.isfinite(values) & ~np.isfinite(narrow)).any():
-                raise InputError("the law has numbers too large for a float; take real='double'")
+                raise InputError(
+                    "the law has numbers that are too large for a float; use real='double'"
+                )
             values = narrow.astype(float)
         end = "F" if self.real == "float" else ""
         shown = ", ".join(f"{x!r}{end}" for x in values.tolist())

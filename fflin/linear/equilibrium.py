@@ -58,7 +58,7 @@ class Equilibrium(FrozenArrays):
     >>> soft = fflin.load("planar_detumble", passive=["joint_1"], stiffness={"joint_1": 50.0})
     >>> print(fflin.equilibrium(soft, fflin.configuration(soft, {"joint_1": 0.2})))
     u: all zero
-    sags: joint_1 = -0.2 rad
+    deflections: joint_1 = -0.2 rad
     """
 
     q: Array
@@ -80,7 +80,7 @@ class Equilibrium(FrozenArrays):
             return said
         names = [name.partition(".")[2] for name in self.force_names[6:]]
         units = ["m" if unit == "N" else "rad" for unit in self.force_units[6:]]
-        return f"{said}\n{signals('sags', shown, names, units)}"
+        return f"{said}\n{signals('deflections', shown, names, units)}"
 
 
 def equilibrium(
@@ -243,14 +243,16 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
     orbiting, (turns, moves) = lin.frame in ORBITAL, np.abs(drift[:6]).reshape(2, 3).max(axis=1)
     if moving:
         reason = (
-            f"joints move, {listed(moving)}. Only rotors may move: joints whose link is symmetric "
-            "about the axis and carries nothing. Set the other joint rates to 0"
+            f"joints move ({listed(moving)}), but only rotors may move, which are joints whose "
+            "link is symmetric about the axis and carries nothing; set all other joint rates to "
+            "0"
         )
     elif orbiting and max(turns, moves) > TOLERANCE:
-        reason = "its base moves in the orbit's frame; leave out the velocity of the base"
+        reason = "the base moves in the orbital frame; remove the velocity of the base"
     elif not orbiting and "q_b.x" not in lin.ignorable and turns > TOLERANCE:
         reason = (
-            "under gravity its base may rotate about the vertical only; change its angular velocity"
+            "under gravity, the base may rotate only about the vertical; change the angular "
+            "velocity of the base"
         )
     else:
         return
@@ -281,8 +283,8 @@ def _unbalanced(
     ]
     return EquilibriumError(
         f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
-        f"forces: {listed(left)}; add inputs that balance them (thrusters only push), or choose "
-        "another point"
+        f"forces: {listed(left)}; add inputs that balance these forces (thrusters cannot pull), "
+        "or choose another point"
     )
 
 

@@ -307,7 +307,7 @@ def _step(tool: str, dt: float | None) -> float:
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(
-            f"dt is {h:g} s for {tool}; only mujoco takes dt, a positive time step below 1000 s"
+            f"dt is {h:g} s for {tool}, but only mujoco has a dt, a positive time step below 1000 s"
         )
     return h
 

@@ -188,8 +188,8 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
         if lacking and beside:
             raise InputError(
                 f"the model of '{lin.robot}' lacks the {kind} {lacking[0]} of the gain of "
-                f"'{gain.robot}', and the gain lacks its {kind} {beside[0]}; one of the two must "
-                f"have all {kind}s of the other"
+                f"'{gain.robot}', and the gain lacks the {kind} {beside[0]} of the model; either "
+                f"the model or the gain must have all {kind}s of the other"
             )
         common = [name for name in other if name in own]
         at.append(([other.index(name) for name in common], [own.index(name) for name in common]))

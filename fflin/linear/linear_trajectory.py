@@ -82,7 +82,7 @@ class LinearTrajectory(Trajectory):
         if self.state_names != self._state.names:
             raise InputError(
                 f"the linear trajectory does not fit the given robot '{self.robot.name}': its "
-                "states differ; give the robot it was made for"
+                "states differ; give the robot for which the trajectory was made"
             )
 
     @property

@@ -98,8 +98,8 @@ def prepare(
         raise unknown_frame(frame)
     if moving and (reference is not None or frame != "local"):
         raise InputError(
-            "moving=True gives the error in the moving base's own axes, but a reference or a frame "
-            "other than 'local' is given; leave both out"
+            "moving=True measures the error in the axes of the moving base, so no reference and "
+            "no frame other than 'local' can be given; leave out reference and frame"
         )
     state = StateMap(robot, reference=reference, frame=frame)
     own = reference is None and robot.orbit is None  # in orbit it is the orbit's frame
@@ -408,17 +408,18 @@ def linearize(
         Axes of the base's velocities and wrenches, see `StateMap`; by default
         "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
-        Pose relative to which the attitude and position of the base are measured. The default is
-        the base pose at the operating point, or the orbital frame if the robot is in orbit.
+        Pose relative to which the attitude and position of the base are measured. The
+        default is the base pose at the operating point, or the orbital frame if the
+        robot is in orbit.
     moving : bool
-        Whether to return the error dynamics about a reference that moves through the operating
-        point; see `Linearizer`.
+        Whether to return the error dynamics about a reference that moves through the
+        operating point; see `Linearizer`.
 
     Returns
     -------
     LinearModel
-        Linear model, with the equations in `Linearizer`. To linearise about many operating points,
-        use `Linearizer`.
+        Linear model, with the equations in `Linearizer`. To linearise about many
+        operating points, use `Linearizer`.
 
     Raises
     ------

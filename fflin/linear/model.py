@@ -232,8 +232,8 @@ class LinearModel(StateSpace):
         """Raise `InputError` if the hash of A, B and f0 differs from an earlier `fingerprint`."""
         if self.fingerprint != fingerprint:
             raise InputError(
-                "A, B or f0 were changed after they were certified; check them with "
-                "fflin.check(robot, lin) instead"
+                "A, B or f0 was changed after the certificate was computed; check the model with "
+                "fflin.check(robot, lin)"
             )
 
     def require_unchanged(self) -> None:

@@ -30,8 +30,8 @@ _MOTION = 1e-2
 _FARTHEST_TURN = 2.5
 
 _CAUSES = (
-    "usual causes: wrong hold, wrong axes (frame) of u or v, wrong units of t or of joints, or "
-    "other springs, damping or gravity"
+    "usual causes: wrong hold, wrong axes (frame) of u or v, wrong units of t or of the joints, "
+    "or springs, damping or gravity that differ from the robot"
 )
 
 
@@ -247,7 +247,7 @@ class Trajectory(Design):
         if turns[k] > _FARTHEST_TURN:
             return (
                 f"the base rotates by {turns[k]:.2g} rad from t = {self.t[k]:g} to "
-                f"{self.t[k + 1]:g} s, which is too far for one interval; give knots at most "
+                f"{self.t[k + 1]:g} s, too far for one interval; give more knots, at most "
                 f"{_FARTHEST_TURN:g} rad apart"
             )
         return ""
@@ -344,8 +344,7 @@ def along(motion: Any, robot: Robot | None) -> Trajectory:
     """Return a motion by knots, with held or linear inputs, whose residual is smaller."""
     if motion.phases:
         raise InputError(
-            "the motion has several phases, each with its own robot; convert each of its phases "
-            "separately"
+            "the motion has several phases, each with its own robot; convert each phase separately"
         )
     if robot is None:
         raise InputError(

@@ -255,8 +255,8 @@ class Robot(Coordinates):
         robot = replace(robot, **checked)
         if robot.orbit and any(robot.gravity):
             raise InputError(
-                f"'{self.name}' has both uniform gravity and an orbit, which includes the gravity "
-                "of its central body; leave one out"
+                f"'{self.name}' has both uniform gravity and an orbit, but an orbit already "
+                "includes the gravity of its central body; leave one of them out"
             )
         for name in robot.used_frames:
             find_frame(robot.model, name)

@@ -374,8 +374,9 @@ def _largest_modes(motion: Any) -> str:
     if not far:
         return table
     said = (
-        "warning: the motion is not accurate: the model is linear in the modal amplitudes, and "
-        f"some of these bend the structure by more than {_LINEAR:g} deg: {_and(far)}"
+        "warning: the motion is not accurate, because the model is linear in the modal "
+        f"amplitudes, but some amplitudes bend the structure by more than {_LINEAR:g} deg: "
+        f"{_and(far)}"
     )
     return f"{table}\n{folded([said])}"
 

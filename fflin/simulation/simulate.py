@@ -214,7 +214,7 @@ def simulate(
         return motion_of(plan, plant, conserved, run)
     except MemoryError:
         raise InputError(
-            f"{plan.times.rows} rows of '{robot.name}' exceed the available memory; take a larger "
+            f"{plan.times.rows} rows of '{robot.name}' exceed the available memory; use a larger "
             "dt or `every`"
         ) from None
 

@@ -284,7 +284,9 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     made = Uncertain(robot, (*alone.values(), *together), variants)
     _refuse_overlap(variants.pieces, made.ranges)
     if why := made._refusal(np.zeros(len(made.blocks))):
-        raise InputError(f"no robot exists at the middle of the ranges: {why}; give other ranges")
+        raise InputError(
+            f"the robot at the middle of the ranges is not valid: {why}; give other ranges"
+        )
     return made
 
 
@@ -292,8 +294,8 @@ def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> N
     names = [each.parameter.name for each in ranges]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(
-            f"'{twice[0]}' is tied to other parameters and also has another range; give only one "
-            "of the two"
+            f"'{twice[0]}' is tied to other parameters and also has a range of its own; give "
+            "only one of these ranges"
         )
     asked = {each.parameter.of for each in ranges} & pieces.keys()
     for name, other in permutations(asked, 2):

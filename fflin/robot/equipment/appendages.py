@@ -123,15 +123,16 @@ class FlexibleAppendage(Appendage):
         if frequency.ndim != 1 or not modes or damping.shape not in ((), (modes,)):
             raise InputError(
                 f"frequency and damping of {what} have shapes {frequency.shape} and "
-                f"{damping.shape}, expected k frequencies [Hz], and k damping ratios or one"
+                f"{damping.shape}, expected k frequencies [Hz], and k damping ratios or one "
+                "damping ratio for all"
             )
         damping = np.broadcast_to(damping, modes).copy()
         known = (frequency > 0.0) & (frequency < _FASTEST) & (damping >= 0.0) & (damping <= 1.0)
         for mode in np.flatnonzero(~known)[:1].tolist():
             raise InputError(
-                f"mode {mode + 1} of {what} has {frequency[mode]:g} Hz and the damping ratio "
-                f"{damping[mode]:g}, expected more than 0 and less than {_FASTEST:g} Hz, and a "
-                "ratio from 0 to 1"
+                f"mode {mode + 1} of {what} has the frequency {frequency[mode]:g} Hz and the "
+                f"damping ratio {damping[mode]:g}, expected a frequency of more than 0 and less "
+                f"than {_FASTEST:g} Hz, and a ratio from 0 to 1"
             )
         for name, unit in (("translation", "kg^0.5"), ("rotation", "kg^0.5 m")):
             hint = f": one column [{unit}] for each of the {modes} frequencies"
@@ -336,8 +337,9 @@ class Slosh(Appendage):
             raise InputError(f"damping of {what} is {ratio:g}, expected a ratio from 0 to 1")
         if ratio and self.frequency is None:
             raise InputError(
-                f"{what} has the damping ratio {ratio:g}, but a pendulum has a frequency only "
-                "under an acceleration; give the frequency [Hz] to which the ratio refers"
+                f"{what} has the damping ratio {ratio:g}, but without a frequency, because a "
+                "pendulum oscillates only under an acceleration; give the frequency [Hz] to "
+                "which the ratio refers"
             )
         object.__setattr__(self, "damping", ratio)
         position = three_numbers(f"position of {what}", self.position)
