@@ -287,7 +287,7 @@ def funnel(
     threads: int | None = None,
     progress: Progress | None = None,
     engine: str | None = None,
-    **options: Any,
+    **options: object,
 ) -> Funnel:
     r"""Estimate the initial errors from which a trajectory tracking loop reaches a goal.
 
@@ -424,7 +424,7 @@ def funnel(
 
 
 def runs_from(
-    robot: Robot, feedback: TrajectoryFeedback, k: int, first: int, options: Mapping[str, Any]
+    robot: Robot, feedback: TrajectoryFeedback, k: int, first: int, options: Mapping[str, object]
 ) -> CampaignJob:
     """Return the runs from knot k of the trajectory, which is time `first` of the schedule.
 
@@ -478,7 +478,7 @@ def _judged(
     return np.select([stopped, exceeded(ended["largest"], within), missed], [1.0, 2.0, 3.0])
 
 
-def _bounds(name: str, given: Any, kinds: Iterable[str]) -> dict[str, float]:
+def _bounds(name: str, given: object, kinds: Iterable[str]) -> dict[str, float]:
     """Return the checked bounds {kind: largest error}."""
     given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
     for key in given:

@@ -142,7 +142,7 @@ def _fields(entries: Record) -> dict[str, Any]:
     }
 
 
-def given(value: Any, _: object) -> Any:
+def given(value: object, _: object) -> Any:
     """Return the content of a file for any kind of model."""
     return value
 
@@ -288,7 +288,7 @@ def arguments(
     return found_as | {"q": q, "v": v}
 
 
-def _require_inputs(known: Sequence[str], names: Any, count: int) -> None:
+def _require_inputs(known: Sequence[str], names: object, count: int) -> None:
     """Raise `InputError` if the inputs of a file, named or not, are not the robot's inputs."""
     given = texts(names)
     if given == tuple(known):
@@ -303,7 +303,7 @@ def _require_inputs(known: Sequence[str], names: Any, count: int) -> None:
     raise InputError(f"{said}; load the robot with the inputs of the trajectory (--inputs)")
 
 
-def _digest(table: Sequence[Sequence[Any]]) -> str:
+def _digest(table: Sequence[Sequence[object]]) -> str:
     """Return the digest of a table without its column of digests."""
     return record.content_digest({"table": csv_table(table)})
 

@@ -168,7 +168,7 @@ class LinearModel(StateSpace):
     _robot: Robot | None = None  # that it was made of; None where it is from a file
     mean_motion: float = 0.0
 
-    def __init__(self, shared: Mapping[str, Any] | None = None, /, **fields: Any) -> None:
+    def __init__(self, shared: Mapping[str, object] | None = None, /, **fields: object) -> None:
         # The __init__ of a dataclass sets three dozen frozen fields one by one, which takes as long
         # as the dynamics of a small robot. Most of them are `shared` by the models of a robot.
         for name, value in fields.items():

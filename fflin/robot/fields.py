@@ -35,7 +35,7 @@ class Scope(NamedTuple):
     urdf_damping: Mapping[str, float]
 
 
-def checked_fields(fields: Mapping[str, Any], scope: Scope) -> dict[str, Any]:
+def checked_fields(fields: Mapping[str, object], scope: Scope) -> dict[str, Any]:
     """Return the checked fields of `Robot.replace`, except for passive joints and inputs."""
     require_known("field of a robot", fields, FIELDS)
     return {name: FIELDS[name](value, scope) for name, value in fields.items()}

@@ -43,7 +43,7 @@ _INVOLVED = 0.1
 _ASYMMETRY = 1e-12
 
 
-def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
+def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
     """Return {joint: body} of bodies that `Robot.with_mass_properties` is given."""
     given = mapping("bodies", bodies, "body")
     index_of = {"base": ROOT, **{model.names[i]: i for i in range(ROOT, model.njoints)}}
@@ -68,7 +68,7 @@ def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
     return new
 
 
-def given_body(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
+def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
     """Return a body that is given in part or as a whole."""
     of = f"of '{name}'"
     if isinstance(value, pin.Inertia):

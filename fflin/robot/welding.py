@@ -71,7 +71,7 @@ def welded(robot: Robot, lock: Lock) -> Robot:
     return with_inputs(whole, inputs)
 
 
-def _without(of: Any, gone: Iterable[str], left: Iterable[str]) -> Any:
+def _without(of: object, gone: Iterable[str], left: Iterable[str]) -> Any:
     """Return a mapping and its nested mappings without keys that name removed joints alone."""
     if not isinstance(of, Mapping):
         return of
@@ -190,7 +190,7 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     return with_inputs(whole, robot.inputs)
 
 
-def _prefixed(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+def _prefixed(values: Mapping[str, object], prefix: str) -> dict[str, Any]:
     return {f"{prefix}.{name}": value for name, value in values.items()}
 
 
