@@ -189,7 +189,7 @@ class RunStatistics(
     namedtuple(
         "RunStatistics",
         "robot law path x_ref q_ref nu_ref kind settled tolerance steps at "
-        "sizes largest_x largest_u largest outside errors inputs",
+        "sizes largest_x largest_u largest outside errors inputs states",
     )
 ):
     """Reference of the errors of eight runs, and their statistics so far.
@@ -198,11 +198,12 @@ class RunStatistics(
     `path` has, or from the rows `q_ref` and `nu_ref` of a moving reference. `kind` (nx,) is 0 for a
     state without a kind, and -1 for a state whose error is not kept. An error has settled if it is
     below the fraction `settled` of its largest value, or below `tolerance` (kinds,). At `steps`
-    (times,) errors and inputs are kept. `at` is work space. The fields after it are in lanes.
+    (times,) the errors of kinds and states and the inputs are kept. `at` is work space. The fields
+    after it are in lanes.
     """
 
 
-_IN_LANES = "sizes largest_x largest_u largest outside errors inputs"
+_IN_LANES = "sizes largest_x largest_u largest outside errors inputs states"
 RUN_STATISTICS = Struct(
     RunStatistics,
     robot=MECHANICS,
@@ -261,7 +262,7 @@ def take(words, rows, first, count):
     """
     stats = _opened_statistics(words)
     at, sizes, kept = stats.at, stats.sizes, 0
-    width, inputs = len(at.q) + len(at.nu), len(stats.largest_u)
+    width, inputs, e = len(at.q) + len(at.nu), len(stats.largest_u), stats.path.e
     while kept < len(stats.steps) and stats.steps[kept] < first:
         kept += 1
     for row in range(count):
@@ -281,6 +282,7 @@ def take(words, rows, first, count):
         if kept < len(stats.steps) and stats.steps[kept] == step:
             vec.copy(sizes, 0, stats.errors, kept * len(sizes), len(sizes))
             vec.copy(rows, begin + width, stats.inputs, kept * inputs, inputs)
+            vec.copy(e, 0, stats.states, kept * len(e), len(e))
             kept += 1
     if count > 0:
         read_state(stats.robot, stats.law, at, 0)
