@@ -29,8 +29,8 @@ from fflin.base.validation import Array, FrozenArrays, Values
 from fflin.linear.model import LinearModel
 
 _LOOPS = (
-    "a periodic joint motion can still rotate the base of the nonlinear robot, by O(e^2) for an "
-    "amplitude e; a linear model does not show this"
+    "a periodic joint motion can still rotate the base of the nonlinear robot, by O(e^2) for a "
+    "joint amplitude e, although the linear model does not show it"
 )
 
 
@@ -59,9 +59,10 @@ class Controllability(FrozenArrays):
     stabilizable : bool
         Whether all fixed poles are stable.
     reach : dict
-        Numbers of independent directions that the inputs can control, with the keys "base
-        attitude", "base position" and "joints". The inputs can bring the position states to any
-        value along these directions, if the final values of all other states are left free.
+        Numbers of independent directions that the inputs can control, with the keys
+        ``"base attitude"``, ``"base position"`` and ``"joints"``. The inputs can bring the position
+        states to any value along these directions, if the final values of all other states are left
+        free.
     method : str
         Method that determined the dimension: "closed form", "modes" or "eigenvalues".
     margin : Margin
@@ -111,16 +112,19 @@ class Controllability(FrozenArrays):
 def controllability(lin: LinearModel) -> Controllability:
     r"""Determine the controllable subspace from the structure of the model.
 
-    Let :math:`x_1` be the positions, :math:`\nu` the velocities and :math:`\dot x_1 = N \nu`. The
-    method depends on the model:
+    Let :math:`x_1` be the positions and :math:`\nu` the velocities, with :math:`\dot x_1 = N \nu`,
+    and let :math:`A_{ij}` and :math:`B_i` be the corresponding blocks of A and B. The method
+    depends on the model:
 
-    - At rest, the momenta :math:`W M \nu` with :math:`W M [A_{21}, A_{22}, B_2] = 0` are
-      conserved. These momenta, and the coordinates :math:`W M N^{-1} x_1` whose rates are these
-      momenta, are uncontrollable and are separated exactly from the other states. Without springs
-      and dampers, all other states are controllable, so the dimension is 2 rank(B).
+    - At rest, the momenta :math:`W M \nu` with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved;
+      each row of W defines one momentum. These momenta, and the coordinates :math:`W M N^{-1} x_1`
+      whose rates are these momenta, are uncontrollable and are separated exactly from the other
+      states. Without springs and dampers, all other states are controllable, so the dimension is 2
+      rank(B).
     - At rest with symmetric springs and dampers, the other states are tested in second-order form,
-      :math:`M a + D v + K s = S u`, by the rank of :math:`[p^2 M + p D + K, S]` at each pole p.
-      Entries within rounding error are set to zero, and each row is scaled by its entries.
+      :math:`M a + D v + K s = S u` with positions s, damping D and stiffness K, by the rank of
+      :math:`[p^2 M + p D + K, S]` at each pole p. Entries within rounding error are set to zero,
+      and each row is scaled to at most unit length.
     - At nonzero velocity, or if springs or dampers are not symmetric, the Popov-Belevitch-Hautus
       test is applied: the rank of :math:`[A - p I, B]` at each pole p is found from its singular
       values, with the states scaled to units of energy.
@@ -144,7 +148,8 @@ def controllability(lin: LinearModel) -> Controllability:
     Returns
     -------
     Controllability
-        Dimension, basis, and named controllable and uncontrollable states.
+        Dimension and basis of the controllable subspace, and names of controllable and
+        uncontrollable states.
 
     Raises
     ------
@@ -285,9 +290,10 @@ def _notes(
     if rotates and any(lin.state_names[i].startswith("q_m.") for i in conserved.kept):
         notes.append(_LOOPS)
     if momenta:
-        notes.append("fflin.momentum_reduction removes the conserved momenta")
+        notes.append("fflin.momentum_reduction removes the conserved momenta from the model")
     if not lin.is_equilibrium():
         notes.append(
-            "the operating point is not an equilibrium; the result is valid for the frozen A and B"
+            "the operating point is not an equilibrium, so the result is valid only for A and B "
+            "frozen at this point"
         )
     return tuple(notes)

@@ -77,13 +77,13 @@ class Observability(FrozenArrays):
 def observability(lin: LinearModel) -> Observability:
     r"""Determine the observable subspace from C and the structure of A.
 
-    At rest, observability is tested in second-order form, :math:`M a + D v + K s = 0`, by the null
-    space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. Here :math:`C_s` and :math:`C_v`
-    are the columns of C for the positions s and the velocities v. All poles at p = 0 are tested
-    together. At nonzero velocity, observability is tested as the controllability of the dual pair
-    :math:`(A^T, C^T)`, with states scaled to units of energy, as in `controllability`. The
-    unobservable subspace is the orthogonal complement of the controllable subspace of the dual
-    pair.
+    At rest, observability is tested in second-order form, :math:`M a + D v + K s = 0` with damping
+    D and stiffness K, by the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p.
+    Here :math:`C_s` and :math:`C_v` are the columns of C for the positions s and the velocities v.
+    All poles at p = 0 are tested together. At nonzero velocity, observability is tested as the
+    controllability of the dual pair :math:`(A^T, C^T)`, with states scaled to units of energy, as
+    in `controllability`. The unobservable subspace is the orthogonal complement of the controllable
+    subspace of the dual pair.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def observability(lin: LinearModel) -> Observability:
     Returns
     -------
     Observability
-        Dimension, basis, and named unobservable motions.
+        Dimension of the observable part, and basis and names of the unobservable motions.
 
     Raises
     ------
@@ -233,7 +233,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
         found = [_gramian(A, B @ B.T, lin.dt, duration) for A, B in pairs]
     if not all(np.isfinite(W).all() for W in found):
         raise InputError(
-            f"duration is {duration:g} s, over which the state transition overflows; shorten it"
+            f"duration is {duration:g} s, over which the state transition matrix overflows; give "
+            "a shorter duration"
         )
     reach, show = (0.5 * (W + W.T) for W in found)
     return Gramians(reach, show, np.inf if duration is None else duration)
@@ -246,8 +247,8 @@ def _require_decay(lin: LinearModel) -> None:
     if growth >= -_DECAY * (1.0 if lin.dt else size):
         slow = f"a pole of modulus {1.0 + growth:.6g}" if lin.dt else f"a pole at {growth:.3g} 1/s"
         raise InputError(
-            f"the model is not asymptotically stable ({slow}), so its Gramians are not finite; "
-            "give duration="
+            f"the model is not asymptotically stable ({slow}), so its infinite-time Gramians are "
+            "not finite; give duration= for finite-time Gramians"
         )
 
 

@@ -32,7 +32,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     lin : LinearModel
         Model to draw.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -90,7 +90,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     modes : Modes
         Result of `fflin.modes`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -158,7 +158,7 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     check : Check
         Result of `fflin.check`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -185,9 +185,9 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
         axes.set_xlabel("relative error (dot) and tolerance (bar)")
         verdict = f"OK: {len(check.rows)} errors within tolerance"
         if bad:
-            verdict = f"FAILED: {len(bad)} of {len(check.rows)} exceed their tolerance"
+            verdict = f"FAILED: {len(bad)} of {len(check.rows)} errors exceed their tolerance"
         exact = len(check.rows) - len(rows)
-        axes.set_title(f"{check.title}\n{verdict}; {exact} are zero, not drawn", loc="left")
+        axes.set_title(f"{check.title}\n{verdict}; {exact} are zero (not drawn)", loc="left")
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)
     return figure
 

@@ -94,8 +94,8 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
     If inputs act on the base attitude, the reduced model keeps the attitude. If inputs act on the
     base position, the reduced model keeps the position. Without springs, the reduced model is
-    minimal. With springs, it may still contain vibrations that no input drives. The reduced model
-    and the full model have the same transfer function from inputs to joint states.
+    minimal. With springs, the reduced model may still contain vibrations that no input drives. The
+    reduced model and the full model have the same transfer function from inputs to joint states.
 
     Reaction wheels are also removed, even if they store momentum (9.4), but the attitude that they
     control is kept. The speeds and angles of three kinds of wheels are kept:
@@ -107,7 +107,7 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     Parameters
     ----------
     lin : LinearModel
-        Model about rest, continuous or sampled.
+        Model about an operating point at rest, continuous or sampled.
     wheel_speeds : bool, optional
         Whether to keep wheels whose speeds the inputs can control. By default, such wheels are kept
         if inputs other than the wheels can rotate the base.
@@ -166,11 +166,12 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
 
 def generalized_inertia(lin: LinearModel) -> Array:
-    r"""Return the generalized inertia matrix: the inertia of the joints with the base free (9.3).
+    r"""Return the generalized inertia matrix: the inertia of the joints with the base free.
 
     .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
 
-    Umetani and Yoshida defined this matrix; `momentum_reduction` lists the reference.
+    Umetani and Yoshida defined this matrix, see (9.3) of docs/derivation.md and the reference in
+    `momentum_reduction`.
 
     Parameters
     ----------
@@ -202,13 +203,14 @@ def generalized_inertia(lin: LinearModel) -> Array:
 
 
 def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") -> Array:
-    r"""Return the generalized Jacobian from joint rates to a frame's velocity (9.3).
+    r"""Return the generalized Jacobian from joint rates to a frame's velocity.
 
     This Jacobian is valid if the base is free and the momentum of the robot is zero.
 
     .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
 
-    Umetani and Yoshida defined this matrix; `momentum_reduction` lists the reference.
+    Umetani and Yoshida defined this matrix, see (9.3) of docs/derivation.md and the reference in
+    `momentum_reduction`.
 
     Parameters
     ----------
@@ -303,7 +305,8 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     rest = [name for name in part.state_names if name not in angles]
     if len(rest) == len(part.M):
         raise StabilizabilityError(
-            "the model contains wheel speeds alone; remove the damping of the wheels"
+            "wheel speeds would be the only states of the reduced model; remove the damping of "
+            "the wheels"
         )
     return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
 

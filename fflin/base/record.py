@@ -203,7 +203,9 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
     elif _MAT_NEARLY.search(content[:_MAT_TEXT]):
         raise ValueError("its header was damaged or edited")
     if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
-        hint = ", but of version 7.3; write it with save -v7" * (content[124:128] == b"\0\2IM")
+        hint = ", but of version 7.3; save the data in MATLAB with save -v7" * (
+            content[124:128] == b"\0\2IM"
+        )
         raise ValueError(f"not a MATLAB file of level 5{hint}")
     record = {key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()}
     return {key: value for key, value in record.items() if key[:2] != "__"}, checksummed
@@ -238,10 +240,14 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
     if found:
         body = content[: len(content) - len(found.group())]
         if hashlib.sha256(body).hexdigest().encode() != found.group(1):
-            raise ValueError(f"{DAMAGED}; to read it as it is, delete the line {CHECKSUM}")
+            raise ValueError(
+                f"{DAMAGED}; to read the file without this check, delete its line {CHECKSUM}"
+            )
     record: Record = json.loads(content)
     if record.pop(CHECKSUM, None) is not None and not found:
-        raise ValueError(f"its line {CHECKSUM} is not in the form that fflin writes; delete it")
+        raise ValueError(
+            f"its line {CHECKSUM} is not in the form that fflin writes; delete this line"
+        )
     return record, bool(found)
 
 

@@ -62,7 +62,11 @@ def _on_terminal() -> bool:
 
 
 def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
-    """Align columns left or right by the letters of `align`, by default right; dim cells "."."""
+    """Return rows of cells as text with aligned columns; a cell "." is dimmed.
+
+    The letters of `align`, "l" or "r", align the first columns left or right. All further columns
+    are aligned right.
+    """
     sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
     align = align.ljust(len(sizes), "r")
     lines = []

@@ -48,7 +48,7 @@ class TomlFile:
             text = content.decode("utf-8-sig").replace("\r\n", "\n")
             for number, written in enumerate(text.split("\n"), start=1):
                 if written.count(".") > _DOTS_LIMIT:
-                    raise ValueError(f"more than {_DOTS_LIMIT} dots (at line {number})")
+                    raise ValueError(f"more than {_DOTS_LIMIT} dots in one line (at line {number})")
             self.record: dict[str, Any] = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
             found = re.search(r"at line (\d+)", str(error))
@@ -61,7 +61,11 @@ class TomlFile:
         for place, value in _values(self.record):
             # Python refuses to write longer integers, as a message would.
             if type(value) is int and value.bit_length() > 10_000:
-                raise self.error(f"{place[-1]} has too many digits; write it as 1e30", *place)
+                raise self.error(
+                    f"{place[-1]} has too many digits; write a number of this size in the form "
+                    "1e30",
+                    *place,
+                )
 
     def line(self, *place: str | int) -> int:
         """Return the line number of a key, or of the table that contains it."""

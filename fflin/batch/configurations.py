@@ -40,7 +40,7 @@ class Grid:
     ----------
     robot : Robot
     axes : mapping
-        {joint: values (k,) [rad|m]}.
+        Values of each varied joint, {joint: values (k,) [rad|m]}.
     start : ndarray (nq,)
         Configuration that contains the base pose and the positions of the joints that the grid does
         not vary.
@@ -84,7 +84,7 @@ class RandomConfigurations:
     count, seed : int
         Number of configurations, and seed of the draws.
     ranges : mapping
-        {joint: (low, high) [rad|m]}.
+        Range of each joint, {joint: (low, high) [rad|m]}.
     start : ndarray (nq,)
         Configuration that contains the base pose; random values replace its joint positions.
 
@@ -149,7 +149,8 @@ def grid(
     ----------
     robot : Robot
     axes : mapping
-        {joint: increasing values (k,) [rad|m]}. The last joint varies fastest.
+        Values of each varied joint in increasing order, {joint: values (k,) [rad|m]}. The last
+        joint varies fastest.
     joints, base : optional
         Values of the other joints and pose of the base, as in `configuration`.
 
@@ -173,7 +174,7 @@ def grid(
     """
     start = configuration(robot, joints, base)
     if not isinstance(axes, Mapping) or not axes:
-        raise InputError(f"the axes of the grid are {axes!r}, expected {{joint: values}}")
+        raise InputError(f"the axes of the grid are {axes!r}, expected a mapping {{joint: values}}")
     checked: dict[str, Array] = {}
     for name, values in axes.items():
         robot.joint(name)
@@ -243,7 +244,7 @@ def random_configurations(
     count, seed = whole("count", count, 1), whole("seed", seed, 0)
     start = configuration(robot, base=base)
     if not (ranges is None or isinstance(ranges, Mapping)):
-        raise InputError(f"ranges is {ranges!r}, expected {{joint: (low, high)}}")
+        raise InputError(f"ranges is {ranges!r}, expected a mapping {{joint: (low, high)}}")
     names = robot.joint_names
     given = joints_by_name("joint", ranges or {}, names, lambda name: robot.joint(name).name)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
@@ -287,7 +288,9 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
         if not low <= high:
             raise InputError(f"{what} is {low:g} to {high:g}, expected low <= high")
         if math.isinf(high - low):
-            raise InputError(f"{what} is {low:g} to {high:g}, its width overflows; narrow it")
+            raise InputError(
+                f"{what} is {low:g} to {high:g}, and its width overflows; give a narrower range"
+            )
         return low, high
     if joint.unbounded:
         return _TURN

@@ -297,7 +297,7 @@ class LinearBatch(FrozenArrays):
         if own != (found["urdf_sha256"], found["locked"], _joints(found["state_names"]), n):
             raise InputError(
                 f"robot '{robot.name}' differs from the robot '{found['robot']}' of the batch in "
-                "its URDF, joints or orbit; give the robot that the batch was made of"
+                "its URDF, joints or orbit; give the robot for which the batch was made"
             )
         from fflin.linear.linearization import prepare
 
@@ -381,7 +381,7 @@ def _checked_fields(
     shapes = {"A": (nx, nx), "B_lower": (nx // 2, nu), "C": (ny, nx), "D": (ny, nu), "f0": (nx,)}
     for key, shape in shapes.items():
         if found[key].shape[1:] != shape:
-            raise ValueError(f"{key} has shape {found[key].shape[1:]} a point, expected {shape}")
+            raise ValueError(f"{key} has shape {found[key].shape[1:]} per point, expected {shape}")
     return found
 
 
@@ -391,8 +391,8 @@ def _joints(state_names: Sequence[str]) -> tuple[str, ...]:
 
 def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:
     raise InputError(
-        f"the {what} is not in the file and is computed from the robot; load the batch with "
-        f"LinearBatch.load(path, robot), with the unchanged robot '{name}'"
+        f"the {what} is computed from the robot, which the file does not contain; load the batch "
+        f"with LinearBatch.load(path, robot), where robot is the unchanged '{name}'"
     )
 
 

@@ -154,14 +154,15 @@ def failure(
         store.discard()
     elif store.part is not None:
         message += (
-            f"; the results of the other chunks are in {store.part}, from which the same call "
-            "resumes"
+            f"; the results of the other chunks are in {store.part}, and the same call resumes "
+            "from this file"
         )
     else:
         batch = made(kept)
         message += (
             "; the results of the other chunks are in the attribute `batch` of this error. With "
-            "out='NAME.h5' (-o NAME.h5), the same call resumes"
+            "out='NAME.h5' (-o NAME.h5), the results would be saved, and the same call would "
+            "resume"
         )
     return SweepError(message, tuple((*span, reason) for span, _, reason in failed), batch)
 

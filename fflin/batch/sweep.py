@@ -94,8 +94,8 @@ def sweep(
         (``Client.get_executor()``) or an executor of mpi4py.futures. `sweep` does not shut down the
         executor.
     workers : int, optional
-        Number of worker processes to start, at most one per core. With workers, call `sweep` under
-        ``if __name__ == "__main__":``.
+        Number of worker processes to start, at most one per core. Each worker imports the main
+        module, so call `sweep` under ``if __name__ == "__main__":``.
     threads : int, optional
         Number of threads of the compiled code; by default one for each available core.
     chunk : int, optional

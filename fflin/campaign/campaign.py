@@ -249,9 +249,9 @@ class Campaign(FrozenArrays):
         Parameters
         ----------
         condition : str or array_like of bool (N,)
-            Text ``NAME < NUMBER UNIT`` with <, <=, > or >=; ``and`` joins several comparisons. If
-            UNIT is omitted, NUMBER is in the unit of the figure. A run that was stopped early never
-            meets a condition given as text.
+            Text such as ``NAME < NUMBER UNIT``; the other operators are <=, > and >=, and ``and``
+            joins several comparisons. If UNIT is omitted, NUMBER is in the unit of the figure. A
+            run that was stopped early never meets a condition given as text.
         """
         if not isinstance(condition, str):
             found = np.asarray(condition if isinstance(condition, np.ndarray | list) else None)

@@ -72,7 +72,7 @@ class Funnel(Design):
 
     The error e relative to the trajectory is defined in `linearize_trajectory`. P(t) is the
     cost-to-go matrix of the gain schedule, and ``e' P e`` is the level of an error. Errors in the
-    null space of P are not tested.
+    null space of P are not tested, because they do not change the level.
 
     Attributes
     ----------
@@ -93,8 +93,8 @@ class Funnel(Design):
         Lower bound, at confidence level `confidence`, on the success rate of runs that start at or
         below the level `rho`.
     rate : ndarray (m, 2)
-        Clopper-Pearson interval of the success rate of all runs. All runs start at or below the
-        level `tried`.
+        Clopper-Pearson interval of the success rate of all runs, which start at or below the level
+        `tried`.
     attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
         Half-axes of the ellipsoids in base attitude [deg], base position [m] and each joint
         [rad|m].
@@ -159,7 +159,7 @@ class Funnel(Design):
 
     @cached_property
     def rho(self) -> Array:
-        """Largest level (m,) up to which every run succeeded."""
+        """Largest level (m,) up to which every run reached the goal."""
         count = self.outcomes.shape[1]
         level: Array = self.tried * ((self.inside - 0.5).clip(min=0.0) / count) ** 2
         return level
@@ -237,13 +237,19 @@ class Funnel(Design):
 
     def __str__(self) -> str:
         count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
-        head = f"{self.robot.name}: errors from which every run ends with {self.goal}"
-        head += f", and on the way {self.within}" * bool(self.within) + f"; {count} runs per knot"
+        head = f"{self.robot.name}: initial errors from which every run ends with {self.goal}"
+        head += (
+            f", and with {self.within} at all times" * bool(self.within)
+            + f"; {count} runs per knot"
+        )
         tail = [
-            "base, joint: largest half-axes",
-            "runs: number of starts inside, all of which succeeded (+: all starts that were tried)",
-            f"inside: lower bound of the success rate of starts inside ({sure} confidence)",
-            "tried: interval of the success rate of starts up to the largest level that was tried",
+            "base, joint: largest half-axes of the ellipsoid of initial errors",
+            "runs: number of runs that start inside the ellipsoid, all of which succeeded (+: "
+            "all runs start inside)",
+            f"inside: lower bound of the success rate of runs that start inside ({sure} "
+            "confidence)",
+            "tried: confidence interval of the success rate of runs that start up to the largest "
+            "level tried",
         ]
         rows = [["t [s]", "rho", "base [deg]", "base [m]", "joint", "runs", "inside", "tried"]]
         wide = (self.attitude, self.position, self.joints)
@@ -297,9 +303,10 @@ def funnel(
     schedule : GainSchedule or TrajectoryFeedback
         Schedule designed by `tvlqr`, continuous or sampled.
     goal : mapping or float
-        {"attitude" [deg], "position" [m], "joints" [rad|m], "omega_b" [rad/s], "v_b" [m/s],
-        "joint rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`. If
-        `goal` is a number, it bounds the final value of ``e' P e``.
+        Bounds on the final errors, {"attitude" [deg], "position" [m], "joints" [rad|m],
+        "omega_b" [rad/s], "v_b" [m/s], "joint rates" [rad/s|m/s]: largest final error}, with the
+        kinds of error of `Campaign`. If `goal` is a number, it bounds the final value of
+        ``e' P e``.
     within : mapping, optional
         Largest errors allowed at any time of a run, as a mapping with the same keys as `goal`.
     knots : int or sequence of float
@@ -326,11 +333,11 @@ def funnel(
     Raises
     ------
     InputError
-        If a size or value is wrong, or no time of the schedule is a knot of the trajectory.
+        If a size or value is wrong, or the schedule and the trajectory have no knot in common.
     UnknownNameError
         If a kind of error or an option is unknown.
     FflinError
-        If a worker process died.
+        If a worker process dies.
 
     References
     ----------
@@ -506,7 +513,8 @@ def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int
     both = both[both < len(t) - 1]
     if not len(both):
         raise InputError(
-            "no time of the schedule is a knot of the trajectory; design it on this trajectory"
+            "no time of the schedule is a knot of the trajectory; design the schedule on this "
+            "trajectory"
         )
     if dimension("knots", knots) == 0:
         chosen = both[np.linspace(0, len(both) - 1, whole("knots", knots, 1)).round().astype(int)]

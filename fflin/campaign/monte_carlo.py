@@ -82,8 +82,8 @@ def monte_carlo(
     policy : policy, GainSchedule or None
         Policy as in `simulate`.
     dispersions : mapping
-        {name, group or pattern: spread}, or dispersions read by `load_dispersions`. A spread is one
-        of
+        Mapping {name, group or pattern: spread}, or the result of `load_dispersions`. A spread is
+        one of
 
         - a number: the standard deviation of a normal distribution about 0;
         - a tuple (least, largest): a uniform distribution;
@@ -122,8 +122,8 @@ def monte_carlo(
           `TrajectoryOutputFeedback` measures. ``NAME.noise``: white noise added to this measurement
           at each sample. If the spread is a number, it is the standard deviation of the noise in
           all runs. From any other spread, a standard deviation is drawn for each run.
-        - ``delay`` [s]: change of the `delay` of `simulate`. The total delay is rounded to whole
-          steps; a negative total becomes 0.
+        - ``delay`` [s]: change of the argument `delay` of `simulate`. The total delay is rounded to
+          whole steps; a negative total becomes 0.
         - ``JOINT.stiffness`` and ``JOINT.damping``: relative changes from the nominal values.
         - ``MODE.frequency`` and ``MODE.damping`` of flexible appendages and slosh: relative changes
           of the frequency and of the damping ratio.
@@ -132,8 +132,8 @@ def monte_carlo(
     duration : float, optional
         Simulated time [s]; by default the duration of the followed trajectory.
     seed : int
-        Random seed. The same seed gives the same draws, independent of the number of runs, workers
-        and chunks, and of other dispersions.
+        Random seed. The draws of a parameter depend only on the seed, not on the number of runs,
+        workers and chunks or on other dispersed parameters.
     goals : sequence of str, optional
         Conditions such as ``"attitude < 1 deg"``, see `Campaign.fraction`. The printed report and
         `plot_campaign` show the success rate of each goal with its confidence interval.
@@ -145,7 +145,7 @@ def monte_carlo(
         Width and confidence level of the interval for `until`. The report uses the same
         confidence level.
     executor, workers, threads, progress : optional
-        As in `sweep`. The workers of an executor must be able to import the policy's modules.
+        As in `sweep`. The workers of an executor must be able to import the modules of the policy.
     chunk : int, optional
         Number of runs per chunk: a multiple of 8, and a divisor of 256 if `until` is given.
     histories : int, optional
@@ -160,8 +160,8 @@ def monte_carlo(
         Whether to replace the file `out` if a call with different arguments wrote it. By default,
         such a file is not replaced, and a `FileError` is raised.
     engine : {"python", "compiled"}, optional
-        Engine that runs the loop. The default is the compiled engine if it supports these runs,
-        see `simulate`.
+        Engine that simulates the runs. The default is the compiled engine if it supports these
+        runs, see `simulate`.
     **options
         Options of `simulate`: x0, q0, v0, dt, method, project, sample, delay, limits, disturbance,
         target, frame, reference.
@@ -169,7 +169,8 @@ def monte_carlo(
     Returns
     -------
     Campaign
-        Runs in their order. If `out` is given, arrays are read from the file on demand.
+        Results in the order of the runs. If `out` is given, arrays are read from the file on
+        demand.
 
     Raises
     ------
@@ -297,8 +298,8 @@ def _earlier(path: Path, request: str) -> Campaign | None:
         if read_rows(path, verify=False)[2].get("request") == request:
             return Campaign.load(path)
     raise FileError(
-        f"{path} exists, and this call did not make it; name another file, or replace it with "
-        "overwrite=True (--force)"
+        f"{path} exists and was not written by this call; name another file, or replace the file "
+        "with overwrite=True (--force)"
     )
 
 
@@ -318,7 +319,9 @@ def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
         return chunk_size(min(_STAGE, runs) if staged else runs, workers)
     size = -(-given // LANES) * LANES
     if staged and _STAGE % size:
-        raise InputError(f"chunk is {given}, expected a divisor of {_STAGE} with until, such as 32")
+        raise InputError(
+            f"chunk is {given}, but with until it must be a divisor of {_STAGE}, such as 32"
+        )
     return size
 
 

@@ -34,8 +34,9 @@ def require_direction(robot: Robot, at: int) -> None:
     for item, names, first in _indexed(robot):
         if first <= at < first + len(names) and isinstance(item, JointTorque):
             raise InputError(
-                f"'{names[0]}.misalignment' is dispersed, but a motor acts along its joint's axis; "
-                "only thrusters, wheels, tau_b and F_b can be misaligned"
+                f"'{names[0]}.misalignment' is dispersed, but the motor of a joint cannot be "
+                "misaligned with the joint; only thrusters, wheels, tau_b and F_b can be "
+                "misaligned"
             )
 
 

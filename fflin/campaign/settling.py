@@ -248,7 +248,7 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
         raise InputError(f"the model of '{lin.robot}' has no states, so nothing can settle")
     if lin.moving or not lin.is_equilibrium() or lin.v.any():
         raise InputError(
-            "the operating point is not an equilibrium at rest, so its loop cannot settle there; "
+            "the operating point is not an equilibrium at rest, so the loop cannot settle there; "
             "linearise about an equilibrium"
         )
     if not loop.decay > 0.0:

@@ -65,8 +65,8 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        {name: spread}, the argument `dispersions` of `monte_carlo`. If a name or spread is not
-        valid for the robot, `monte_carlo` raises an error that names the file and the line.
+        Mapping {name: spread} for the argument `dispersions` of `monte_carlo`. If a name or spread
+        is not valid for the robot, `monte_carlo` raises an error that names the file and the line.
 
     Raises
     ------

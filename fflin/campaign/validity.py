@@ -77,7 +77,7 @@ class Validity(FrozenArrays):
     joint_unit : str
         "rad" or "m" if all joints have this unit, otherwise "rad|m".
     frame : str
-        Frame in whose axes base velocities and inputs are fed back.
+        Frame whose axes express the base velocities and inputs in the feedback.
 
     Examples
     --------
@@ -120,17 +120,17 @@ class Validity(FrozenArrays):
         order = "the order of the error cannot be determined"
         if np.isfinite(self.slope):
             order = f"the error grows with the displacement to the power {self.slope:.3f}"
-        beyond = " and beyond" if self.trusted == self.largest else ""
+        beyond = ", the largest displacement tested" if self.trusted == self.largest else ""
         first = shown(_scaled(self.largest, float(self.sampled[0])), self.joint_unit)
         lines = [
             f"{self.robot}: the linear loop predicts the nonlinear loop within "
             f"{100.0 * TRUSTED:g} % up to {trusted}{beyond}; {order}",
-            f"every run settled up to {holds}: {self.inside} of {self.inside} runs, "
-            f"so at least {100.0 * self.inside_rate:.1f} % settle there ({sure} confidence)"
+            f"up to {holds}, every run settled ({self.inside} of {self.inside}), so at least "
+            f"{100.0 * self.inside_rate:.1f} % of such displacements settle ({sure} confidence)"
             if self.inside
             else f"the run from the smallest displacement tried, {first}, did not settle",
-            f"up to {largest}: {self.settled} of {count} runs settled, "
-            f"so {100.0 * low:.1f} to {100.0 * high:.1f} % settle there ({sure} confidence)"
+            f"up to {largest}, {self.settled} of {count} runs settled, so {100.0 * low:.1f} to "
+            f"{100.0 * high:.1f} % of such displacements settle ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]
         return folded(lines)
@@ -163,14 +163,15 @@ def validity(
 ) -> Validity:
     """Find displacements up to which a linear model predicts the motion and its loop settles.
 
-    The nonlinear robot is simulated under ``u = u0 - K (x - x0)``, held between samples if the
-    model is sampled. All runs start from a displaced configuration and the velocity of the
-    operating point. There are two sets of runs:
+    The nonlinear robot is simulated under the feedback ``u = u0 - K (x - x0)``; if the model is
+    sampled, u is held between samples. All runs start from a displaced configuration and the
+    velocity of the operating point. There are two sets of runs:
 
-    - Displacements of growing size, to compare the motion with the linear prediction.
-    - Random displacements. A run has settled if its error falls to a thousandth of its initial
-      value within the allowed time. The allowed time is three times the settling time of the
-      slowest mode of the linear loop.
+    - Runs from displacements of growing size show how far the motion departs from the linear
+      prediction.
+    - Runs from random displacements show whether the loop settles. A run has settled if its error
+      falls to a thousandth of its initial value within the allowed time. The allowed time is three
+      times the settling time of the slowest mode of the linear loop.
 
     If numba is installed, the compiled loop computes eight runs at a time.
 
@@ -183,9 +184,9 @@ def validity(
     gain : Gain or array_like (nu, nx)
         Gain K, which must stabilise the linear loop.
     attitude, position, joint : float
-        Largest displacement of the base [deg] and [m], and of the most displaced joint [rad|m]. A
-        state that is missing from a reduced model, or that the gain does not regulate, is not
-        displaced; its displacement is reported as 0.
+        Largest displacements to test: of the base attitude [deg], of the base position [m] and of
+        the most displaced joint [rad|m]. A state that is missing from a reduced model, or that the
+        gain does not regulate, is not displaced; its displacement is reported as 0.
     samples, seed : int
         Number of random runs, and random seed. The same seed gives the same result for any executor
         or number of workers.
@@ -205,10 +206,14 @@ def validity(
     Raises
     ------
     InputError
-        If the linear loop is unstable, the operating point is not an equilibrium, the poles are so
-        far apart that a run takes a million steps, or an argument has a wrong size or value.
+        If one of these conditions is true:
+
+        - the linear loop is unstable;
+        - the operating point is not an equilibrium;
+        - the poles are so far apart that a run would take a million steps;
+        - an argument has a wrong size or value.
     FflinError
-        If a worker process died.
+        If a worker process dies.
 
     References
     ----------

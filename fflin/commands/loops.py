@@ -21,11 +21,13 @@ from fflin.commands.points import (
     velocity_of,
 )
 from fflin.commands.regulator import (
+    add_allocation,
     add_trajectory,
     add_weights,
     gain_of,
     models_along,
     regulated_part,
+    robot_of_design,
     schedule_of,
     weights_of,
 )
@@ -127,13 +129,7 @@ def _add_controllers(group: parser.Group) -> None:
         "--negative-feedback",
         "apply the controller of --controller with negative feedback, u - u0 = -K (y - y0)",
     )
-    group.yes_or_no(
-        "--allocate",
-        "design the regulator with base torque and force as inputs, and allocate its commands to "
-        "the thrusters, which produce the nearest possible wrench. Allocation is the default if "
-        "the thrusters can push in every direction. With --no-allocate, the regulator commands "
-        "each thruster itself, and negative thrust is cut at zero",
-    )
+    add_allocation(group)
     group.switch(
         "--mpc",
         "use model predictive control (MPC) with the limits of the robot; MPC requires --sample",
@@ -214,7 +210,6 @@ def about_point(
     robot: Robot, arguments: argparse.Namespace
 ) -> tuple[Feedback | Allocation, Any, LinearModel | None]:
     """Return the policy, its feedback, and the model that predicts every row."""
-    from fflin.control.authority import thrusters_give_every_wrench
     from fflin.control.linear_controller import LinearController
     from fflin.control.policies import Allocation, StateFeedback
 
@@ -223,9 +218,6 @@ def about_point(
         names = ("allocate", "gain", "controller", "reduce")
         refuse(arguments, names, "--mpc replaces the regulator and its options")
         arguments.allocate = False
-    allocate = (
-        thrusters_give_every_wrench(robot) if arguments.allocate is None else arguments.allocate
-    )
     if arguments.gain:
         from fflin.control.gain import Gain
 
@@ -235,13 +227,10 @@ def about_point(
             "the file of --gain already contains the weights and the operating point of the design",
         )
         gain = Gain.load(arguments.gain)
-        # A gain designed for the motors and thrusters needs no allocation of a wrench.
-        if arguments.allocate is None:
-            allocate = allocate and "tau_b.x" in gain.input_names
-        design = _without_thrusters(robot) if allocate else robot
+        design = robot_of_design(robot, arguments.allocate, gain)
         lin = _about_gain(design, gain, arguments)
     else:
-        design = _without_thrusters(robot) if allocate else robot
+        design = robot_of_design(robot, arguments.allocate)
         lin = _about_target(design, arguments)
     if arguments.controller:
         refuse(
@@ -254,9 +243,9 @@ def about_point(
     elif arguments.mpc:
         feedback = _mpc(lin, arguments)
     else:
-        gain = gain or gain_of(lin, arguments)
+        gain = gain or gain_of(lin, arguments, allocated=design is not robot)
         feedback = StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
-    if allocate:
+    if design is not robot:
         return Allocation(feedback, design), feedback, None
     return feedback, feedback, None if arguments.reduce else lin
 
@@ -293,7 +282,7 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
         poses,
         "the simulation starts on the trajectory, and only --offset displaces the start from it",
     )
-    design = _without_thrusters(robot) if arguments.allocate else robot
+    design = robot_of_design(robot, bool(arguments.allocate))
     if arguments.schedule is None:
         models = models_along(arguments, design)
         policy = TrajectoryFeedback(models, schedule_of(models, arguments))
@@ -338,21 +327,6 @@ def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> Linea
     if number := arguments.relative_equilibrium:
         q, reference = attitude(robot, q, number, gain.frame)
     return linearize(robot, q, v, gain.u0, frame=gain.frame, reference=reference)
-
-
-def _without_thrusters(robot: Robot) -> Robot:
-    from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
-
-    others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
-    if len(others) == len(robot.inputs):
-        raise InputError(
-            f"--allocate: '{robot.name}' has no thrusters; give --inputs with thrusters"
-        )
-    missing = [
-        kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)
-    ]
-    base = tuple(kind() for kind in missing)
-    return robot.replace(inputs=(*base, *others))
 
 
 def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:

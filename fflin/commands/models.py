@@ -291,7 +291,7 @@ def inputs_report(robot: Robot) -> str:
     for name, unit in zip(acting.names, acting.units, strict=True):
         ends = limits.get(name, (-math.inf, math.inf))
         rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
-    return grid(cut(rows, "see linearize -o"), "ll")
+    return grid(cut(rows, "see --json"), "ll")
 
 
 def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:

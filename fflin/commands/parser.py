@@ -80,6 +80,7 @@ class OutputFile:
 
 RECORD, TABLE = OutputFile((".npz", ".mat", ".json")), OutputFile((".npz", ".mat", ".json", ".csv"))
 ROWS, FIGURE = OutputFile((".npz", ".h5")), OutputFile((".png", ".pdf", ".svg"))
+RUNS = OutputFile((".npz", ".h5", ".csv", ".mat"))
 PAGE, PICTURE, ANIMATION = (OutputFile((f".{ending}",)) for ending in ("html", "png", "gif"))
 
 

@@ -136,20 +136,24 @@ def placed(
     return q
 
 
-def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
-    """Return the robot and its linear model about the given point."""
+def linear_model(
+    arguments: argparse.Namespace, robot: Robot | None = None
+) -> tuple[Robot, LinearModel]:
+    """Return the robot, by default as given, and its linear model about the given point."""
     from fflin.linear.linearization import linearize
 
-    robot, q, v, reference = point_of(arguments)
+    robot, q, v, reference = point_of(arguments, robot)
     q, u, reference = held_at(robot, q, v, arguments, reference)
     return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
 
 
-def point_of(arguments: argparse.Namespace) -> tuple[Robot, Array, Array | None, pin.SE3 | None]:
+def point_of(
+    arguments: argparse.Namespace, robot: Robot | None = None
+) -> tuple[Robot, Array, Array | None, pin.SE3 | None]:
     """Return the robot, q (nq,), v (nv,) and the reference of the given point."""
     import pinocchio as pin
 
-    robot = load_robot(arguments)
+    robot = robot or load_robot(arguments)
     q = configuration_of(robot, arguments, robot.point)
     v = velocity_of(robot, arguments, robot.point, "velocity")
     refuse_pose(arguments)

@@ -8,8 +8,8 @@ from pathlib import Path
 from fflin.base.errors import InputError
 from fflin.commands import options, parser
 from fflin.commands.loops import along
-from fflin.commands.points import limits_of_options, linear_model, load_robot, once
-from fflin.commands.regulator import add_trajectory, add_weights, gain_of, regulated_part
+from fflin.commands.points import limits_of_options, load_robot, once
+from fflin.commands.regulator import add_allocation, add_trajectory, add_weights, designed
 from fflin.commands.results import Report, figure_of
 
 _ERRORS = "attitude [deg], position [m], joints, omega_b, v_b or joint rates"
@@ -39,6 +39,7 @@ def _add_validity(commands: parser.Commands) -> None:
     )
     options.add_point(validity)
     add_weights(validity)
+    add_allocation(validity.group(parser.CONTROLLER))
     runs = validity.group("runs")
     runs.add("--attitude", "largest rotation of the base [deg]", float, "X", default=90.0)
     runs.add("--offset", "largest displacement of the base [m]", float, "X", default=0.5)
@@ -101,14 +102,12 @@ def _validity(arguments: argparse.Namespace) -> Report:
     from fflin.base.process import Progress
     from fflin.campaign.validity import validity
 
-    robot, lin = linear_model(arguments)
-    lin = regulated_part(lin, arguments)
-    gain = gain_of(lin, arguments)
+    robot, design, lin, gain = designed(arguments)
     judged = lin.discretize(arguments.sample) if arguments.sample else lin
     bar, cut = Progress(), arguments.limits == "urdf"
     try:
         found = validity(
-            robot,
+            design,
             judged,
             gain,
             attitude=arguments.attitude,
@@ -125,6 +124,8 @@ def _validity(arguments: argparse.Namespace) -> Report:
     text = str(found)
     if cut or any(name in lin.limits for name in lin.input_names):
         text += "\ninputs were " + ("saturated at the limits of the robot" if cut else _FREE)
+    if design is not robot:
+        text += "\nan ideal torque and force on the base replace the thrusters (--no-allocate)"
     return Report(robot.name, found, text, {arguments.plot: figure_of("plot_validity", found)})
 
 

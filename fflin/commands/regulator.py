@@ -9,7 +9,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityError
+from fflin.base.errors import (
+    EquilibriumError,
+    FflinWarning,
+    InputError,
+    StabilizabilityError,
+    UnknownNameError,
+)
+from fflin.base.tables import folded
 from fflin.commands import DONE, FELL_SHORT, options, parser
 from fflin.commands.points import linear_model, load_robot, once, refuse
 from fflin.commands.results import Report, figure_of
@@ -17,6 +24,7 @@ from fflin.commands.results import Report, figure_of
 if TYPE_CHECKING:
     from fflin.control.gain import Gain
     from fflin.control.gain_schedule import GainSchedule
+    from fflin.control.kalman import Compensator
     from fflin.linear.check import Check
     from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
@@ -42,6 +50,7 @@ def _add_lqr(commands: parser.Commands) -> None:
     )
     options.add_point(lqr)
     add_weights(lqr)
+    add_allocation(lqr.group(parser.CONTROLLER))
     options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD, "Gain")
     options.add_figure(lqr, "the poles, the loop gain of each input and the stability margins")
 
@@ -159,6 +168,52 @@ def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
     )
 
 
+def add_allocation(group: parser.Group) -> None:
+    """Add --allocate and --no-allocate."""
+    group.yes_or_no(
+        "--allocate",
+        "design the regulator with base torque and force as inputs, and allocate its commands to "
+        "the thrusters, which produce the nearest possible wrench. Allocation is the default if "
+        "the thrusters can push in every direction. With --no-allocate, the regulator commands "
+        "each thruster itself, and negative thrust is cut at zero",
+    )
+
+
+def robot_of_design(
+    robot: Robot, allocate: bool | None, law: Gain | GainSchedule | Compensator | None = None
+) -> Robot:
+    """Return the robot of a design: with allocation, base torque and force replace the thrusters.
+
+    By default, thrusters that push in every direction are allocated, unless a law from a file was
+    designed for other inputs.
+    """
+    from fflin.control.authority import thrusters_give_every_wrench
+    from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
+
+    if allocate is None:
+        of_wrench = law is None or "tau_b.x" in law.input_names
+        allocate = of_wrench and thrusters_give_every_wrench(robot)
+    if not allocate:
+        return robot
+    others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
+    if len(others) == len(robot.inputs):
+        raise InputError(
+            f"--allocate: '{robot.name}' has no thrusters; give --inputs with thrusters"
+        )
+    missing = [
+        kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)
+    ]
+    return robot.replace(inputs=(*(kind() for kind in missing), *others))
+
+
+def designed(arguments: argparse.Namespace) -> tuple[Robot, Robot, LinearModel, Gain]:
+    """Return the robot, the robot of the design, the model to be regulated, and the regulator."""
+    robot = load_robot(arguments)
+    design = robot_of_design(robot, arguments.allocate)
+    lin = regulated_part(linear_model(arguments, design)[1], arguments)
+    return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
+
+
 def weights_of(arguments: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Return the weights of --q, --r and --bryson; nothing if none of them is given."""
     names = ("q", "r", "bryson")
@@ -175,7 +230,7 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
     return momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
 
 
-def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
+def gain_of(lin: LinearModel, arguments: argparse.Namespace, *, allocated: bool = False) -> Gain:
     """Return the regulator of the weights; warn if its margins are small."""
     from fflin.control.gain import fragility, one_sided
     from fflin.control.lqr import lqr, require_fixed_point
@@ -197,6 +252,9 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
             gain = replace(lqr(lin, *weights, wheel_speeds=speeds), weights=rule)
         else:
             gain = lqr(lin, weights=arguments.weights, wheel_speeds=speeds)
+    except UnknownNameError as error:
+        hint = "; --no-allocate weights single thrusters" * allocated
+        raise UnknownNameError(f"{error}{hint}") from None
     except StabilizabilityError as error:
         hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
         raise StabilizabilityError(f"{error}{hint}") from None
@@ -205,13 +263,23 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     return gain
 
 
+_ALLOCATED = (
+    "allocation: tau_b and F_b are realised by the thrusters, in `fflin simulate --gain` too; "
+    "--no-allocate designs the thrusts themselves"
+)
+
+
 def _lqr(arguments: argparse.Namespace) -> Report:
-    _, lin = linear_model(arguments)
-    gain = gain_of(regulated_part(lin, arguments), arguments)
+    from fflin.base.record import record_of
+
+    robot, design, _, gain = designed(arguments)
     # The warnings are on the standard error output.
     text = "\n\n".join(x for x in str(gain).split("\n\n") if not x.startswith("warning: "))
+    if design is not robot:
+        text += f"\n\n{folded([_ALLOCATED])}"
     files = {arguments.output_file: gain.save, arguments.plot: figure_of("plot_loops", gain)}
-    return Report(gain.robot, gain, text, files)
+    result = {**record_of(gain), "margins": gain.margins, "allocated": design is not robot}
+    return Report(gain.robot, result, text, files)
 
 
 def _export(arguments: argparse.Namespace) -> Report:
@@ -226,10 +294,11 @@ def _export(arguments: argparse.Namespace) -> Report:
     with reading(arguments.file, "Gain, GainSchedule or Compensator"):
         kind = kinds[text(read_record(arguments.file)[0]["kind"])]
     law = kind.load(arguments.file)
+    robot = robot_of_design(load(arguments.robot), None, law) if arguments.robot else None
     folder = write_c(
         law,
         arguments.output_folder,
-        robot=load(arguments.robot) if arguments.robot else None,
+        robot=robot,
         limits=None if arguments.limits == "none" else arguments.limits,
         name=arguments.name,
         real=arguments.real,

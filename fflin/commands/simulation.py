@@ -6,8 +6,9 @@ import argparse
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import InputError
+from fflin.base.errors import FileError, InputError
 from fflin.base.names import chosen, input_keys
+from fflin.base.tables import folded
 from fflin.commands import DONE, FELL_SHORT, options, parser
 from fflin.commands.loops import add_loop, loop_of, target_of
 from fflin.commands.points import configuration_of, limits_of_options, load_robot, once, velocity_of
@@ -201,9 +202,12 @@ def _add_montecarlo(commands: parser.Commands) -> None:
     )
     shown.add("--worst", "list the K worst runs", parser.whole, "K", default=3)
     options.add_figure(montecarlo, "quantile bands over time, histograms and the worst runs")
-    what = "the runs (with .h5, the same command resumes after an interruption)"
+    what = (
+        "the runs (.csv and .mat are tables for other programs; with .h5, the same command resumes "
+        "after an interruption)"
+    )
     force = "replace the file of -o even if it contains the runs of another command"
-    options.add_output_file(shown, what, parser.ROWS)
+    options.add_output_file(shown, what, parser.RUNS)
     shown.switch("--force", force)
     add_pictures(montecarlo, "that plays the worst run")
 
@@ -212,8 +216,12 @@ def _montecarlo(arguments: argparse.Namespace) -> Report:
     from fflin.campaign.monte_carlo import monte_carlo
     from fflin.campaign.report import campaign_record, worst_runs
     from fflin.campaign.spreads import load_dispersions
+    from fflin.control.policies import bound
 
     path = arguments.output_file
+    is_table = path is not None and path.suffix in (".csv", ".mat")
+    if is_table and path.exists() and not arguments.force:
+        raise FileError(f"{path} already exists; give another file name, or add --force")
     dispersions = load_dispersions(arguments.dispersions)
     robot = load_robot(arguments)
     check_pictures(robot, arguments)
@@ -221,14 +229,17 @@ def _montecarlo(arguments: argparse.Namespace) -> Report:
     settings: dict[str, Any] = {name: getattr(arguments, name) for name in _PASSED} | loop.options
     settings |= {"goals": arguments.goal, "histories": _ROWS if arguments.plot else 0}
     with going_on(path, "runs") as progress:
-        settings |= {"progress": progress, "out": path}
+        settings |= {"progress": progress, "out": None if is_table else path}
         settings["overwrite"] = arguments.force
         campaign = monte_carlo(robot, loop.policy, dispersions, **settings)
     worst = cache(lambda: campaign.replay(campaign.worst(1)[0]))
     files = {
-        path: None,
+        path: campaign.save if is_table else None,
         arguments.plot: figure_of("plot_campaign", campaign),
         **pictures(robot, worst, arguments),
     }
-    text = "\n".join([str(campaign), *worst_runs(campaign, arguments.worst)])
-    return Report(robot.name, campaign_record(campaign, arguments.worst), text, files)
+    notes = getattr(bound(loop.policy, robot), "notes", ()) if loop.policy else ()
+    shown = [str(campaign), *(folded([note]) for note in notes)]
+    text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
+    result = {**campaign_record(campaign, arguments.worst), "notes": notes}
+    return Report(robot.name, result, text, files)

@@ -60,7 +60,7 @@ class Impact(FrozenArrays):
     momentum: Array
     momentum_after: Array
     event: str
-    # Of the robot that it was, just before.
+    # Robot, configuration and velocity just before the impact.
     _before: tuple[Robot, Array, Array] = field(kw_only=True)
 
     def __repr__(self) -> str:
@@ -98,14 +98,14 @@ def jam(
     ----------
     robot : Robot
     joints : str or sequence of str
-        Names of the joints to jam, or patterns. Mimic joints of a jammed joint are also jammed.
+        Names or patterns of the joints to jam. Mimic joints of a jammed joint are also jammed.
     q, v : array_like (nq,), (nv,), optional
         Configuration and velocity just before the impact; neutral and at rest by default.
 
     Returns
     -------
     Impact
-        Result of the impact. In its `robot`, the jammed joints are welded and have no inputs.
+        Result of the impact. The jammed joints of `Impact.robot` are welded and have no inputs.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def jam(
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> tuple[dict[str, Any], Array]:
-    """Return the fields of `Impact` for robots at q, v that become one (13.1), and the impulses."""
+    """Join robots at (q, v) to one (13.1); return the fields of `Impact`, and the impulses."""
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))
@@ -200,7 +200,7 @@ def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
 
 
 def joint_called(robot: Robot, name: str) -> Any:
-    """Return the joint of Pinocchio's model of that name."""
+    """Return the joint of Pinocchio's model with a name."""
     return robot.model.joints[robot.model.getJointId(name)]
 
 
@@ -268,8 +268,9 @@ def capture(
     robot. G is the Jacobian that maps the velocity of the combined robot to the velocities of robot
     and payload.
 
-    The solution is the projection of the velocities onto the motions that the rigid grasp permits,
-    orthogonal with respect to the inertia. The impact conserves linear and angular momentum.
+    The solution projects the velocities just before the impact onto the motions that the rigid
+    grasp permits. The projection is orthogonal with respect to the inertia matrix. The impact
+    conserves linear and angular momentum.
 
     Parameters
     ----------
@@ -290,7 +291,7 @@ def capture(
     payload_v : array_like (6,) or (nv,), optional
         Velocity of the payload; at rest by default. The first six entries are the twist of the
         payload's frame in its own axes (Pinocchio's LOCAL): linear [m/s], then angular [rad/s].
-        The joint rates of the payload follow.
+        The remaining entries are the joint rates of the payload.
     prefix : str
         Name of the payload's frame. The payload's joints and links are named PREFIX.NAME.
 
@@ -315,8 +316,8 @@ def capture(
 
     References
     ----------
-    The impact is a perfectly inelastic collision of two bodies. For the dynamics of a robot with
-    free joints, see Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
+    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989, for a robot with free
+    joints. The impact itself is the perfectly inelastic collision of two bodies.
 
     Examples
     --------
@@ -333,7 +334,7 @@ def capture(
         other = replace(alone, gravity=robot.gravity, orbit=robot.orbit)
     else:
         instance("payload", payload, Robot, "a pin.Inertia or a fflin.Robot").require_unchanged()
-        other = replace(payload)  # which may be the robot's twin, the same object
+        other = replace(payload)  # a copy, since the payload may be the same object as the robot
     for name in ("gravity", "orbit") if isinstance(payload, Robot) else ():
         own, theirs = (getattr(each, name) for each in (robot, other))
         if own != theirs:
@@ -361,7 +362,7 @@ def capture(
 
 
 def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:
-    """Return configuration and velocity of a payload whose base is at a placement."""
+    """Return the checked configuration and velocity of a payload with its base at a placement."""
     configuration = other.neutral() if q is None else other.checked_configuration(q).copy()
     root = other.model.jointPlacements[ROOT]
     configuration[:7] = pin.SE3ToXYZQUAT(root.actInv(at))

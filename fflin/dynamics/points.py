@@ -15,13 +15,13 @@ from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, by_joint
 from fflin.robot.robot import Robot
 
-LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
+LARGEST_SPEED = 1e50  # [rad/s|m/s], so that squares and their sums do not overflow
 
 
 def configuration(
     robot: Robot, joints: Mapping[str, float] | None = None, base: pin.SE3 | None = None
 ) -> Array:
-    """Return the Pinocchio configuration with the named joint values and base placement.
+    """Return the Pinocchio configuration for joint values given by name and a base placement.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def configuration(
 
 
 def require_slow(what: str, v: Array) -> None:
-    """Raise `InputError` if the square of a velocity overflows."""
+    """Raise `InputError` if a velocity exceeds `LARGEST_SPEED`."""
     if not np.abs(v).max(initial=0.0) < LARGEST_SPEED:
         raise InputError(
             f"{what} has an entry of {np.abs(v).max():.3g}, expected less than {LARGEST_SPEED:g} "
@@ -88,7 +88,7 @@ def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, An
 
 
 def start_of(robot: Robot) -> tuple[Array, Array]:
-    """Return the configuration (nq,) and velocity (nv,) at which a robot starts."""
+    """Return the initial configuration (nq,) and velocity (nv,) of a robot."""
     start = combined(robot.point, robot.start)
     q = configuration(robot, start.get("joints"), base_of(start))
     return q, velocity(robot, start.get("velocity", {}))
@@ -101,7 +101,7 @@ def point_of(
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:
-            raise InputError("x0 is given together with q0 or v0; give x0 alone, or q0 and v0")
+            raise InputError("x0 is given together with q0 or v0; give either x0, or q0 and v0")
         return state.to_pinocchio(x0)
     if q0 is None and v0 is None:
         return default()
@@ -110,7 +110,7 @@ def point_of(
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
-    """Return the Pinocchio velocity with the named joint rates and base velocities.
+    """Return the Pinocchio velocity for joint rates and base velocities given by name.
 
     Parameters
     ----------
@@ -144,13 +144,13 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     state = StateMap(robot)
     for name, _ in named_wheels(robot.inputs):
         if name in checked and name not in robot.joint_names:
-            robot.joint(name)  # says why it has no speed
+            robot.joint(name)  # its error says why the joint has no velocity
     rates = rates_by_name(robot.joint_names, checked)
     return state.spread(np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]]))
 
 
 def effort(robot: Robot, values: Mapping[str, float]) -> Array:
-    """Return the input vector u with the named values.
+    """Return the input vector u for values given by name.
 
     Parameters
     ----------

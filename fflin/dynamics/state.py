@@ -21,23 +21,23 @@ class StateMap:
 
     The state is :math:`X = (q_b, r_b, q_m, \omega_b, v_b, \dot q_m)` of dimension 12 + 2n. The base
     placement relative to the reference is :math:`{}^{ref}M_b = {}^oM_{ref}^{-1}\,{}^oM_b`. Its
-    translation is r_b, and the vector part of its unit quaternion is q_b. The sign of the
-    quaternion is chosen such that the scalar part is not negative.
+    translation is r_b, and the vector part of its unit quaternion is q_b. Of the two quaternions
+    of an attitude, the one with a scalar part of at least 0 is used.
 
     Parameters
     ----------
     robot : Robot
     reference : pin.SE3, optional
-        Placement oMref of the reference frame, in which the state gives the attitude and position
-        of the base; the identity by default.
+        Placement oMref relative to which the attitude and position of the base are measured; the
+        identity by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
         Axes of the angular velocity omega_b of the base and of the velocity v_b of its origin:
 
         - hybrid (default): omega_b in base axes, v_b = d r_b/dt in reference axes;
         - local: omega_b and v_b in base axes;
         - world: omega_b and v_b in reference axes;
-        - lvlh (default in orbit) or hill: the same axes as hybrid, for a robot in orbit only. The
-          world of Pinocchio is then the orbital frame with this name.
+        - lvlh (default in orbit) or hill: the same axes as hybrid, for a robot in orbit only.
+          Pinocchio's world is then the orbital frame, with the axes lvlh or hill.
 
     Attributes
     ----------
@@ -50,8 +50,8 @@ class StateMap:
     axes : tuple of bool
         Whether omega_b is in reference axes, and whether v_b is in reference axes.
     in_reference : tuple of slice
-        Rows in reference axes of a vector nu = (omega_b, v_b, qdot_m), or of a wrench in the same
-        order.
+        Slices of nu = (omega_b, v_b, qdot_m), or of generalised forces in the same order, whose
+        components are in reference axes.
     S : ndarray (nv, 6 + n) or None
         Matrix S of v = S nu, with nu = (omega_b, v_b, qdot_m) in base axes, if the robot has mimic
         joints or modes. Otherwise S is None, because v is only a permutation of nu.
@@ -93,7 +93,7 @@ class StateMap:
         self.frame = names.frame_of(robot, frame)
         self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
-        # The field of the robot's orbit, if it has one.
+        # Acceleration field of the robot's orbit, or None.
         self.field = OrbitField(robot, self.frame) if robot.orbit else None
         self.nx = 12 + 2 * n
         self.groups = names.Groups(
@@ -106,16 +106,16 @@ class StateMap:
         )
         self.names, self.units = zip(*names.state_units(robot).items(), strict=True)
         joints = robot.joints
-        # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
+        # Index in Pinocchio's v of each velocity of the state.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
-        # And back; what a joint that mimics another has is written after.
+        # The inverse map. Entries of mimic joints are written afterwards (`spread`).
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
-        # Entry of v for a unit of each velocity of the state: 1, but for modal amplitudes.
+        # Pinocchio's v per unit of each velocity of the state: 1 except for modal amplitudes.
         self._scale = np.array([1.0] * 6 + [joint.scale for joint in joints])
         self._scaled = bool((self._scale != 1.0).any())
-        # v = S nu; where no joint mimics another and none is scaled S is the permutation above.
+        # S of v = S nu; None if S is the permutation `_order` (no mimic joints and no scaling).
         self.S: Array | None = None
         if robot.followers or self._scaled:
             self.S = np.column_stack([self.spread(e) for e in np.eye(6 + n)])
@@ -125,7 +125,7 @@ class StateMap:
         self._sin = self._cos + 1
         root = robot.model.jointPlacements[ROOT].rotation
         self._gravity, self._pulled = root.T @ np.array(robot.gravity), any(robot.gravity)
-        # Whether anything accelerates the base's origin against the reference.
+        # Whether gravity or an orbit accelerates the base's origin relative to the reference.
         self.falls = self._pulled or robot.orbit is not None
         self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
 
@@ -137,8 +137,8 @@ class StateMap:
 
     def _refer(self, oMref: pin.SE3) -> None:
         self._reference = oMref
-        # The free-flyer joint may itself stand somewhere in the world. Composed as quaternions:
-        # their entries survive to the last digit near a turn of pi.
+        # The model may place its free-flyer joint away from the world's origin. Rotations are
+        # composed as quaternions, which stay accurate to machine precision near 180 deg.
         offset = pin.SE3ToXYZQUAT(oMref.actInv(self.robot.model.jointPlacements[ROOT]))
         self._position, self.origin_quaternion = offset[:3], offset[3:]
         self._rotation = turning.rotation_matrix(self.origin_quaternion)
@@ -175,11 +175,11 @@ class StateMap:
         return chart
 
     def charts(self, q: Array) -> Chart:
-        """Return the attitude charts at valid configurations q (.., nq), for any base attitude."""
+        """Return the attitude charts at valid q (.., nq), without the check against 180 deg."""
         return Chart.of(q[..., 3:7] @ turning.product_matrix(self.origin_quaternion).T)
 
     def rotation(self, q: Array) -> Array:
-        """Return the rotation matrix (3, 3) of refMb at a valid configuration.
+        """Return the rotation matrix (3, 3) of the base relative to the reference, at a valid q.
 
         Unlike the chart, the rotation matrix is regular at an attitude 180 deg from the reference.
         """
@@ -197,7 +197,7 @@ class StateMap:
     def scalar(self, q: Array) -> float:
         """Return the scalar part q0 of the base quaternion relative to the reference.
 
-        The sign of q0 follows from the sign of the quaternion in the valid configuration q (nq,).
+        The sign of q0 changes with the sign of the quaternion in the valid configuration q (nq,).
         """
         return float(turning.quaternion_product(self.origin_quaternion, q[3:7])[3])
 
@@ -209,7 +209,8 @@ class StateMap:
         q : array_like (nq,)
             Configuration.
         v : array_like (nv,)
-            Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
+            Velocity in Pinocchio's order: linear and angular velocity of the base in base axes,
+            then joint rates.
         near : array_like (nx,), optional
             State for unwrapping the angles of continuous joints: each angle is shifted by the
             multiple of 2 pi that brings it closest to its value in `near`. By default, the angles
@@ -233,13 +234,13 @@ class StateMap:
         return self.read(q, v, near=near)
 
     def read(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
-        """Return the same state as `to_state`, but without checking the arguments."""
+        """Return the same state as `to_state`, without checking the arguments."""
         q_m, nu = self.joint_positions(q), self.velocities(v)
         x = self.compose(self.chart(q), self.positions(q), q_m, nu)
         return x if near is None else names.unwound(self, x, near)
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
-        """Return the state (.., nx) from its parts, with velocities nu (.., 6 + n) in base axes."""
+        """Assemble the state (.., nx) from parts; velocities nu (.., 6 + n) are in base axes."""
         in_frame = nu
         if not chart.standing:
             in_frame = self.to_frame(chart, nu[..., None])[..., 0]

@@ -55,12 +55,13 @@ class CLaw:
     frame : str
         Axes of the inputs on the base, as in `LinearModel`.
     origin : pin.SE3 or None
-        Reference placement of the state and of the inputs on the base.
+        Placement relative to which the state and the inputs on the base are measured.
 
     Raises
     ------
     FileError
-        If the folder contains no law, or several laws without `name`, or the files were edited.
+        If the folder contains no law, contains several laws and `name` is omitted, or contains
+        edited files.
     MissingPackageError
         If there is no C compiler.
     InputError
@@ -89,8 +90,8 @@ class CLaw:
         ]
         if len(found) != 1:
             raise FileError(
-                f"{source}: contains {len(found)} pairs of .json and .c, expected one pair that "
-                "fflin.write_c wrote; if there are several laws, choose one with name="
+                f"{source}: contains {len(found)} pairs of .json and .c files, expected one pair "
+                "that fflin.write_c wrote; if there are several pairs, choose one with name="
             )
         [self.name] = found
         about, header, code = (source / f"{self.name}.{end}" for end in ("json", "h", "c"))
@@ -130,7 +131,7 @@ class CLaw:
         Raises
         ------
         InputError
-            If the states, inputs or outputs of the robot differ from the C code.
+            If the robot and the C code have different states, inputs or outputs.
         """
         made = f"the C code '{self.name}' was made from the {self._about['title']}"
         state = StateMap(robot, reference=self.origin, frame=self.frame)
@@ -220,4 +221,4 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
         try:
             return ctypes.CDLL(str(library))
         except OSError as error:
-            raise InputError(f"'{compiler}' made no library of {source}: {error}") from None
+            raise InputError(f"'{compiler}' made no library from {source}: {error}") from None

@@ -56,8 +56,8 @@ def write_c(
     Parameters
     ----------
     law : Gain, StateFeedback, ScheduledFeedback, OutputFeedback, LinearController or GainSchedule
-        Control law, which may also be a `Compensator` or `TrajectoryFeedback`. A controller, or
-        gains along a trajectory, must be in discrete time.
+        Control law; a `Compensator` or `TrajectoryFeedback` is also accepted. Controllers and gains
+        along a trajectory must be in discrete time.
     folder : path
         Folder for the files; created if it does not exist. Existing files with the same names are
         replaced only if they were written for the same type of law and the same robot.
@@ -275,7 +275,9 @@ class _Texts:
             with np.errstate(over="ignore"):
                 narrow = values.astype(np.float32)
             if (np.isfinite(values) & ~np.isfinite(narrow)).any():
-                raise InputError("the law has numbers too large for a float; take real='double'")
+                raise InputError(
+                    "the law has numbers that are too large for a float; use real='double'"
+                )
             values = narrow.astype(float)
         end = "F" if self.real == "float" else ""
         shown = ", ".join(f"{x!r}{end}" for x in values.tolist())

@@ -69,7 +69,7 @@ _LOOSEST = 1e-2
 
 @dataclass(frozen=True)
 class Check:
-    """Result of `check`: the errors of a linear model; prints as a table.
+    """Result of `check`: the errors of a linear model; ``print`` shows a table.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Check:
 
     @property
     def ok(self) -> bool:
-        """Whether no error exceeds its tolerance."""
+        """Whether all errors are within their tolerances."""
         return all(row.ok for row in self.rows)
 
     @property
@@ -133,7 +133,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     - Pinocchio's ABA derivatives, mapped into the attitude chart of the model (relative tolerance
       1e-9);
     - sixth-order central differences of the nonlinear model :math:`\dot x = f(x, u)` in the same
-      chart (relative tolerance 1e-8). The function f is itself compared with integrated motions.
+      chart (relative tolerance 1e-8). The function f is itself verified against integrated motions.
 
     For an ill-conditioned inertia matrix M, the tolerances are larger, because round-off errors
     grow with the condition number of M.
@@ -151,7 +151,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     Returns
     -------
     Check
-        Result, which prints as a table; ``ok`` is True if no error exceeds its tolerance.
+        Result, in which ``ok`` is True if no error exceeds its tolerance.
 
     Raises
     ------

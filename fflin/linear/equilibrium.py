@@ -36,10 +36,10 @@ class Equilibrium(FrozenArrays):
     Attributes
     ----------
     q : ndarray (nq,)
-        Equilibrium configuration, for the argument q of `linearize`. This configuration differs
-        from the given configuration by the spring deflections of joints without a motor.
+        Equilibrium configuration, to be given to `linearize` as q. This configuration differs from
+        the given configuration by the spring deflections of joints without a motor.
     u : ndarray (nu,)
-        Minimum-norm inputs, for the argument u of `linearize`.
+        Minimum-norm inputs, to be given to `linearize` as u.
     sag : ndarray (n,)
         Deflection of each joint from its given position [rad | m].
     residual : ndarray (6 + n,)
@@ -58,7 +58,7 @@ class Equilibrium(FrozenArrays):
     >>> soft = fflin.load("planar_detumble", passive=["joint_1"], stiffness={"joint_1": 50.0})
     >>> print(fflin.equilibrium(soft, fflin.configuration(soft, {"joint_1": 0.2})))
     u: all zero
-    sags: joint_1 = -0.2 rad
+    deflections: joint_1 = -0.2 rad
     """
 
     q: Array
@@ -80,7 +80,7 @@ class Equilibrium(FrozenArrays):
             return said
         names = [name.partition(".")[2] for name in self.force_names[6:]]
         units = ["m" if unit == "N" else "rad" for unit in self.force_units[6:]]
-        return f"{said}\n{signals('sags', shown, names, units)}"
+        return f"{said}\n{signals('deflections', shown, names, units)}"
 
 
 def equilibrium(
@@ -93,10 +93,10 @@ def equilibrium(
 ) -> Equilibrium:
     r"""Compute the spring deflections and the minimum-norm inputs that balance all forces.
 
-    The forces are the same as in `linearize`: springs, gravity, dampers, and the inertial forces of
-    a steady motion. In orbit, the base is at rest in the rotating orbital frame, and the forces
-    include the gravity gradient and the inertial forces of this frame. To find attitudes at which
-    the base needs no torque in orbit, use `relative_equilibria`.
+    The balanced forces are the forces that `linearize` also includes: springs, gravity, dampers,
+    and the inertial forces of a steady motion. In orbit, the base is at rest in the rotating
+    orbital frame, and the forces include the gravity gradient and the inertial forces of this
+    frame. To find attitudes at which the base needs no torque in orbit, use `relative_equilibria`.
 
     Let f be the generalised forces on the robot without the inputs u, and B the matrix from u to
     generalised forces. The inputs solve
@@ -132,8 +132,9 @@ def equilibrium(
     Returns
     -------
     Equilibrium
-        Result with q and u for ``linearize(robot, result.q, v, u=result.u)``, which needs the same
-        `frame` and `reference`.
+        Result whose q and u define the operating point of
+        ``linearize(robot, result.q, v, u=result.u)``. Give `linearize` the same `frame` and
+        `reference`.
 
     Raises
     ------
@@ -150,9 +151,9 @@ def equilibrium(
 
     Notes
     -----
-    If the robot has thrusters, the minimisation is a least-distance problem because of the bounds.
-    Non-negative least squares solve this problem exactly (C. Lawson and R. Hanson, Solving Least
-    Squares Problems, 1974, chapter 23).
+    The bounds of thrusters turn the minimisation into a least-distance problem, which non-negative
+    least squares solve exactly (Lawson and Hanson, Solving Least Squares Problems, 1974,
+    chapter 23).
 
     Examples
     --------
@@ -242,14 +243,16 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
     orbiting, (turns, moves) = lin.frame in ORBITAL, np.abs(drift[:6]).reshape(2, 3).max(axis=1)
     if moving:
         reason = (
-            f"joints move, {listed(moving)}. Only rotors may move: joints whose link is symmetric "
-            "about the axis and carries nothing. Set the other joint rates to 0"
+            f"joints move ({listed(moving)}), but only rotors may move, which are joints whose "
+            "link is symmetric about the axis and carries nothing; set all other joint rates to "
+            "0"
         )
     elif orbiting and max(turns, moves) > TOLERANCE:
-        reason = "its base moves in the orbit's frame; leave out the velocity of the base"
+        reason = "the base moves in the orbital frame; remove the velocity of the base"
     elif not orbiting and "q_b.x" not in lin.ignorable and turns > TOLERANCE:
         reason = (
-            "under gravity its base may rotate about the vertical only; change its angular velocity"
+            "under gravity, the base may rotate only about the vertical; change the angular "
+            "velocity of the base"
         )
     else:
         return
@@ -280,8 +283,8 @@ def _unbalanced(
     ]
     return EquilibriumError(
         f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
-        f"forces: {listed(left)}; add inputs that balance them (thrusters only push), or choose "
-        "another point"
+        f"forces: {listed(left)}; add inputs that balance these forces (thrusters cannot pull), "
+        "or choose another point"
     )
 
 

@@ -28,8 +28,8 @@ class ToolModel(StateSpace, Design):
     r"""Linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The state x consists of the tool's q and v. If the tool's q is on a manifold (mujoco, pinocchio,
-    spart), x contains instead of q its difference from the operating point, a tangent vector in the
-    order of v.
+    spart), x contains a tangent vector instead of q: the difference of q from the operating point,
+    in the order of v.
 
     Attributes
     ----------
@@ -40,8 +40,8 @@ class ToolModel(StateSpace, Design):
     T : ndarray (nx, 12 + 2n)
         Matrix from state deviations of the `LinearModel` to deviations of x.
     T_left : ndarray (12 + 2n, nx)
-        Inverse of T; only a left inverse if x contains a quaternion of four entries or mimic
-        joints, because x then has more entries than the state of the `LinearModel`.
+        Inverse of T. If x contains a quaternion of four entries or mimic joints, x has more entries
+        than the state of the `LinearModel`, so `T_left` is only a left inverse.
     T_u : ndarray (nu, nu)
         Matrix from input deviations of the `LinearModel` to input deviations of the tool. For a
         gain K of the `LinearModel`, the gain in the tool's coordinates is ``T_u @ K @ T_left``.
@@ -84,7 +84,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     .. math:: A' = (T A + \dot T)\,T^+ + \ldots, \qquad B' = T B\,T_u^{-1}
 
     :math:`T^+` is the left inverse of T. The omitted terms account for inputs in other axes and for
-    the length of a quaternion; equations (15.1) to (15.6) of docs/derivation.md contain them.
+    the length of a quaternion; (15.1) to (15.6) of docs/derivation.md give them in full.
     docs/guide/tools.md compares the conventions of the tools.
 
     Parameters
@@ -98,7 +98,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     dt : float, optional
         Time step [s] of MuJoCo; only for "mujoco". If `dt` is given, A and B are the discrete-time
         matrices that ``mjd_transitionFD`` returns for the Euler integrator. If the robot has
-        dampers, these matrices agree only if ``eulerdamp`` is disabled in MuJoCo.
+        dampers, disable ``eulerdamp`` in MuJoCo, because its matrices otherwise differ.
 
     Returns
     -------
@@ -218,8 +218,9 @@ def from_tool(
     tool, dt
         See `transform`; dt is the time step for which A and B were computed.
     q, v : array_like
-        Configuration and velocity in the tool's coordinates; v is zero by default. For "spart", q
-        consists of R0 (column by column), r0 and qm, and v consists of u0 and um.
+        Configuration and velocity in the tool's coordinates; v is zero by default. For "spart", in
+        SPART's notation, q consists of R0 (column by column), r0 and qm, and v consists of u0 and
+        um.
     u : array_like (nu,), optional
         Inputs of the robot in the tool's order and axes; zero by default.
     A, B : array_like, optional
@@ -306,7 +307,7 @@ def _step(tool: str, dt: float | None) -> float:
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(
-            f"dt is {h:g} s for {tool}; only mujoco takes dt, a positive time step below 1000 s"
+            f"dt is {h:g} s for {tool}, but only mujoco has a dt, a positive time step below 1000 s"
         )
     return h
 

@@ -116,7 +116,7 @@ def _fields(entries: Record) -> dict[str, Any]:
     sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}
     units = {signal: len(fields[f"{signal}_units"]) for signal in _SIGNALS}
     if sizes != units:
-        raise ValueError("its signals differ in number from their units")
+        raise ValueError("the number of its signals differs from the number of their units")
     sizes |= {"velocity": sizes["state"] // 2, "coordinate": -1, "placement": 7}
     sizes |= {"drift": sizes["state"] if np.size(entries["drift"]) else 0}
     sizes |= {"limit": len(fields["limit_names"])}
@@ -294,7 +294,7 @@ def _require_inputs(known: Sequence[str], names: Any, count: int) -> None:
     if given == tuple(known):
         return
     missing, extra = ([n for n in a if n not in b] for a, b in ((known, given), (given, known)))
-    said = "the file has the inputs of the robot in another order"
+    said = "the file contains the inputs of the robot in another order"
     if not given:
         said = f"u has {count} columns, expected one for each input of the robot: {listed(known)}"
     elif missing or extra:
@@ -332,8 +332,8 @@ def _entries(columns: Record, state: StateMap) -> Record:
     """Return the entries that the named columns of a csv are."""
     if "t [s]" in columns:
         raise FileError(
-            "this is the table of a motion, expected a trajectory; save motion.trajectory() "
-            "instead, or save the motion as .npz, .mat or .json"
+            "this table contains a motion, expected a trajectory; save motion.trajectory() in "
+            "its place, or save the motion as .npz, .mat or .json"
         )
     inputs = Actuation(state).names
     rows = {key: [name for name in columns if name.startswith(f"{key}[")] for key in "qv"}

@@ -81,7 +81,8 @@ def outputs(
 ) -> Array:
     """Return the outputs y of a robot in the coordinates of a linear model.
 
-    - Attitudes are in the model's chart, for the sign of the quaternion with a scalar part q0 >= 0.
+    - Attitudes are in the model's chart. Of the two quaternions of an attitude, the one with a
+      scalar part q0 >= 0 is used.
     - Rotations of frames are relative to their attitudes at the operating point.
     - Angles of continuous joints are unwrapped to be nearest to their values at the operating
       point.
@@ -91,8 +92,8 @@ def outputs(
     Parameters
     ----------
     robot : Robot
-        Robot with the same states, inputs and outputs as the model. Its masses may differ from the
-        robot that was linearised.
+        Robot with the same states, inputs and outputs as the model. Its masses may differ from
+        those with which the model was computed.
     lin : LinearModel
         Model that defines the reference and the operating point.
     q, v : array_like (nq,), (nv,)
@@ -141,9 +142,9 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
     """Return the matrix K of a gain for another model, with states and inputs matched by name.
 
     Use `line_up` to keep a gain after a change of the robot, such as a jammed joint or a captured
-    payload, which leaves most states the same. If the model has a state or an input that the gain
-    lacks, this column or row of K is zero. If the gain has a state or an input that the model
-    lacks, this column or row is dropped.
+    payload, which leaves most states the same. Columns of K belong to states, and rows to inputs.
+    If the gain lacks a state or an input of the model, the column or row is zero. If the model
+    lacks a state or an input of the gain, the column or row is dropped.
 
     Parameters
     ----------
@@ -187,8 +188,8 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
         if lacking and beside:
             raise InputError(
                 f"the model of '{lin.robot}' lacks the {kind} {lacking[0]} of the gain of "
-                f"'{gain.robot}', and the gain lacks its {kind} {beside[0]}; one of the two must "
-                f"have all {kind}s of the other"
+                f"'{gain.robot}', and the gain lacks the {kind} {beside[0]} of the model; either "
+                f"the model or the gain must have all {kind}s of the other"
             )
         common = [name for name in other if name in own]
         at.append(([other.index(name) for name in common], [own.index(name) for name in common]))

@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 class LinearTrajectory(Trajectory):
     r"""Error dynamics along a motion, ``d(dx)/dt = A(t) dx + B(t) du``, ``dy = C dx + D du``.
 
-    The errors dx and du are the differences from the motion. The error dx is in the axes of the
-    moving base, see `Linearizer` (``moving=True``). Torques and forces on the base in du are also
-    in base axes. If ``dt`` is positive, the model is in discrete time: the left side of the first
-    equation is the error dx at the next knot. For a LinearTrajectory ``along``, ``along[k]`` is the
-    linear model at knot k.
+    The errors dx and du are the deviations of state and inputs from the motion. The error dx is in
+    the axes of the moving base, see `Linearizer` (``moving=True``). Torques and forces on the base
+    in du are also in base axes. If ``dt`` is positive, the model is in discrete time: the left side
+    of the first equation is then the error dx at the next knot. For a LinearTrajectory ``along``,
+    ``along[k]`` is the linear model at knot k.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class LinearTrajectory(Trajectory):
         if self.state_names != self._state.names:
             raise InputError(
                 f"the linear trajectory does not fit the given robot '{self.robot.name}': its "
-                "states differ; give the robot it was made for"
+                "states differ; give the robot for which the trajectory was made"
             )
 
     @property
@@ -128,10 +128,9 @@ class LinearTrajectory(Trajectory):
         return A, B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
-        """Return the values of arrays given at the knots, at one time.
+        """Interpolate arrays that are given at the knots to the time t [s].
 
-        In continuous time, the values are interpolated between knots. In discrete time, they are
-        held from the previous knot.
+        If the model is in discrete time, the values at the previous knot are returned instead.
         """
         k, fraction = interval_of(self.t, self._within(t))
         if self.dt or not fraction:
@@ -197,8 +196,8 @@ def linearize_trajectory(
     t : Trajectory or array_like (N,)
         The motion as a `Trajectory`, or the times of its knots [s].
     q, v, u : array_like, optional
-        Configurations, velocities and inputs at the knots, see `Trajectory`. Give these arguments
-        only if t contains times.
+        Configurations, velocities and inputs at the knots, see `Trajectory`. Give q, v and u only
+        if t contains times.
     strict : bool
         Whether to raise an error, instead of a warning, if the knots violate the robot's dynamics
         with a residual above 1e-2.

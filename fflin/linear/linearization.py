@@ -98,8 +98,8 @@ def prepare(
         raise unknown_frame(frame)
     if moving and (reference is not None or frame != "local"):
         raise InputError(
-            "moving=True gives the error in the moving base's own axes, but a reference or a frame "
-            "other than 'local' is given; leave both out"
+            "moving=True measures the error in the axes of the moving base, so no reference and "
+            "no frame other than 'local' can be given; leave out reference and frame"
         )
     state = StateMap(robot, reference=reference, frame=frame)
     own = reference is None and robot.orbit is None  # in orbit it is the orbit's frame
@@ -187,7 +187,7 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
 
 
 class Linearizer:
-    r"""Linearisation of one robot about many operating points; preparations are made only once.
+    r"""Linearise one robot about many operating points; common data are computed only once.
 
     Threads may share a `Linearizer`, but only one thread computes at a time. To compute in
     parallel, copy or pickle the `Linearizer`: every copy has a separate work space.
@@ -198,12 +198,13 @@ class Linearizer:
         A = \begin{bmatrix} 0 & N \\ 0 & 0 \end{bmatrix}, \qquad
         B = \begin{bmatrix} 0 \\ M^{-1} \end{bmatrix}.
 
-    M is the joint-space inertia in state order, and N = blkdiag(E3/2, E3, En) consists of identity
-    matrices of sizes 3, 3 and n.
+    M is the joint-space inertia in state order, and N = blkdiag(E3/2, E3, En) with identity
+    matrices E3 and En of sizes 3 and n.
 
     About other points, the acceleration :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is
-    differentiated in base axes as :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`. The
-    derivatives are then transformed to the attitude chart and to the axes of `frame`. The position
+    differentiated in base axes as :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`, where
+    rnea is the inverse dynamics. The derivatives are then transformed to the attitude chart and to
+    the axes of `frame`. The position
     and linear velocity of the base do not affect the dynamics (Galilean invariance). Therefore they
     are set to zero in the computation, so that a large distance from the origin does not reduce the
     accuracy. docs/derivation.md derives the equations; its section 14 treats robots in orbit, whose
@@ -216,9 +217,9 @@ class Linearizer:
         Axes of the base velocities and wrenches, see `StateMap`. The default is "hybrid". For a
         robot in orbit, the frames are "lvlh" (default) and "hill".
     reference : pin.SE3, optional
-        Reference placement, relative to which the state gives the base attitude and position. The
-        default is the base placement at each operating point, so that q_b and r_b are zero there.
-        For a robot in orbit, the default is the orbital frame.
+        Placement relative to which the attitude and position of the base are measured. The default
+        is the base placement at each operating point, so that q_b and r_b are zero there. For a
+        robot in orbit, the default is the orbital frame.
     moving : bool
         Whether to return the error dynamics about a moving reference, which passes through the
         operating point and obeys the dynamics of the robot. The frame is then "local", and f0 is
@@ -245,7 +246,7 @@ class Linearizer:
     robot : Robot
         The robot that is linearised.
     prepared : Prepared
-        Data that are the same for all operating points.
+        Prepared data, which are the same for all operating points.
 
     References
     ----------
@@ -407,16 +408,18 @@ def linearize(
         Axes of the base's velocities and wrenches, see `StateMap`; by default
         "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
-        Reference pose, relative to which the state gives the base attitude and position. The
-        default is the base pose at the operating point, or the orbital frame in orbit.
+        Pose relative to which the attitude and position of the base are measured. The
+        default is the base pose at the operating point, or the orbital frame if the
+        robot is in orbit.
     moving : bool
-        Whether to return the error dynamics about a reference that moves through the operating
-        point; see `Linearizer`.
+        Whether to return the error dynamics about a reference that moves through the
+        operating point; see `Linearizer`.
 
     Returns
     -------
     LinearModel
-        Linear model; `Linearizer` gives its equations, and linearises about many points.
+        Linear model, with the equations in `Linearizer`. To linearise about many
+        operating points, use `Linearizer`.
 
     Raises
     ------

@@ -32,12 +32,12 @@ class Certificate:
     Attributes
     ----------
     condition : float
-        Condition number of the inertia matrix M, scaled to a unit diagonal. Residuals of about this
-        number times machine precision are expected.
+        Condition number of the inertia matrix M after scaling to a unit diagonal. Residuals of
+        about this number times machine precision are expected.
     inertia_residual : float
         Largest entry of M M^-1 - I, where M is scaled to a unit diagonal.
     route_A, route_B : float
-        Largest difference of A (or B) from the same matrix computed from Pinocchio's ABA
+        Largest difference between A (or B) and the matrix that follows from Pinocchio's ABA
         derivatives, relative to the largest entry of the same block.
     f0 : float
         Largest entry of the state derivative at the operating point; 0 at a fixed point.
@@ -122,7 +122,7 @@ class LinearModel(StateSpace):
     urdf_sha256 : str
         Hash of the URDF as it was read; empty if there is no URDF.
     locked : tuple of str
-        "joint=value" [rad|m] of each welded joint.
+        Text "joint=value" [rad|m] for each welded joint.
     fflin_version, pinocchio_version : str
         Versions of the packages that made the model.
     verified : bool
@@ -196,7 +196,7 @@ class LinearModel(StateSpace):
 
     @property
     def reference(self) -> pin.SE3:
-        """Placement oMref of the reference, relative to which the state gives the base pose."""
+        """Placement oMref relative to which the attitude and position of the base are measured."""
         import pinocchio as pin
 
         return pin.XYZQUATToSE3(self.placement)
@@ -222,18 +222,18 @@ class LinearModel(StateSpace):
 
     @property
     def fingerprint(self) -> str:
-        """Hash of A, B and f0, which shows whether they changed since their certificate."""
+        """Hash of A, B and f0, used to detect later changes of these matrices."""
         digest = sha256()
         for array in (self.A, self.B, self.f0):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
     def require(self, fingerprint: str) -> None:
-        """Raise `InputError` if A, B or f0 changed since their certificate."""
+        """Raise `InputError` if the hash of A, B and f0 differs from an earlier `fingerprint`."""
         if self.fingerprint != fingerprint:
             raise InputError(
-                "A, B or f0 were changed after they were certified; check them with "
-                "fflin.check(robot, lin) instead"
+                "A, B or f0 was changed after the certificate was computed; check the model with "
+                "fflin.check(robot, lin)"
             )
 
     def require_unchanged(self) -> None:
@@ -260,7 +260,7 @@ class LinearModel(StateSpace):
 
     @cached_property
     def ignorable(self) -> tuple[str, ...]:
-        """Names of the states on which the dynamics do not depend, derived from the robot.
+        """Names of the states that do not affect the dynamics, as derived from the robot.
 
         The ignorable states are:
 
@@ -292,22 +292,22 @@ class LinearModel(StateSpace):
         zero, so the motion of the reference is tested instead:
 
         - the velocities of the reference in base axes must be constant;
-        - no joint except rotors may move;
+        - all joints except rotors must be at rest;
         - under gravity, the base may rotate only about the vertical.
 
         Parameters
         ----------
         tol : float
             Largest permitted rate, in SI units, of a coordinate that is not ignorable. In orbit
-            the tolerance is multiplied by the mean motion, because accelerations by the gravity
-            gradient are small.
+            the tolerance is multiplied by the mean motion, because the gravity gradient causes only
+            small accelerations.
         """
         rate = self.f0 if self.drift is None else self.drift
         judged = [name not in self.ignorable for name in self.state_names]
         return bool(np.abs(rate[judged]).max(initial=0.0) <= self.bound(number("tol", tol)))
 
     def bound(self, tol: float) -> float:
-        """Return `tol`, multiplied in orbit by the mean motion, as the tolerance of rates."""
+        """Return the largest rate at an equilibrium: `tol`, or `tol` times mean motion in orbit."""
         return tol * min(1.0, self.mean_motion or 1.0)
 
     def discretize(self, dt: float) -> LinearModel:

@@ -83,8 +83,9 @@ class ToolCoordinates:
         self._wrench = wrench = acting.fixed[:6]  # of the inputs
         if wrench[LINEAR].any() and not wrench[ANGULAR].any() and self._X[LINEAR, ANGULAR].any():
             raise InputError(
-                "a force of spart acts at the root link's centre of mass, and a BaseForce alone "
-                "cannot give its moment about the link's origin; give the robot a BaseTorque too"
+                "in spart, a base force acts at the centre of mass of the root link, so a "
+                "BaseForce needs a BaseTorque for its moment about the origin of the link; give "
+                "the robot a BaseTorque too"
             )
         # Which of the robot's inputs stands where among the tool's.
         self._inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))

@@ -30,14 +30,16 @@ _MOTION = 1e-2
 _FARTHEST_TURN = 2.5
 
 _CAUSES = (
-    "usual causes: wrong hold, wrong axes (frame) of u or v, wrong units of t or of joints, or "
-    "other springs, damping or gravity"
+    "usual causes: wrong hold, wrong axes (frame) of u or v, wrong units of t or of the joints, "
+    "or springs, damping or gravity that differ from the robot"
 )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Design):
-    """Motion of a robot, given at knots; the arrays are copied and read-only.
+    """Motion of a robot, given by configurations, velocities and inputs at knots.
+
+    The arrays are copied and read-only.
 
     Parameters
     ----------
@@ -166,10 +168,10 @@ class Trajectory(Design):
     def residual(self) -> Array:
         """Residual (N,) at each knot, which shows how well the motion obeys the robot's dynamics.
 
-        From each knot, the dynamics are integrated to the next knot under the given inputs. The
-        error of this interval is the difference between the integrated state and the next knot,
-        divided by the duration of the interval and by the largest rate of the motion; see `Flow`.
-        The residual of a knot is the larger error of its two adjacent intervals.
+        In each interval, the dynamics are integrated from the first knot under the given inputs.
+        The error of the interval is the difference between the integrated state and the second
+        knot, divided by the duration of the interval and by the largest rate of the motion; see
+        `Flow`. The residual of a knot is the larger error of its two adjacent intervals.
         """
         found = self.flow.residual
         return np.maximum(np.append(found, 0.0), np.append(0.0, found))
@@ -188,10 +190,9 @@ class Trajectory(Design):
         return self.flow.at(self._within(t))
 
     def resampled(self, dt: float) -> Trajectory:
-        """Return the same motion, interpolated by `point`, with knots every dt [s] and at the end.
+        """Return the motion with new knots every dt [s] and at the end, interpolated by `point`.
 
-        If inputs are held and every old knot is also a new knot, the inputs are the same functions
-        of time.
+        Held inputs are reproduced exactly only if every old knot is also a new knot.
         """
         times = self.samples(dt)
         if times[-1] < self.t[-1]:
@@ -202,7 +203,7 @@ class Trajectory(Design):
         return Trajectory(self.robot, times, q, v, u, **kept)  # type: ignore[arg-type]
 
     def samples(self, dt: float) -> Array:
-        """Return the times every dt [s] from the first knot to the last."""
+        """Return times from the first knot to the last, dt [s] apart."""
         dt, duration = number("dt", dt), float(self.t[-1] - self.t[0])
         if not dt >= 1e-7 * duration:
             raise InputError(
@@ -214,7 +215,7 @@ class Trajectory(Design):
         return times
 
     def require(self, *, strict: bool = False) -> None:
-        """Warn if the residual of the motion exceeds 1e-2, or raise `InputError` if `strict`.
+        """Warn if the residual of the motion exceeds 1e-2; raise `InputError` instead if `strict`.
 
         The message gives the interval with the largest error, this error, and the number of
         intervals with errors above 1e-2. If the integration overflows, `InputError` is raised even
@@ -246,7 +247,7 @@ class Trajectory(Design):
         if turns[k] > _FARTHEST_TURN:
             return (
                 f"the base rotates by {turns[k]:.2g} rad from t = {self.t[k]:g} to "
-                f"{self.t[k + 1]:g} s, which is too far for one interval; give knots at most "
+                f"{self.t[k + 1]:g} s, too far for one interval; give more knots, at most "
                 f"{_FARTHEST_TURN:g} rad apart"
             )
         return ""
@@ -343,8 +344,7 @@ def along(motion: Any, robot: Robot | None) -> Trajectory:
     """Return a motion by knots, with held or linear inputs, whose residual is smaller."""
     if motion.phases:
         raise InputError(
-            "the motion has several phases, each with its own robot; convert each of its phases "
-            "separately"
+            "the motion has several phases, each with its own robot; convert each phase separately"
         )
     if robot is None:
         raise InputError(

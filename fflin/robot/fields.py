@@ -55,11 +55,11 @@ def checked_inputs(
             raise InputError(f"{item!r} is not an input; expected {known}")
     value = [one for item in value for one in _spread(item, find, joints, passive)]
     if not value:
-        raise InputError("all inputs are torques of passive joints; add another input")
+        raise InputError("all inputs are torques of passive joints; add an input that is not")
     names = [name for item, own in named_inputs(value) for name in own]
     for each in names:
         if names.count(each) > 1:
-            raise InputError(f"input '{each}' is given twice; remove one of the two")
+            raise InputError(f"input '{each}' is given twice; remove one of them")
     return tuple(value)
 
 
@@ -199,7 +199,7 @@ def _weights(value: object, scope: Scope) -> dict[str, Any]:
                 least = "0 or more" if part == "q" else "more than 0"
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
     for key in weights["bryson"].keys() & (weights["q"].keys() | weights["r"].keys()):
-        raise InputError(f"'{key}' has both a weight and a largest value; give only one of the two")
+        raise InputError(f"'{key}' has both a weight and a largest value; give only one of them")
     return {part: value for part, value in weights.items() if value}
 
 

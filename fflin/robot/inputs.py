@@ -201,8 +201,8 @@ class Thruster(WrenchInput):
         pulses = truth("thruster on_off", self.on_off)
         if self.ranges[0][0] < 0.0 or (pulses and (self.max is None or self.min)):
             raise InputError(
-                f"thruster min is {self.min} and max is {self.max}, expected a min of 0 or more, "
-                "and with on_off a max, the force of a pulse, and no min"
+                f"thruster min is {self.min} and max is {self.max}, expected a min of 0 or more; "
+                "an on_off thruster needs a max, the force of its pulses, and no min"
             )
         if (impulse := self.least_impulse) is not None:
             self._set("least_impulse", positive("thruster least_impulse", impulse, "N s"))

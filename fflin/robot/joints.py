@@ -225,7 +225,9 @@ class Coordinates:
         """Return a vector (size,); the error for a longer one names the removed coordinates."""
         if self._removed and np.size(value) > size:
             removed = ", ".join(self._removed)
-            of_what += f"; the coordinates {removed} left with the replaced inputs or appendages"
+            of_what += (
+                f"; the coordinates {removed} were removed with the replaced inputs or appendages"
+            )
         return vector(name, value, size, of_what)
 
     def _followed(self, q: Array) -> Array:

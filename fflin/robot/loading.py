@@ -235,8 +235,8 @@ def _check_root(model: pin.Model, name: str) -> None:
     fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
     if fixed:
         raise ModelError(
-            f"'{name}': joint '{fixed[0]}' is attached to the world, not the free-flyer; connect "
-            "every moving link to the one base"
+            f"'{name}': joint '{fixed[0]}' is attached to the world, not to the free-flyer; "
+            "connect every moving link to the base"
         )
 
 
@@ -248,8 +248,9 @@ def _check_order(model: pin.Model, name: str) -> None:
             above.pop()
         if joint and not above:
             raise ModelError(
-                f"'{name}': the joints are not in depth-first order, which makes Pinocchio's CRBA "
-                "wrong; add all joints of one branch before the joints of the next"
+                f"'{name}': the joints are not in depth-first order, for which Pinocchio's CRBA "
+                "gives wrong results; add all joints of one branch before the joints of the "
+                "next branch"
             )
         above.append(joint)
 

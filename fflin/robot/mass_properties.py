@@ -312,7 +312,7 @@ def massless_note(robot: Robot) -> str:
     idle = listed(robot.idle_coordinates)
     return (
         f"the mass matrix of '{robot.name}' is singular at every configuration: {idle} can move "
-        "without moving mass; give the links of these joints an inertia, or lock the joints"
+        "without moving mass; give an inertia to the link of each such joint, or lock the joint"
     )
 
 

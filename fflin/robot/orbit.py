@@ -105,8 +105,8 @@ class CircularOrbit:
         given = [value for value in (self.altitude, self.mean_motion) if value is not None]
         if len(given) != 1:
             raise InputError(
-                f"an orbit has altitude {self.altitude} [m] and mean_motion {self.mean_motion} "
-                "[rad/s]; give exactly one of the two"
+                f"altitude is {self.altitude} [m] and mean_motion is {self.mean_motion} [rad/s]; "
+                "give exactly one of them"
             )
         size = self.mu, self.body_radius
         mu, ground = (
@@ -122,16 +122,16 @@ class CircularOrbit:
             altitude = (mu / n) ** (1.0 / 3.0) / n ** (1.0 / 3.0) - ground
         if not 0.0 < altitude < 1e15:
             raise InputError(
-                f"an altitude of {altitude:g} m over {self.body} is no orbit; give an altitude "
-                "above 0, or a smaller mean motion"
+                f"an altitude of {altitude:g} m over {self.body} is not an orbit; give an "
+                "altitude above 0 and below 1e15 m, or another mean motion"
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
             # Not for an orbit that was saved, nor for another body called earth.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
                 warnings.warn(
-                    f"an altitude of {altitude:.8g} m over earth: altitudes are in metres; write "
-                    "400 km as 400e3",
+                    f"an altitude of {altitude:.8g} m over earth is too low for an orbit; "
+                    "altitudes are in metres, so write 400 km as 400e3",
                     FflinWarning,
                     stacklevel=3,
                 )

@@ -129,7 +129,7 @@ class FramePose(FrameOutput):
 
     - Position (3,) [m] of the frame's origin relative to the reference, in reference axes.
     - Rotation vector (3,) [rad], log(R*^T R), in the frame's own axes. R is the frame's attitude,
-      and R* is its attitude at the operating point, where the vector is therefore zero.
+      and R* is its attitude at the operating point. At this point, the rotation vector is zero.
 
     Parameters
     ----------
@@ -179,8 +179,8 @@ class RelativePose(FrameOutput):
     - Position (3,) [m] of the origin of `frame` relative to the origin of `to`, in the axes of
       `to`.
     - Rotation vector (3,) [rad], log(R*^T R), in the axes of `frame`. R is the attitude of `frame`
-      relative to `to`, and R* is this attitude at the operating point, where the vector is
-      therefore zero.
+      relative to `to`, and R* is this attitude at the operating point. At this point, the rotation
+      vector is zero.
 
     Parameters
     ----------
@@ -255,8 +255,8 @@ class Accelerometer(FrameOutput):
     """Output of an accelerometer: specific force (3,) [m/s^2] at a frame, in the frame's own axes.
 
     The specific force is the acceleration of the frame's origin minus the gravitational
-    acceleration. Therefore the specific force is zero in free fall without rotation and thrust, and
-    g upwards at rest under gravity.
+    acceleration. It is zero in free fall without rotation and thrust. At rest under gravity, it is
+    directed upwards with the magnitude g.
 
     Parameters
     ----------

@@ -101,14 +101,14 @@ class Robot(Coordinates):
     start : mapping
         Default initial state of `simulate` and `visualize`, see `replace`.
     limits : mapping
-        Limits {name of an input or state: (least, largest)}, which replace limits of the URDF and
-        of the inputs.
+        Limits {name: pair (least, largest)} of inputs and states, which replace limits of the URDF
+        and of the inputs.
     links : mapping
-        Mass properties {link: LinkMass} of all links with mass, as given in the URDF.
+        Mass properties of all links with mass, as given in the URDF, by the names of the links.
     file_joints : tuple of str
         All joints of the file, including fixed joints.
     attached : tuple of (str, Robot)
-        Payload robots that were grasped, each after the prefix of its names.
+        Grasped payload robots, each in a pair with the prefix of its names.
     appendages : tuple of FlexibleAppendage and Slosh
         Flexible appendages and slosh. Their modes are among the joints.
 
@@ -179,10 +179,10 @@ class Robot(Coordinates):
         outputs : sequence of Output
             Measured outputs of the robot, in the order of y.
         stiffness : mapping or float
-            Spring stiffness {joint: K [N m/rad | N/m]}, or one value for all joints except
+            Spring stiffness {joint: value [N m/rad | N/m]}, or one value for all joints except
             wheels. In this and all other mappings, a name may be a pattern such as ``hinge_*``.
         damping : mapping, float or "urdf"
-            Viscous damping {joint: D [N m s/rad | N s/m]}, one value for all joints except
+            Viscous damping {joint: value [N m s/rad | N s/m]}, one value for all joints except
             wheels, or "urdf" for the damping of the URDF.
         rest : mapping
             Positions {joint: position [rad|m]} at which the springs are relaxed.
@@ -255,8 +255,8 @@ class Robot(Coordinates):
         robot = replace(robot, **checked)
         if robot.orbit and any(robot.gravity):
             raise InputError(
-                f"'{self.name}' has both uniform gravity and an orbit, which includes the gravity "
-                "of its central body; leave one out"
+                f"'{self.name}' has both uniform gravity and an orbit, but an orbit already "
+                "includes the gravity of its central body; leave one of them out"
             )
         for name in robot.used_frames:
             find_frame(robot.model, name)
@@ -306,8 +306,8 @@ class Robot(Coordinates):
         uniformly from [-1, 1]:
 
         - The mass is multiplied by ``1 + mass * d``.
-        - For each axis of the body's frame, the second moment of mass along this axis, divided by
-          the mass, is multiplied by ``1 + inertia * d``.
+        - For each axis of the body's frame, the second moment along this axis per unit mass is
+          multiplied by ``1 + inertia * d``.
         - Along each axis, the centre of mass is shifted by ``com * d`` times the root-mean-square
           distance of the body's mass elements from the centre of mass along this axis.
 
@@ -425,7 +425,7 @@ class Robot(Coordinates):
         UnknownNameError
             If the robot has no joint with this name; the message suggests similar names.
         InputError
-            If the joint is a mimic joint, a wheel without inertia or a locked joint.
+            If the name belongs to a mimic joint, a wheel without inertia or a locked joint.
         """
         for joint in self.joints:
             if joint.name == name:

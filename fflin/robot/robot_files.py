@@ -137,7 +137,7 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
 
     Examples
     --------
-    If the file contains ::
+    A file with this content ::
 
         [[input]]
         type = "joint_torque"
@@ -150,7 +150,7 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
         position = [-0.9, 0.0, 0.65]
         direction = [1, 0, 0]
 
-    `load_inputs` returns
+    gives the inputs
     ``(JointTorque("joint_1"), Thruster("base", (-0.9, 0, 0.65), (1, 0, 0), "nozzle"))``.
 
     >>> inputs = fflin.load_inputs("cubesat")  # bundled

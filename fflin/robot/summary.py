@@ -39,7 +39,7 @@ def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
         else:
             rows.append([name, str(robot.n), f"{robot.mass:.6g}", origin])
     notes = [textwrap.fill(line, width(), subsequent_indent="  ") for line in refused]
-    head = f"{len(rows) - 1} robots can be loaded by name, {len(refused)} cannot be loaded"
+    head = f"{len(rows) - 1} robots can be loaded by name; {len(refused)} cannot be loaded"
     return "\n\n".join((head, grid(rows, "lrrl"), *notes))
 
 

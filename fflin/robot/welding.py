@@ -43,8 +43,8 @@ def welded(robot: Robot, lock: Lock) -> Robot:
     ]
     if not inputs:
         raise InputError(
-            f"without {', '.join(sorted(gone))} the robot has no input; a model needs at least "
-            "one input"
+            f"without {', '.join(sorted(gone))}, the robot has no input, but a model needs at "
+            "least one input"
         )
     outputs = [
         replace(each, joints=tuple(x for x in each.joints if x not in gone))

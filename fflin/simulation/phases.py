@@ -56,8 +56,9 @@ def _require_met(
     if apart.max() > _MET * max(1.0, np.abs(v).max()):
         at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())
         raise InputError(
-            f"'{what}' does not begin where the motion before it ended: '{robot.model.names[at]}' "
-            f"differs by {apart.max():.2g} in position or rate; start from q and v of the last row"
+            f"'{what}' does not begin where the motion before it ended: "
+            f"'{robot.model.names[at]}' differs by {apart.max():.2g} in position or rate; start "
+            "from q and v in the last row of that motion"
         )
 
 

@@ -234,7 +234,7 @@ def _state_of(
     own_frame, own_reference = axes_of(policy)
     if lin is not None and (frame is not None or reference is not None):
         raise InputError(
-            "frame or reference is given, but the policy's model fixes both; leave them out"
+            "frame or reference is given, but the model of the policy defines both; leave them out"
         )
     if tracking_of(policy):
         if frame not in (None, own_frame):

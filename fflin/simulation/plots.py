@@ -187,7 +187,9 @@ def _draw_panels(
         elif len(found) > _MOST_IN_A_PANEL:
             _below(figure, _named(axes), title, "center" if joints is None else "right")
         else:
-            axes.legend(ncols=2 if len(found) > 3 else 1, handlelength=1.6)
+            if many := len(found) > 3:
+                axes.margins(y=0.3)  # room for the names above the curves
+            axes.legend(ncols=2 if many else 1, handlelength=1.6)
     if joints is not None:
         # Joints are many, have long names, and are the same in three panels.
         limit = {"limit": lines.pop("limit")} if "limit" in lines else {}

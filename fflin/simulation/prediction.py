@@ -56,9 +56,9 @@ def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
         same = same and linear.output_names == policy.lin.output_names
     if not same or not linear.reference.isApprox(state.reference, 1e-9):
         raise InputError(
-            f"linear is a model of '{linear.robot}' with other states, inputs, frame or reference "
-            f"than the simulation of '{plant.robot.name}'; linearise that robot in the policy's "
-            "frame and reference"
+            f"linear is a model of '{linear.robot}' with other states, inputs, frame or "
+            f"reference than the simulation of '{plant.robot.name}'; linearise the simulated "
+            "robot with the frame and the reference of the policy"
         )
     return linear
 

@@ -324,6 +324,7 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
         kind for kind in kinds if kind.steered and kind.title not in _ALL_OF_MODES
     ]
     moved = [kind for kind in judged if kind.size.max() > THERE]
+    aside = [kind.last for kind in places if kind.late and not kind.steered]
     if motion.tracked and not motion.phases:
         said = f"tracking errors at the end: {_and([kind.last for kind in judged])}"
     elif failed := [kind.last for kind in moved if kind.late]:
@@ -335,13 +336,10 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
             what = "positions" if judged[0].title in _PLACES else "rates"
             said = f"{what} {said}; not yet: {_and(late)}"
     else:
-        said = "settled: at the target throughout the run"
-    aside = {k.title: k.last for k in places if k.late and not k.steered}
-    loose = not pushed(motion) and aside.pop("position", "")
+        which = f"{_and([kind.title for kind in judged])} " * bool(aside)
+        said = f"settled: {which}at the target throughout the run"
     if aside:
-        said += f"; not controlled: {_and([*aside.values()])}"
-    if loose:
-        said += "; position is not controlled"
+        said += f"; not controlled: {_and(aside)}"
     return f"{said}; saturated inputs: {_full(motion)}"
 
 
@@ -376,8 +374,9 @@ def _largest_modes(motion: Any) -> str:
     if not far:
         return table
     said = (
-        "warning: the motion is not accurate: the model is linear in the modal amplitudes, and "
-        f"some of these bend the structure by more than {_LINEAR:g} deg: {_and(far)}"
+        "warning: the motion is not accurate, because the model is linear in the modal "
+        f"amplitudes, but some amplitudes bend the structure by more than {_LINEAR:g} deg: "
+        f"{_and(far)}"
     )
     return f"{table}\n{folded([said])}"
 

@@ -49,12 +49,12 @@ class Times(NamedTuple):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the recorded rows, for the report."""
-        said = f"one of {self.every} steps is recorded; every=1 (--every 1) records all "
+        said = f"one in {self.every} steps is recorded; every=1 (--every 1) records all "
         notes: tuple[str, ...] = (f"{said}{self.steps:,} steps",) if self.thinned else ()
         if self.sample and self.every % self.sample and self.sample % self.every:
             aside = (
                 f"a row is recorded every {self.every} steps, but the controller samples every "
-                f"{self.sample} steps; the "
+                f"{self.sample} steps, so the "
             )
             notes += (f"{aside}rows are not a valid trajectory",)
         return notes
@@ -75,9 +75,9 @@ class Times(NamedTuple):
             )
         if chosen and self.fastest * _STEP > 1.0 and self.steps > _MANY_STEPS:
             warnings.warn(
-                f"the simulation takes long: the loop's fastest pole at {self.fastest:.3g} 1/s "
-                f"requires {self.steps:,} steps of {self.dt:.3g} s; give dt=, sample= or a slower "
-                "gain",
+                "the simulation takes long, because the fastest pole of the loop at "
+                f"{self.fastest:.3g} 1/s requires {self.steps:,} steps of {self.dt:.3g} s; give "
+                "dt=, sample= or a slower gain",
                 FflinWarning,
                 stacklevel=3,
             )
@@ -116,8 +116,8 @@ def times_of(policy: Any, options: SimulationOptions) -> Times:
     if abs(steps * dt - duration) > 1e-6 * duration:
         if sample or delay:
             raise InputError(
-                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s, as "
-                "the input is sampled or delayed; choose dt accordingly"
+                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s, "
+                "because the input is sampled or delayed; choose dt accordingly"
             )
         steps = int(np.ceil(duration / dt))
         dt = duration / steps

@@ -154,7 +154,7 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
 
 
 class Gain(NamedTuple):
-    """From a disturbance over `scale` at the inputs to C x, and D of the disturbance."""
+    """Channel of a gain, from w to C x + D w, with the disturbance `scale` * w at the inputs."""
 
     C: Array
     D: Array

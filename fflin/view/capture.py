@@ -49,7 +49,7 @@ def find_chromium() -> str:
     if found is None:
         raise MissingPackageError(
             "Chromium, which takes the pictures, is not found; install it (Debian: apt install "
-            "chromium), or open the HTML file and take them by hand"
+            "chromium), or open the HTML file in a browser and take screenshots"
         )
     return found
 

@@ -276,7 +276,8 @@ def _listen(port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         raise InputError(
-            f"port {port} is not available: {error.strerror}; give another one, or 0 for a free one"
+            f"port {port} is not available: {error.strerror}; give another port, or 0 for a free "
+            "port"
         ) from None
     listener.setblocking(False)
     return listener

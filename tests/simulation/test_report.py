@@ -167,6 +167,16 @@ def test_wheels_are_no_joints():
     assert first(motion).startswith("settled") and says(first(motion), "target")
 
 
+def test_a_base_that_no_force_pushes_is_off_its_target_by_a_figure():
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat")[-3:])  # wheels
+    lin = fflin.linearize(robot)
+    x0 = np.zeros(len(lin.x0))
+    x0[3] = 1.0
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    said = motion_report(fflin.simulate(robot, policy, x0=x0, duration=1.0))
+    assert says(said, "settled: attitude at the target", "not controlled: position 1 m;")
+
+
 def test_lengths_and_angles_of_joints_have_rows_of_their_own():
     motion = course(lambda t: np.exp(-t))
     units = list(motion.state_units)

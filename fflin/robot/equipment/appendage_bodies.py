@@ -76,9 +76,9 @@ def mounted_appendages(
         lighter = min(1.0, _LARGEST_SHARE * bodies[joint].mass / mass) if mass else 1.0
         if lighter < _LIGHTEST:
             raise InputError(
-                f"mode '{of_body[0].name}' has a participation in translation, but the slosh of "
-                f"its body leaves it {bodies[joint].mass:.3g} kg; the mass in the URDF must "
-                "include the appendage and the liquid"
+                f"mode '{of_body[0].name}' moves the centre of mass of its body, but without the "
+                f"sloshing liquid this body has only {bodies[joint].mass:.3g} kg; the mass in "
+                "the URDF must include the appendage and the liquid"
             )
         for ball in of_body:
             part, removed = ball.mounted(joint, lighter)
@@ -130,9 +130,10 @@ def _compare_inertia(item: _Modes, bodies: list[pin.Inertia], links: Mapping[str
     if apart.max() > _AGREE * max(M[0, 0], of_file.mass):
         file, urdf = (f"{x.mass:.4g} kg at {_point(x.lever)} m" for x in (of_file, of_link))
         warnings.warn(
-            f"flexible appendage '{appendage.title}': its file has {file}, but {what} has {urdf} "
-            "in the axes of the frame, or other moments of inertia; correct the URDF, or use the "
-            "inertia of the file with rigid=True",
+            f"flexible appendage '{appendage.title}': the inertia in its file ({file}) differs "
+            f"from the inertia of {what} ({urdf} in the axes of the frame) in these values or in "
+            "the moments of inertia; correct the URDF, or use the inertia of the file with "
+            "rigid=True",
             FflinWarning,
             stacklevel=6,
         )
@@ -155,9 +156,10 @@ def _require_inertia(body: pin.Inertia, of: str, found: Sequence[_Modes]) -> Non
         least = float(_least_eigenvalue(*rows, L[:, :k])[0])
         if not least >= -_NEGATIVE:
             raise InputError(
-                f"mode '{mode}' has more participation than {of} with {body.mass:.4g} kg can have: "
-                f"M_rr - L L^T has the eigenvalue {least:.2g}, relative to the largest eigenvalue "
-                "of M_rr; the URDF's inertia must include the appendage as if it were rigid"
+                f"the effective masses of the modes up to '{mode}' exceed the inertia of {of} "
+                f"({body.mass:.4g} kg): M_rr - L L^T has the eigenvalue {least:.2g}, relative to "
+                "the largest eigenvalue of M_rr; the inertia in the URDF must include the "
+                "appendage as if it were rigid"
             )
 
 

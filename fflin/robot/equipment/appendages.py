@@ -39,7 +39,7 @@ class Appendage(FrozenArrays):
 
     @property
     def title(self) -> str:
-        """Name with which the names of the modes begin."""
+        """Prefix of the names of the modes."""
         return self.name or self.frame
 
     @property
@@ -63,10 +63,10 @@ class FlexibleAppendage(Appendage):
     r"""Flexible part of a link, such as a solar array, described by its modes when clamped.
 
     Each mode adds a coordinate to q_m, with the name NAME_mode_1, NAME_mode_2 and so on. The
-    coordinate is the modal amplitude in kg^0.5 m, for unit modal mass. For a mode of angular
-    frequency :math:`\omega` and damping ratio :math:`\zeta`, the coordinate has the stiffness
-    :math:`\omega^2`, the damping :math:`2 \zeta \omega` and no motor. The link's inertia in the
-    URDF must include the appendage as if it were rigid.
+    coordinate is the modal amplitude, in kg^0.5 m because the modal mass is 1. For a mode of
+    angular frequency :math:`\omega` and damping ratio :math:`\zeta`, the coordinate has the
+    stiffness :math:`\omega^2`, the damping :math:`2 \zeta \omega` and no motor. The link's inertia
+    in the URDF must include the appendage as if it were rigid.
 
     Parameters
     ----------
@@ -84,15 +84,15 @@ class FlexibleAppendage(Appendage):
     damping : float or sequence of float (k,)
         Damping ratios, from 0 to 1.
     name : str, optional
-        Name with which the names of the coordinates begin; the frame's name by default.
+        Prefix of the names of the coordinates; the frame's name by default.
 
     Raises
     ------
     InputError
         If a shape is wrong, a value is not finite, a frequency is not positive, or a damping ratio
         is not between 0 and 1. `load` also raises the error if the participation L is too large for
-        the rigid inertia :math:`M_{rr}` of the carrying body, such that :math:`M_{rr} - L L^T` is
-        not positive semidefinite.
+        the rigid inertia :math:`M_{rr}` of the carrying body, because :math:`M_{rr} - L L^T` must
+        be positive semidefinite.
 
     Examples
     --------
@@ -123,15 +123,16 @@ class FlexibleAppendage(Appendage):
         if frequency.ndim != 1 or not modes or damping.shape not in ((), (modes,)):
             raise InputError(
                 f"frequency and damping of {what} have shapes {frequency.shape} and "
-                f"{damping.shape}, expected k frequencies [Hz], and k damping ratios or one"
+                f"{damping.shape}, expected k frequencies [Hz], and k damping ratios or one "
+                "damping ratio for all"
             )
         damping = np.broadcast_to(damping, modes).copy()
         known = (frequency > 0.0) & (frequency < _FASTEST) & (damping >= 0.0) & (damping <= 1.0)
         for mode in np.flatnonzero(~known)[:1].tolist():
             raise InputError(
-                f"mode {mode + 1} of {what} has {frequency[mode]:g} Hz and the damping ratio "
-                f"{damping[mode]:g}, expected more than 0 and less than {_FASTEST:g} Hz, and a "
-                "ratio from 0 to 1"
+                f"mode {mode + 1} of {what} has the frequency {frequency[mode]:g} Hz and the "
+                f"damping ratio {damping[mode]:g}, expected a frequency of more than 0 and less "
+                f"than {_FASTEST:g} Hz, and a ratio from 0 to 1"
             )
         for name, unit in (("translation", "kg^0.5"), ("rotation", "kg^0.5 m")):
             hint = f": one column [{unit}] for each of the {modes} frequencies"
@@ -160,14 +161,15 @@ class FlexibleAppendage(Appendage):
     ) -> FlexibleAppendage:
         r"""Read a Craig-Bampton model that Nastran wrote as an external superelement.
 
-        The boundary of the superelement is reduced to a rigid interface at `frame`. The index b
-        denotes the boundary, and q the modes in the file:
+        The boundary of the superelement is reduced to a rigid interface at `frame`. In the matrices
+        of the file, the index b denotes the boundary, and the index q denotes the modes. With these
+        matrices,
 
-        - :math:`\Phi` contains the rigid motions of the boundary, in the output coordinate systems
-          of its grids.
-        - V contains the eigenvectors of :math:`K_{qq}, M_{qq}`, scaled to unit modal mass.
-        - The participation is :math:`L = \Phi^T M_{bq} V`.
-        - The rigid inertia is :math:`M_{rr} = \Phi^T M_{bb} \Phi`.
+        - the participation is :math:`L = \Phi^T M_{bq} V`;
+        - the rigid inertia is :math:`M_{rr} = \Phi^T M_{bb} \Phi`.
+
+        :math:`\Phi` contains the rigid motions of the boundary, in the output coordinate systems of
+        its grids. V contains the eigenvectors of :math:`K_{qq}, M_{qq}`, scaled to unit modal mass.
 
         Parameters
         ----------
@@ -175,7 +177,8 @@ class FlexibleAppendage(Appendage):
             Output4 file with the mass and stiffness matrix (mxx, maa or maax; kxx, kaa or kaax).
         asm : path
             Assembly file with the boundary grids and the points of the modes. A .pch file in the
-            same folder defines which degrees of freedom of the grids are kept.
+            same folder defines which degrees of freedom of the grids belong to the boundary;
+            without this file, all six do.
         frame : str
             Frame of the robot's model at the interface. Its axes must be parallel to the basic
             axes of the Nastran file.
@@ -291,8 +294,7 @@ class Slosh(Appendage):
     damping : float
         Damping ratio, from 0 to 1.
     name : str, optional
-        Name with which the names of the coordinates begin; by default the frame's name, followed by
-        "_slosh".
+        Prefix of the names of the coordinates; by default the frame's name, followed by "_slosh".
 
     Raises
     ------
@@ -335,8 +337,9 @@ class Slosh(Appendage):
             raise InputError(f"damping of {what} is {ratio:g}, expected a ratio from 0 to 1")
         if ratio and self.frequency is None:
             raise InputError(
-                f"{what} has the damping ratio {ratio:g}, but a pendulum has a frequency only "
-                "under an acceleration; give the frequency [Hz] to which the ratio refers"
+                f"{what} has the damping ratio {ratio:g}, but without a frequency, because a "
+                "pendulum oscillates only under an acceleration; give the frequency [Hz] to "
+                "which the ratio refers"
             )
         object.__setattr__(self, "damping", ratio)
         position = three_numbers(f"position of {what}", self.position)
@@ -427,7 +430,7 @@ class Slosh(Appendage):
 
     @property
     def title(self) -> str:
-        """Name with which the names of the coordinates begin."""
+        """Prefix of the names of the coordinates."""
         return self.name or f"{self.frame}_slosh"
 
     @property

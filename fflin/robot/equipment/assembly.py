@@ -41,8 +41,8 @@ def with_appendages(robot: Any, appendages: Any) -> Any:
             joint = find_frame(bare.model, item.frame).joint
             if joint in taken:
                 raise InputError(
-                    f"'{item.title}' is the second appendage with rigid=True on its body; use it "
-                    "for one appendage of each body"
+                    f"'{item.title}' is the second appendage with rigid=True on its body; use "
+                    "rigid=True for only one appendage of each body"
                 )
             taken.add(joint)
             bare = _with_rigid(bare, item)

@@ -171,9 +171,10 @@ def mounted_wheels(
             of = "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
             lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
             raise InputError(
-                f"wheel '{name}' of {wheel.inertia:g} kg m^2 does not have less inertia than the "
-                f"link that carries it: {of} has {about:.3g} kg m^2 about its axis; the URDF's "
-                f"inertia must include the wheels, so correct the URDF or the wheel{lock}"
+                f"wheel '{name}' of {wheel.inertia:g} kg m^2 must have less inertia than the "
+                f"link that carries it, but {of} has {about:.3g} kg m^2 about the axis of the "
+                "wheel; the inertia in the URDF must include the wheels, so correct the URDF or "
+                f"the wheel{lock}"
             )
         bodies[joint] = rest
         placement = pin.SE3(turned_to(axis), np.zeros(3))

@@ -109,8 +109,8 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
     boundary = np.asarray(boundary, dtype=bool)
     if not boundary.any() or boundary.all() or not np.isfinite(points).all() or not len(points):
         raise InputError(
-            f"{path} names no boundary grids (GRID) with coordinates, or no modes (SPOINT); "
-            "expected those of a Craig-Bampton superelement"
+            f"{path} lacks boundary grids (GRID) with coordinates or modes (SPOINT); expected "
+            "both, as in a Craig-Bampton superelement"
         )
     return boundary[keep], np.asarray(rigid)[keep], points
 
@@ -154,15 +154,15 @@ def _require_clamped(path: Path, K: Array, rigid: Array, boundary: Mask) -> None
     coupling = K[np.ix_(boundary, inner)]
     if np.abs(coupling).max(initial=0.0) > _SHARE * largest:
         raise InputError(
-            f"the stiffness of {path} couples boundary and modes; expected modes that are clamped "
-            "at the boundary (Craig-Bampton)"
+            f"the stiffness matrix in {path} couples boundary and modes; expected modes that are "
+            "clamped at the boundary (Craig-Bampton)"
         )
     K_b = K[np.ix_(boundary, boundary)]
     size = np.abs(rigid).T @ np.abs(K_b) @ np.abs(rigid)
     if np.abs(rigid.T @ K_b @ rigid).max() > _SHARE * max(float(size.max()), 1e-300):
         raise InputError(
-            f"the stiffness of {path} resists a rigid motion of its boundary: the structure is "
-            "clamped elsewhere too, or the .asm file has other grids"
+            f"the stiffness matrix in {path} resists a rigid motion of the boundary, because the "
+            "structure is also clamped elsewhere, or because the .asm file describes other grids"
         )
 
 
@@ -176,8 +176,8 @@ def _eigenpairs(path: Path, K: Array, M: Array) -> tuple[Array, Array]:
         squares = np.zeros(1)
     if not squares[0] > 0.0:
         raise InputError(
-            f"the modal mass or stiffness of {path} is not positive definite; expected independent "
-            "modes that are clamped at the boundary"
+            f"the modal mass or stiffness matrix in {path} is not positive definite; expected "
+            "independent modes that are clamped at the boundary"
         )
     return np.asarray(squares), np.asarray(shapes)
 

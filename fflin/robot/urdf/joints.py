@@ -107,8 +107,8 @@ def _limits(element: Element, of: str, kind: str) -> dict[str, float] | None:
     lower, upper = limits.get("lower", 0.0), limits.get("upper", 0.0)
     if lower > upper:
         found.note(
-            f"lower limit {lower:g} of {of} exceeds its upper limit {upper:g}; the model has no "
-            "position limits for it"
+            f"lower limit {lower:g} of {of} exceeds its upper limit {upper:g}; both position "
+            "limits are ignored"
         )
         limits |= {"lower": -UNLIMITED, "upper": UNLIMITED}
     return limits
@@ -137,7 +137,7 @@ def _dynamics(element: Element, of: str, kind: str) -> tuple[float, float]:
     if min(damping, friction) < 0.0:
         raise found.error(
             f"damping {damping:g} and friction {friction:g} of {of}: expected 0 or more; correct "
-            "the negative one"
+            "the negative value"
         )
     return damping, friction
 
