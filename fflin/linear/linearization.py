@@ -408,17 +408,18 @@ def linearize(
         Axes of the base's velocities and wrenches, see `StateMap`; by default
         "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
-        Pose relative to which the attitude and position of the base are measured. The default is
-        the base pose at the operating point, or the orbital frame if the robot is in orbit.
+        Pose relative to which the attitude and position of the base are measured. The
+        default is the base pose at the operating point, or the orbital frame if the
+        robot is in orbit.
     moving : bool
-        Whether to return the error dynamics about a reference that moves through the operating
-        point; see `Linearizer`.
+        Whether to return the error dynamics about a reference that moves through the
+        operating point; see `Linearizer`.
 
     Returns
     -------
     LinearModel
-        Linear model, with the equations in `Linearizer`. To linearise about many operating points,
-        use `Linearizer`.
+        Linear model, with the equations in `Linearizer`. To linearise about many
+        operating points, use `Linearizer`.
 
     Raises
     ------
