@@ -112,7 +112,7 @@ class LaneLoop:
         self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self._fresh.append(pair))
         self._words = words_of(self.parts, loop.ARGUMENTS)
         self._work = work_space(self.parts.robot.layout.size)
-        self._advance = kernel("loop", "advance", "the loop of eight runs at a time")
+        self._advance = kernel("loop", "advance", "the loop that simulates eight runs at a time")
         robot, point = self.parts.robot, self.parts.point
         ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3]).tolist()
         self.width, self.steps, self.done = ends[-1], plan.times.steps, 0
