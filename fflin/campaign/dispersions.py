@@ -51,14 +51,13 @@ class Column(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """Drawn values (N, k) of some runs, and the numbers of these runs (N,)."""
+    """Drawn values (N, k) of some runs."""
 
     drawn: Array
-    run: Array
 
     def part(self, start: int, stop: int) -> Draws:
         """Return the runs from `start` up to `stop`."""
-        return Draws(self.drawn[start:stop], self.run[start:stop])
+        return Draws(self.drawn[start:stop])
 
 
 class Bound(NamedTuple):
@@ -213,7 +212,7 @@ class Dispersions:
                 low, high = max(start, first), min(stop, first + _BLOCK)
                 values = self._drawn(column, first // _BLOCK, high - first)
                 drawn[low - start : high - start, at] = values[low - first : high - first]
-        return Draws(drawn, np.arange(start, stop, dtype=float))
+        return Draws(drawn)
 
     def _uniform(self, column: Column, block: int) -> Array:
         key = (self._seed, zlib.crc32(column.name.encode()))

@@ -181,15 +181,6 @@ def of_joints(state: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]
     return {**state, **kept}
 
 
-def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a state with parts, joints and rates replaced by those of another state."""
-    both = {**state, **other}
-    for part in ("joints", "velocity"):
-        if part in both:
-            both[part] = {**state.get(part, {}), **other.get(part, {})}
-    return both
-
-
 def _weights(value: object, scope: Scope) -> dict[str, Any]:
     """Return the weights of a robot's regulator, by names of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)

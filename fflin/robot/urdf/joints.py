@@ -119,8 +119,8 @@ def _limit(found: Element, name: str, of: str) -> float:
     value = decimal(found.attributes[name].strip())
     if math.isnan(value) or (value < 0.0 and name in ("effort", "velocity")):
         found.note(
-            f"limit {name} of {of} is {quoted(found.attributes[name])}, expected a number, of 0 or "
-            "more for effort and velocity; the limit is ignored"
+            f"limit {name} of {of} is {quoted(found.attributes[name])}, expected a number (0 or "
+            "more for effort and velocity); the limit is ignored"
         )
         value = -math.inf if name == "lower" else math.inf
     return max(-UNLIMITED, min(value, UNLIMITED))
@@ -244,7 +244,7 @@ def _check_root(root: Element) -> None:
             nested = inner.tag == "robot" or inner is not child
             if nested and marks.get(inner.tag, {""}) <= {part.tag for part in inner.children}:
                 raise inner.error(
-                    f"<{inner.tag}> inside a <{child.tag}>, where URDF ignores it; put "
+                    f"a <{inner.tag}> is inside a <{child.tag}>, where URDF ignores it; put "
                     f"{quoted(inner.attributes.get('name', ''))} directly into <robot>"
                 )
 
@@ -276,7 +276,7 @@ def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointEl
             raise joint.element.error(
                 f"link {quoted(joint.child)} is the child of {of} and of joint "
                 f"{quoted(other.name)} in line {other.element.line}; a link can have only one "
-                "parent, so remove one joint: URDF has no closed loops"
+                "parent, because URDF has no closed loops; remove one of these joints"
             )
         above[joint.child] = joint
 

@@ -98,7 +98,8 @@ class Element:
                     f"{', '.join(names)}; correct it or remove it"
                 )
             self.note(
-                f"attribute {quoted(name)} of <{self.tag}> is ignored: it is not part of URDF"
+                f"attribute {quoted(name)} of <{self.tag}> is ignored, because it is not part of "
+                "URDF"
             )
 
     def text(self, name: str, of: str) -> str:
