@@ -1,8 +1,13 @@
 """Errors that fflin raises; each message says what was given, what was expected, what to do."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Collection, Iterable
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fflin.analysis.ranks import Margin
 
 # Characters that end a line or command the terminal, names that are too long to be read, and how
 # long a message may be. A part of a path is such a name, the path is not.
@@ -165,7 +170,7 @@ class StabilizabilityError(FflinError, ValueError):
     fflin.base.errors.StabilizabilityError: the inputs cannot stabilise linear momentum ...
     """
 
-    margin: Any = None
+    margin: Margin | None = None
 
 
 class DetectabilityError(FflinError, ValueError):
@@ -186,7 +191,7 @@ class DetectabilityError(FflinError, ValueError):
     fflin.base.errors.DetectabilityError: the outputs do not observe q_b.x, q_b.y, q_b.z, ...
     """
 
-    margin: Any = None
+    margin: Margin | None = None
 
 
 class MissingPackageError(FflinError, ImportError):

@@ -286,7 +286,7 @@ def _listen(port: int) -> socket.socket:
 class _Guarded(RequestHandler):
     """Answers only to this machine's own names, so that no other site's page gets through."""
 
-    def initialize(self, hosts: set[str], **fields: object) -> None:
+    def initialize(self, hosts: set[str], **fields: Any) -> None:
         self._hosts = hosts
         self._fields = fields
 
