@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import unquote
 
 from fflin.base.errors import FileError, InputError, require_known, unknown
@@ -102,7 +102,7 @@ def find_inputs(inputs: str | Path) -> Path:
     return path
 
 
-def folders(given: Any, within: str | Path = "") -> tuple[Path, ...]:
+def folders(given: object, within: str | Path = "") -> tuple[Path, ...]:
     """Return a given folder or list of folders as paths relative to the folder `within`."""
     listed = [given] if isinstance(given, str | os.PathLike) else given
     if not isinstance(listed, Sequence):

@@ -35,7 +35,7 @@ class Scope(NamedTuple):
     urdf_damping: Mapping[str, float]
 
 
-def checked_fields(fields: Mapping[str, Any], scope: Scope) -> dict[str, Any]:
+def checked_fields(fields: Mapping[str, object], scope: Scope) -> dict[str, Any]:
     """Return the checked fields of `Robot.replace`, except for passive joints and inputs."""
     require_known("field of a robot", fields, FIELDS)
     return {name: FIELDS[name](value, scope) for name, value in fields.items()}
@@ -179,15 +179,6 @@ def of_joints(state: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]
     by_name = {part: state[part] for part in ("joints", "velocity") if part in state}
     kept = {part: {k: x for k, x in of.items() if k in names} for part, of in by_name.items()}
     return {**state, **kept}
-
-
-def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a state whose parts, joints and rates are replaced by the entries of another state."""
-    both = {**state, **other}
-    for part in ("joints", "velocity"):
-        if part in both:
-            both[part] = {**state.get(part, {}), **other.get(part, {})}
-    return both
 
 
 def _weights(value: object, scope: Scope) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def load(
     *,
     lock: Lock | None = None,
     package_dirs: Sequence[str | Path] = (),
-    **fields: Any,
+    **fields: object,
 ) -> Robot:
     """Load a robot as a free flyer, by default in zero gravity.
 
@@ -112,7 +112,7 @@ def load(
     return replace(loaded, notes=tuple(notes))
 
 
-def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
+def with_fields(robot: Robot, fields: Mapping[str, object]) -> Robot:
     """Return a robot with new fields; fields of joints are merged with the robot's."""
     if not fields:
         return robot
@@ -154,7 +154,7 @@ def _load(
 
 
 def from_model(
-    model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: Any
+    model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: object
 ) -> Robot:
     """Make a robot from a Pinocchio model that was built from MJCF, SDF or code.
 

@@ -42,7 +42,7 @@ _INVOLVED = 0.1
 _ASYMMETRY = 1e-12
 
 
-def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
+def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
     """Return {joint: body} from the argument of `Robot.with_mass_properties`."""
     given = mapping("bodies", bodies, "body")
     index_of = {"base": ROOT, **{model.names[i]: i for i in range(ROOT, model.njoints)}}
@@ -67,7 +67,7 @@ def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
     return new
 
 
-def given_body(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
+def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
     """Return a body from an inertia, or from changed parts of the old body."""
     of = f"of '{name}'"
     if isinstance(value, pin.Inertia):

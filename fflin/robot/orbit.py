@@ -169,7 +169,7 @@ class CircularOrbit:
         )
 
 
-def checked_orbit(value: Any) -> CircularOrbit | None:
+def checked_orbit(value: object) -> CircularOrbit | None:
     """Return the orbit from an orbit, an altitude [m], a mapping of parts, or None."""
     if value is None or isinstance(value, CircularOrbit):
         return value

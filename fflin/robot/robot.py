@@ -163,7 +163,7 @@ class Robot(Coordinates):
             default = (BaseTorque(), BaseForce(), *map(JointTorque, self.joint_names))
             object.__setattr__(self, "inputs", default)
 
-    def replace(self, **fields: Any) -> Robot:
+    def replace(self, **fields: object) -> Robot:
         """Return a copy of the robot with other inputs, springs, gravity, orbit or other fields.
 
         Parameters
@@ -262,7 +262,7 @@ class Robot(Coordinates):
             find_frame(robot.model, name)
         return robot
 
-    def with_mass_properties(self, bodies: Mapping[str, Any]) -> Robot:
+    def with_mass_properties(self, bodies: Mapping[str, object]) -> Robot:
         """Return a copy of the robot with other masses, centres of mass or inertias.
 
         Parameters
@@ -455,7 +455,7 @@ class Robot(Coordinates):
         """The robot without wheels and modes."""
         return self._unequipped or self
 
-    def _without_motors(self, passive: Any) -> Robot:
+    def _without_motors(self, passive: object) -> Robot:
         """Return the robot without the torque inputs of passive joints."""
         bare = self._bare
         joints = checked_passive(passive, bare.joint, bare.joint_names)

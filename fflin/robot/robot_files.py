@@ -82,7 +82,7 @@ class RobotToml:
                 raise
 
 
-def _flat(key: str, value: Any) -> Any:
+def _flat(key: str, value: object) -> Any:
     """Return the value of a key with flat tables: nested keys are joined by dots."""
     if not isinstance(value, dict):
         return value

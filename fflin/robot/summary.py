@@ -7,7 +7,6 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from string import Template
 from textwrap import fill
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -132,7 +131,7 @@ def _settings(robot: Robot) -> list[str]:
     return [folded(lines)] * bool(lines)
 
 
-def _said(value: Any) -> str:
+def _said(value: object) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key} = {_said(each)}" for key, each in value.items())
     if isinstance(value, tuple | list):

@@ -71,7 +71,7 @@ def welded(robot: Robot, lock: Lock) -> Robot:
     return with_inputs(whole, inputs)
 
 
-def _without(of: Any, gone: Iterable[str], left: Iterable[str]) -> Any:
+def _without(of: object, gone: Iterable[str], left: Iterable[str]) -> Any:
     """Remove the keys that match only removed joints from a mapping and its nested mappings."""
     if not isinstance(of, Mapping):
         return of
@@ -194,7 +194,7 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     return with_inputs(whole, robot.inputs)
 
 
-def _prefixed(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+def _prefixed(values: Mapping[str, object], prefix: str) -> dict[str, Any]:
     return {f"{prefix}.{name}": value for name, value in values.items()}
 
 

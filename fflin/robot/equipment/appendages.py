@@ -147,15 +147,15 @@ class FlexibleAppendage(Appendage):
     @classmethod
     def from_nastran(
         cls,
-        op4: Any,
-        asm: Any,
+        op4: object,
+        asm: object,
         *,
         frame: str,
-        origin: Any = None,
+        origin: object = None,
         modes: int | None = None,
         length: str = "m",
         mass: str = "kg",
-        damping: Any = 0.005,
+        damping: object = 0.005,
         name: str | None = None,
         rigid: bool = False,
     ) -> FlexibleAppendage:
@@ -477,7 +477,7 @@ class Slosh(Appendage):
         return np.column_stack((x, np.cross(z, x), z))
 
 
-def checked_appendages(value: Any) -> tuple[Appendage, ...]:
+def checked_appendages(value: object) -> tuple[Appendage, ...]:
     """Return flexible appendages and slosh, or raise `InputError`."""
     if isinstance(value, Appendage):
         value = [value]

@@ -41,7 +41,7 @@ class Superelement(NamedTuple):
 
 
 def read_superelement(
-    op4: Any, asm: Any, *, origin: Any, modes: int | None, length: str, mass: str
+    op4: object, asm: object, *, origin: Any, modes: int | None, length: str, mass: str
 ) -> Superelement:
     """Return the modes of a superelement, see `FlexibleAppendage.from_nastran`."""
     for what, unit, known in (("length", length, LENGTHS), ("mass", mass, MASSES)):
