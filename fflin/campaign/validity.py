@@ -19,7 +19,6 @@ from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, Loop, checked_loop, settle, settling_runs
-from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -147,7 +146,7 @@ _ENDS = {
 def validity(
     robot: Robot,
     lin: LinearModel,
-    gain: Any,
+    gain: object,
     *,
     attitude: float = 90.0,
     position: float = 0.5,
@@ -155,7 +154,7 @@ def validity(
     samples: int = 100,
     seed: int = 0,
     confidence: float = 0.95,
-    limits: Any = None,
+    limits: object = None,
     executor: Executor | None = None,
     workers: int | None = None,
     threads: int | None = None,
@@ -240,22 +239,21 @@ def validity(
         True: (np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
         False: (levels, _DIRECTIONS + np.arange(samples)),
     }
-    starts = {key: partial(_starts, loop, largest, seed, *each) for key, each in sets.items()}
+    starts = {key: _starts(loop, largest, seed, *each) for key, each in sets.items()}
     runs_of = {key: partial(settling_runs, loop, key, limits, largest["joint"]) for key in sets}
     work = []
-    for key, (at, _) in sets.items():
+    for key, x in starts.items():
         job = runs_of[key]()
         job.choose(engine)  # a wrong argument is refused before anything is compiled
-        some = np.arange(min(LANES, len(at)))
-        work.append((job, Draws(starts[key](some), some.astype(float)), len(at)))
+        work.append((job, Draws(x), len(x)))
     total, done, found = len(_LEVELS) * _DIRECTIONS + samples, 0, {}
     with executor_of(executor, workers) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         expect(progress, work, others, threads)
-        for key, (at, _) in sets.items():
+        for key, x in starts.items():
             how["progress"] = progress and partial(_report, progress, done, total)
-            found[key] = settle(runs_of[key], starts[key], np.arange(len(at)), engine, **how)
-            done += len(at)
+            found[key] = settle(runs_of[key], x, engine, **how)
+            done += len(x)
     error = found[True]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
     outcomes = tuple(OUTCOMES[int(code)] for code in found[False]["outcome"])
     failed = np.array([outcome != "settled" for outcome in outcomes])
@@ -285,11 +283,10 @@ def _starts(
     seed: int,
     levels: Array,
     streams: NDArray[np.intp],
-    runs: NDArray[np.intp],
 ) -> Array:
-    """Return deviations of the initial states of some runs, each from its own random stream."""
+    """Return deviations (N, nx) of the initial states, each from its own random stream."""
     x = []
-    for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
+    for level, stream in zip(levels.tolist(), streams.tolist(), strict=True):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
         x.append(loop.displaced(rng, **_scaled(largest, level)))
     return np.array(x) - loop.start

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, ClassVar, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,13 +67,11 @@ def noises(plan: Plan, size: int, step: int, last: int) -> tuple[NDArray[np.intp
 class Statistics(Protocol):
     """Records of eight parallel runs, slice by slice."""
 
-    FIELDS: ClassVar[tuple[str, ...]]  # names of the outcomes
     every: int  # steps from one row to the next
     span: int  # steps between checks of `over`
 
-    @property
-    def over(self) -> NDArray[np.bool_]:
-        """Mask (LANES,) of the runs that may end early."""
+    def over(self, q: Array, v: Array) -> NDArray[np.bool_]:
+        """Return the mask (LANES,) of the runs that end early at these q and v (LANES, ..)."""
 
     def reset(self) -> None:
         """Begin with eight other runs."""
@@ -173,7 +171,10 @@ class LaneLoop:
                 for lane in going.nonzero()[0]:
                     told[lane] = self._ending(done * times.dt, point.q[:, lane], v[lane])
                 stop = np.array([float(stop_of(each)) for each in told])
-                ending = going & ((stop > 0.0) | (done == steps) | statistics.over[:count])
+                if done % statistics.span == 0:
+                    over = statistics.over(point.q.T, v)[:count] & (stop == 0.0)
+                    stop[over] = STOPS.index("stopped")
+                ending = going & ((stop > 0.0) | (done == steps))
                 if not ending.any():
                     continue
                 self._end(statistics, ending, stop[of_lane], out)
@@ -232,8 +233,9 @@ class LaneLoop:
         diverged = (stop == STOPS.index("diverged"))[:count]
 
         def write(chosen: NDArray[np.bool_]) -> None:
-            for name, values in statistics.outcome(self.done, stop).items():
-                out[name][chosen] = values[:count][chosen]
+            found = statistics.outcome(self.done, stop)
+            for name, rows in out.items():
+                rows[chosen] = found[name][:count][chosen]
 
         if (ending & diverged).any():
             write(ending & diverged)
@@ -257,9 +259,7 @@ class LaneRows:
     The rows of run k before its end are ``kept[:counts[k], :, k]``, with the columns of the loop.
     """
 
-    FIELDS: ClassVar[tuple[str, ...]] = ("steps", "last")
     span = _SPAN
-    over = np.zeros(LANES, dtype=bool)
 
     def __init__(self, loop: LaneLoop, every: int, count: int) -> None:
         self.every, self._count = every, count
@@ -270,6 +270,10 @@ class LaneRows:
     def counts(self) -> list[int]:
         """Numbers of rows before the ends of the runs."""
         return [-(-int(steps) // self.every) for steps in self.ends["steps"]]
+
+    def over(self, q: Array, v: Array) -> NDArray[np.bool_]:
+        """Return that no run ends early."""
+        return np.zeros(len(q), dtype=bool)
 
     def reset(self) -> None:
         """Begin with other runs."""
@@ -307,7 +311,7 @@ def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
     return Recording(t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled")
 
 
-def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> str:
+def engine_of(engine: object, plan: Plan, plant: Plant, *, many: bool = False) -> str:
     """Return the engine for a plan or many runs of it: as requested, or by the rule.
 
     Many runs go by the compiled loop where it can run them; one does if it is long and the machine
@@ -348,7 +352,7 @@ def _reason(plan: Plan, plant: Plant) -> str:
     return ""
 
 
-def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
+def _unmeasured(plan: Plan, plant: Plant, policy: object) -> str:
     """Say why a plan's compensator, if it has one, cannot have its samples."""
     if not isinstance(policy, _OF_OUTPUTS):
         return ""
