@@ -109,7 +109,7 @@ class TomlFile:
         return *table, *[key for key in keys if stands_for_any(key, names)][:1]
 
 
-def flat(table: Mapping[str, Any]) -> dict[str, Any]:
+def flat(table: Mapping[str, object]) -> dict[str, Any]:
     """Return a table in which ``a.b = 1``, read as a table in a table, is the name "a.b"."""
     while any(isinstance(value, dict) and value for value in table.values()):
         pairs = []
@@ -120,7 +120,7 @@ def flat(table: Mapping[str, Any]) -> dict[str, Any]:
     return dict(table)
 
 
-def _values(record: Mapping[str, Any]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+def _values(record: Mapping[str, object]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
     """Yield (place, value) of all values that are not tables or arrays, at any depth."""
     left: list[tuple[tuple[str | int, ...], Any]] = [((), record)]
     while left:

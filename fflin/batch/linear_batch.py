@@ -134,7 +134,7 @@ class LinearBatch(FrozenArrays):
     @overload
     def __getitem__(self, index: slice | Sequence[int] | Array) -> LinearBatch: ...
 
-    def __getitem__(self, index: Any) -> LinearModel | LinearBatch:
+    def __getitem__(self, index: object) -> LinearModel | LinearBatch:
         if isinstance(index, int | np.integer):
             if not -len(self) <= index < len(self):
                 raise IndexError(f"index is {index}, but the batch has {len(self)} points")
@@ -337,7 +337,7 @@ class LinearBatch(FrozenArrays):
         x0[:, 6 : 6 + q_m.shape[1]] = q_m
         return frozen(x0)
 
-    def _named(self, joints: Mapping[str, Any]) -> dict[int, Any]:
+    def _named(self, joints: Mapping[str, object]) -> dict[int, Any]:
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
         require_known("joint", joints, self.joint_names)
@@ -353,7 +353,7 @@ _OPTIONAL_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array | None
 _TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
 
 
-def fields_of_model(common: Mapping[str, Any]) -> dict[str, Any]:
+def fields_of_model(common: Mapping[str, object]) -> dict[str, Any]:
     """Return the fields that are the same for all models and that a batch does not have."""
     return {key: value for key, value in common.items() if key not in _KINDS}
 

@@ -71,7 +71,7 @@ class Dispersions:
     """Dispersions of `monte_carlo`: draws, and the robots and initial states that they give."""
 
     def __init__(
-        self, given: Any, plant: Plant, policy: Any, x0: Array, seed: int, times: Times
+        self, given: object, plant: Plant, policy: object, x0: Array, seed: int, times: Times
     ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
@@ -177,7 +177,7 @@ class Dispersions:
                 self.columns.append(Column(name, kind, where, inverse))
 
     def _by_piece(
-        self, kind: str, spreads: Mapping[str, Any]
+        self, kind: str, spreads: Mapping[str, object]
     ) -> tuple[dict[str, Any], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: name} where it is named alone."""
         robot, found, named = self._plant.robot, dict[str, Any](), dict[str, str]()

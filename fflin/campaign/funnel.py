@@ -287,7 +287,7 @@ def funnel(
     threads: int | None = None,
     progress: Progress | None = None,
     engine: str | None = None,
-    **options: Any,
+    **options: object,
 ) -> Funnel:
     r"""Estimate the initial errors from which a trajectory tracking loop reaches a goal.
 

@@ -93,7 +93,7 @@ class CampaignJob:
         # A worker repeats the construction, since functions bound to a robot cannot be sent.
         return _remade, (self._arguments, self.engine)
 
-    def choose(self, engine: Any) -> None:
+    def choose(self, engine: object) -> None:
         """Set the engine of the runs: the requested one, or the faster one that supports them."""
         self.engine = engine_of(engine, self.plan, self.plant, many=True)
 
@@ -236,7 +236,7 @@ def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, Any]:
     samples = noises(plan, len(parts.law.y), 0, last)[1] if noise_of(plan) else np.zeros(0)
     found: dict[str, Any] = {"noise": samples}
 
-    def collect(name: str, value: Any) -> None:
+    def collect(name: str, value: object) -> None:
         if isinstance(value, tuple):
             for index, each in enumerate(value):
                 collect(f"{name}.{index}", each)

@@ -121,7 +121,7 @@ class Loop:
 
 
 def settling_runs(
-    loop: Loop, predicts: bool, limits: Any, joint: float, fine: int = 0
+    loop: Loop, predicts: bool, limits: object, joint: float, fine: int = 0
 ) -> CampaignJob:
     """Return runs of a loop from displaced states, until they settle or up to a horizon.
 

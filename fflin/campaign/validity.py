@@ -147,7 +147,7 @@ _ENDS = {
 def validity(
     robot: Robot,
     lin: LinearModel,
-    gain: Any,
+    gain: object,
     *,
     attitude: float = 90.0,
     position: float = 0.5,
@@ -155,7 +155,7 @@ def validity(
     samples: int = 100,
     seed: int = 0,
     confidence: float = 0.95,
-    limits: Any = None,
+    limits: object = None,
     executor: Executor | None = None,
     workers: int | None = None,
     threads: int | None = None,

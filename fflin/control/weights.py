@@ -268,7 +268,7 @@ def _negative(what: str, value: float, where: str, definite: bool) -> InputError
 def rule_weights(
     lin: LinearModel,
     name: str | None,
-    given: Mapping[str, Any] | None = None,
+    given: Mapping[str, object] | None = None,
     *,
     wheel_speeds: bool | None = None,
     pace: Pace = AT_A_POINT,

@@ -304,7 +304,7 @@ def _require_inputs(known: Sequence[str], names: Any, count: int) -> None:
     raise InputError(f"{said}; load the robot with the inputs of the trajectory (--inputs)")
 
 
-def _digest(table: Sequence[Sequence[Any]]) -> str:
+def _digest(table: Sequence[Sequence[object]]) -> str:
     """Return the digest of a table without its column of digests."""
     return record.content_digest({"table": csv_table(table)})
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -311,7 +311,7 @@ def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
     return Recording(t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled")
 
 
-def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> str:
+def engine_of(engine: object, plan: Plan, plant: Plant, *, many: bool = False) -> str:
     """Return the engine for a plan or many runs of it: as requested, or by the rule.
 
     Many runs go by the compiled loop where it can run them; one does if it is long and the machine
@@ -352,7 +352,7 @@ def _reason(plan: Plan, plant: Plant) -> str:
     return ""
 
 
-def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
+def _unmeasured(plan: Plan, plant: Plant, policy: object) -> str:
     """Say why a plan's compensator, if it has one, cannot have its samples."""
     if not isinstance(policy, _OF_OUTPUTS):
         return ""

@@ -311,7 +311,7 @@ class Motion(Design):
         return plot_motion(self, path, **options)
 
 
-def require_motion(motion: Any) -> Motion:
+def require_motion(motion: object) -> Motion:
     """Return the motion, or raise `InputError` if it is not a Motion."""
     found: Motion = instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
     return found

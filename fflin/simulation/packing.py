@@ -220,7 +220,7 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
     )
 
 
-def _path(path: policies.Path, plan: Plan, policy: Any, asking: Plant) -> policies.Path:
+def _path(path: policies.Path, plan: Plan, policy: object, asking: Plant) -> policies.Path:
     state, count = asking.state, len(asking.actuation.names)
     if type(policy) is not TrajectoryFeedback:
         return path
@@ -260,5 +260,5 @@ def _path(path: policies.Path, plan: Plan, policy: Any, asking: Plant) -> polici
     )
 
 
-def _places(indices: Any) -> Any:
+def _places(indices: object) -> Any:
     return np.array(indices, dtype=np.intp)

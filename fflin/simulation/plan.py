@@ -162,7 +162,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
     return goal
 
 
-def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law | None:
+def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
     """Return the policy bound to the robot, with checked inputs."""
     if policy is None:
         return None
@@ -170,7 +170,7 @@ def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law |
     return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
 
 
-def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan, Plant]:
+def planned(robot: Robot, policy: object, options: SimulationOptions) -> tuple[Plan, Plant]:
     """Return the checked plan of `simulate` with these options, and the robot that moves."""
     policy = followed(policy, robot)
     times = times_of(policy, options)
@@ -227,7 +227,7 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
 
 
 def _state_of(
-    robot: Robot, policy: Any, frame: Frame | None, reference: pin.SE3 | None
+    robot: Robot, policy: object, frame: Frame | None, reference: pin.SE3 | None
 ) -> StateMap:
     """Return the state of a motion, in the frame and reference of its policy if these are known."""
     lin, _ = feedback_of(policy)

@@ -27,7 +27,7 @@ class Predictor(NamedTuple):
     law: Callable[[], LinearLaw]
 
 
-def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | None:
+def predictor(plant: Plant, policy: Any, linear: object) -> Predictor | None:
     """Return the predictor of a run: the policy's own model, or the given model."""
     if isinstance(linear, bool | np.bool_) and not linear:
         return None
@@ -63,7 +63,7 @@ def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
     return linear
 
 
-def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
+def _law(policy: object, lin: LinearModel) -> Callable[[], LinearLaw] | None:
     """Return a factory of a policy's law in deviations from a point, if the policy is linear."""
     if policy is None:
         return lambda: lambda _: np.zeros(len(lin.u0))

@@ -310,7 +310,7 @@ def courses(motion: Any) -> list[ErrorHistory]:
     return found
 
 
-def pushed(of: Any) -> bool:
+def pushed(of: object) -> bool:
     """Return whether an input of a motion or similar object is a force on the base."""
     return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def simulate(
     robot: Robot,
-    policy: Policy | StateFeedback | GainSchedule | Any = None,
+    policy: Policy | StateFeedback | GainSchedule | object = None,
     *,
     x0: ArrayLike | None = None,
     q0: ArrayLike | None = None,

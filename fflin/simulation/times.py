@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -83,7 +83,7 @@ class Times(NamedTuple):
             )
 
 
-def times_of(policy: Any, options: SimulationOptions) -> Times:
+def times_of(policy: object, options: SimulationOptions) -> Times:
     """Return the times of a simulation of a policy."""
     duration, dt, every, sample = options.duration, options.dt, options.every, options.sample
     follows = tracking_of(policy)
@@ -131,7 +131,7 @@ def times_of(policy: Any, options: SimulationOptions) -> Times:
     return Times(dt, steps, every, samples, late, fastest, thinned)
 
 
-def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> float:
+def _fastest_pole(policy: object, follows: TrajectoryFeedback | None) -> float:
     """Return the largest magnitude [1/s] of a continuous loop's poles; 0 if it is not known."""
     if follows is not None:
         return largest_rate(follows.schedule)
@@ -161,7 +161,7 @@ def _part_of(sample: float, largest: float, *times: float) -> float:
     return sample / least
 
 
-def _positive(name: str, value: Any) -> float:
+def _positive(name: str, value: object) -> float:
     time = number(name, value)
     if not 1.0 / _FOREVER < time <= _FOREVER:
         raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_FOREVER:g} s")
