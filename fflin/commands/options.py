@@ -269,7 +269,7 @@ def add_output_file(
     if kinds:
         group.switch(
             "--force",
-            "replace the file of -o whatever it contains. Without --force, -o replaces only a "
+            "replace the file of -o, whatever it contains. Without --force, -o replaces only a "
             "file that contains a result of the same kind",
         )
         group.set_defaults(kinds=kinds)
