@@ -305,7 +305,7 @@ def _system_of(given: Any) -> System:
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
 
-def _realised(given: Any) -> Any:
+def _realised(given: object) -> Any:
     try:
         if hasattr(given, "to_ss"):
             return given.to_ss()

@@ -195,7 +195,7 @@ _KINDS = (
 )
 
 
-def law_of(given: Any, robot: Any, limits: Any) -> StateLaw | OutputLaw:
+def law_of(given: object, robot: object, limits: object) -> StateLaw | OutputLaw:
     """Return the tables of a policy or design; `limits` as in `simulate`."""
     if not isinstance(given, _KINDS) or isinstance(given, TrajectoryOutputFeedback):
         raise InputError(
@@ -275,9 +275,9 @@ def _model_of(gain: Gain, robot: Robot) -> LinearModel:
 
 
 def _common(
-    given: Any,
+    given: object,
     robot: Robot | None,
-    limits: Any,
+    limits: object,
     names: tuple[str, ...],
     units: tuple[str, ...],
 ) -> dict[str, Any]:
@@ -295,7 +295,7 @@ def _common(
     return {**common, "input_names": names, "input_units": units}
 
 
-def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: Any) -> StateLaw:
+def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: object) -> StateLaw:
     if not policy.schedule.dt:
         raise InputError(
             "the gains are continuous in time, expected sampled gains; design sampled gains with "

@@ -93,7 +93,11 @@ def _compile_alone(
     # Threads wait at _COMPILING, so they never wait for a file lock of their own process.
     with _COMPILING, _between_processes(folder / f"{module}.{name}.lock"):
         if not _kept(folder, module, name):
-            _log.warning("fflin: compiling %s once; the code is stored in %s", what, folder)
+            _log.warning(
+                "fflin: compiling %s; this happens only once, because the code is stored in %s",
+                what,
+                folder,
+            )
             with _seconds_shown(what):
                 return compile(signature)
         return compile(signature)
@@ -139,7 +143,9 @@ def _between_processes(path: Path) -> Iterator[None]:
         try:
             lock.acquire(timeout=_SILENCE)
         except Timeout:
-            _log.warning("fflin: waiting for another process, which compiles in %s", path.parent)
+            _log.warning(
+                "fflin: waiting for another process that compiles the code in %s", path.parent
+            )
             lock.acquire(timeout=_LONGEST_WAIT)
     try:
         yield

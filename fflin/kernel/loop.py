@@ -193,7 +193,7 @@ class RunStatistics(
     namedtuple(
         "RunStatistics",
         "robot law path x_ref q_ref nu_ref kind settled tolerance steps at "
-        "sizes largest_x largest_u largest outside errors inputs",
+        "sizes largest_x largest_u largest outside errors inputs states",
     )
 ):
     """Statistics of the errors of eight runs, and the reference of these errors.
@@ -204,12 +204,12 @@ class RunStatistics(
     - `kind` (nx,) is the kind of each state: 0 without a kind, -1 if its error is not recorded.
     - An error has settled when it stays below the fraction `settled` of its largest value, or below
       `tolerance` (kinds,).
-    - At the `steps` (times,), errors and inputs are recorded.
+    - At the `steps` (times,), the errors of kinds and states, and the inputs, are recorded.
     - `at` is work space. The fields after `at` are laned.
     """
 
 
-_IN_LANES = "sizes largest_x largest_u largest outside errors inputs"
+_IN_LANES = "sizes largest_x largest_u largest outside errors inputs states"
 RUN_STATISTICS = Struct(
     RunStatistics,
     robot=MECHANICS,
@@ -268,7 +268,7 @@ def take(words, rows, first, count):
     """
     stats = _opened_statistics(words)
     at, sizes, kept = stats.at, stats.sizes, 0
-    width, inputs = len(at.q) + len(at.nu), len(stats.largest_u)
+    width, inputs, e = len(at.q) + len(at.nu), len(stats.largest_u), stats.path.e
     while kept < len(stats.steps) and stats.steps[kept] < first:
         kept += 1
     for row in range(count):
@@ -288,6 +288,7 @@ def take(words, rows, first, count):
         if kept < len(stats.steps) and stats.steps[kept] == step:
             vec.copy(sizes, 0, stats.errors, kept * len(sizes), len(sizes))
             vec.copy(rows, begin + width, stats.inputs, kept * inputs, inputs)
+            vec.copy(e, 0, stats.states, kept * len(e), len(e))
             kept += 1
     if count > 0:
         read_state(stats.robot, stats.law, at, 0)

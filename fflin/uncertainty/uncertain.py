@@ -177,7 +177,7 @@ class Uncertain:
         return [self.at(self.values(delta)) for delta in self.draws(n, seed=seed)[0]]
 
     def worst(
-        self, gain: Any, q: Array | None = None, *, samples: int = 200, seed: int = 0
+        self, gain: object, q: Array | None = None, *, samples: int = 200, seed: int = 0
     ) -> Worst:
         """Search the ranges for the worst closed loop u = -K x.
 
@@ -212,7 +212,7 @@ class Uncertain:
         return searched(self, self.lft(q), gain, whole("samples", samples, 1), seed)
 
 
-def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
+def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     """Define the uncertain parameters of a robot and their ranges.
 
     Parameters
@@ -305,7 +305,7 @@ def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> N
             )
 
 
-def _range(one: Parameter, value: Any) -> Range:
+def _range(one: Parameter, value: object) -> Range:
     if one.part[:9] == "direction":
         said = (
             "rotates a unit vector, so that the model is not a rational function of it; use "

@@ -169,7 +169,7 @@ class _Browser:
         self._number = 0
         self._session: dict[str, str] = {}
 
-    def tell(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def tell(self, method: str, **parameters: object) -> dict[str, Any]:
         """Send a command and return the answer."""
         self._number += 1
         command = {"id": self._number, "method": method, "params": parameters, **self._session}
