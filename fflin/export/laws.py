@@ -208,8 +208,8 @@ def law_of(given: Any, robot: Any, limits: Any) -> StateLaw | OutputLaw:
         return _output_law(given, lin, robot, limits)
     if robot is None:
         raise InputError(
-            f"the robot of this {type(given).__name__} is not known, so that its continuous joints "
-            "are not known; give the robot with robot= (--robot)"
+            f"'{getattr(lin or given, 'robot', '')}', the robot of this {type(given).__name__}, is "
+            "not among the robots that load knows by name; give the robot with robot= (--robot)"
         )
     if isinstance(given, GainSchedule):
         given = TrajectoryFeedback(given.trajectory(robot), given)
