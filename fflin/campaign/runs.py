@@ -16,7 +16,7 @@ from fflin.base.errors import FflinError
 from fflin.base.record import content_digest
 from fflin.base.validation import Array
 from fflin.batch.files import MemoryStore
-from fflin.batch.run import ChunkResult, Progress, run_chunks, worker_count
+from fflin.batch.run import ChunkResult, Progress, Rows, run_chunks, worker_count
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.spreads import placed
 from fflin.campaign.statistics import (
@@ -291,20 +291,21 @@ def chunk_size(count: int, workers: int, least: int = LANES) -> int:
 
 def completed(
     job: CampaignJob,
-    starts: Array,
+    rows: Rows,
+    count: int,
     executor: Executor | None = None,
     workers: int | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Run a job from all deviations (N, nx) of the initial state, and return its arrays."""
-    count, compiled = len(starts), job.engine == "compiled"
+    """Run a job on all its rows, and return its arrays."""
+    compiled = job.engine == "compiled"
     threads = (threads or available_cores()) if compiled else 1
     size = chunk_size(count, workers or threads, LANES if compiled else 1)
     store = MemoryStore(count, size, job.shapes)
     failed = run_chunks(
         job,
-        Draws(starts).part,
+        rows,
         store,
         executor=executor,
         threads=threads,
