@@ -29,8 +29,8 @@ from fflin.base.validation import Array, FrozenArrays, Values
 from fflin.linear.model import LinearModel
 
 _LOOPS = (
-    "a periodic joint motion can still rotate the base of the nonlinear robot, by O(e^2) for an "
-    "amplitude e; a linear model does not show this"
+    "a periodic joint motion can still rotate the base of the nonlinear robot, by O(e^2) for a "
+    "joint amplitude e, although the linear model does not show it"
 )
 
 
@@ -290,9 +290,10 @@ def _notes(
     if rotates and any(lin.state_names[i].startswith("q_m.") for i in conserved.kept):
         notes.append(_LOOPS)
     if momenta:
-        notes.append("fflin.momentum_reduction removes the conserved momenta")
+        notes.append("fflin.momentum_reduction removes the conserved momenta from the model")
     if not lin.is_equilibrium():
         notes.append(
-            "the operating point is not an equilibrium; the result is valid for the frozen A and B"
+            "the operating point is not an equilibrium, so the result is valid only for A and B "
+            "frozen at this point"
         )
     return tuple(notes)

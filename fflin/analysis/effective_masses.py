@@ -76,8 +76,8 @@ class EffectiveMasses(FrozenArrays):
     def __str__(self) -> str:
         """Show a table of masses and one of inertias, with their percentages of the total."""
         head = (
-            f"{self.robot}, base clamped: {counted(len(self.frequencies), 'mode')}, effective "
-            "masses about the base frame's origin in the base's axes"
+            f"{self.robot}, base clamped: {counted(len(self.frequencies), 'mode')}; effective "
+            "masses and moments of inertia about the origin of the base frame, in base axes"
         )
         parts = [textwrap.fill(head, width())]
         for values, unit, at in ((self.masses, "kg", 0), (self.inertias, "kg m^2", 3)):
@@ -155,8 +155,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     robot = lin._robot
     if robot is None or len(lin.M) != 6 + robot.n:
         raise InputError(
-            "the model is reduced or from a file, and lacks the robot's springs, which effective "
-            "masses need; give the model that fflin.linearize returns"
+            "effective masses need the springs of the robot, which a reduced model and a model "
+            "from a file do not contain; give the model that fflin.linearize returns"
         )
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     chart = state.chart(lin.q)

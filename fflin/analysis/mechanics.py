@@ -46,7 +46,7 @@ def checked(lin: LinearModel) -> LinearModel:
     if lin.M.shape != (nx // 2, nx // 2) or nx % 2:
         raise InputError(
             f"the model has {nx} states and an inertia of shape {lin.M.shape}, expected half as "
-            "many rows as states; make it with linearize or momentum_reduction"
+            "many rows as states; make the model with linearize or momentum_reduction"
         )
     for name in "ABCD":
         if not np.isfinite(getattr(lin, name)).all():
@@ -61,9 +61,9 @@ def warn_of_stiffness(lin: LinearModel) -> None:
     fastest = float((np.abs(rate_matrix(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
     if 0.0 < lin.mean_motion < _SLOWEST * fastest:
         warnings.warn(
-            f"orbital effects on '{lin.robot}' at {lin.mean_motion:.3g} rad/s are smaller than the "
-            f"rounding error of joint vibrations at {fastest:.3g} rad/s, so that the result may "
-            "miss the orbital effects; lock these joints",
+            f"orbital effects on '{lin.robot}' at {lin.mean_motion:.3g} rad/s are smaller than "
+            f"the rounding error of joint vibrations at {fastest:.3g} rad/s, so the result may "
+            "miss the orbital effects; lock the joints that vibrate",
             FflinWarning,
             stacklevel=4,
         )

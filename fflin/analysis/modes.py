@@ -168,14 +168,18 @@ class Modes:
     def notes(self) -> tuple[str, ...]:
         """Remarks on missing data, and on modes whose stability rounding error leaves undecided."""
         undecided = tuple(
-            f"undecided: whether the mode at {mode.frequency:.4g} rad/s grows or decays; its real "
-            f"part is {mode.margin:.1g} times its rounding error"
+            f"undecided: the mode at {mode.frequency:.4g} rad/s may grow or decay, because the "
+            f"real part of its pole is only {mode.margin:.1g} times the rounding error"
             for mode in self.modes
             if 0.1 < abs(mode.margin) < 10.0
         )
         if not self.modes or self.modes[0].energy:
             return undecided
-        return (*undecided, "a model from a file lacks the kinetic energies of the bodies")
+        return (
+            *undecided,
+            "the kinetic energies of the bodies are unknown, because the model was loaded from a "
+            "file",
+        )
 
     @property
     def poles(self) -> Complex:
@@ -199,7 +203,7 @@ class Modes:
         said = [head]
         if self.unstable:
             poles = ", ".join(f"{mode.pole:.5g}" for mode in self.unstable)
-            said.append(f"unstable: poles with a positive real part {poles}")
+            said.append(f"unstable poles (positive real part): {poles}")
         said += [f"note: {note}" for note in self.notes]
         parts = [textwrap.fill(each, width()) for each in said]
         rows = [["rad/s", "damping", "decay [s]", "", "kinetic energy"]]
@@ -241,11 +245,12 @@ class Modes:
             cells = [f"{100.0 * part:.1f}" if part > 1e-12 else "." for part in parts]
             of_masses.append([name, f"{clamped[name]:.6g}" if name in clamped else ".", *cells])
         title = (
-            "effective masses and moments of inertia in % of the body that carries the appendage, "
-            "or of its file's inertia, about the appendage's frame"
+            "effective masses and moments of inertia about the frame of the appendage, in % of "
+            "the inertia of the body that carries it, or of the inertia in its file"
         )
         return [
-            f"modes of appendages, with the link free and clamped\n{grid(rows, 'rrll')}",
+            "modes of the appendages, with the link that carries them free and "
+            f"clamped\n{grid(rows, 'rrll')}",
             f"{textwrap.fill(title, width())}\n{grid(of_masses, 'lrrrrrrr')}",
         ]
 

@@ -77,9 +77,9 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
 def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[str, ...]:
     """Say what is decided within rounding, and the two answers: `count` states, or others."""
     return tuple(
-        f"undecided: {shape(lin, at)} is taken as {'' if change < 0 else 'not '}{what}; "
-        f"the test value is {ratio:.1g} times its rounding error; "
-        f"{count} or {count + change} of {len(lin.A)} states are {what}"
+        f"undecided: {shape(lin, at)} counts as {'' if change < 0 else 'not '}{what}, but the "
+        f"test value is only {ratio:.1g} times its rounding error; {count} or {count + change} "
+        f"of {len(lin.A)} states are {what}"
         for ratio, at, change in margin.doubts
     )
 
@@ -87,8 +87,8 @@ def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[
 def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
     """Say where rounding decides whether the slowest motion decays."""
     return tuple(
-        f"undecided: whether {shape(lin, at)} decays by itself; its decay rate "
-        f"is {ratio:.1g} times its rounding error; the model may or may not be {what}"
+        f"undecided: {shape(lin, at)} may or may not decay by itself, because its decay rate is "
+        f"only {ratio:.1g} times its rounding error; the model may or may not be {what}"
         for ratio, at, _ in settling.doubts
     )
 

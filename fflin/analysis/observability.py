@@ -233,7 +233,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
         found = [_gramian(A, B @ B.T, lin.dt, duration) for A, B in pairs]
     if not all(np.isfinite(W).all() for W in found):
         raise InputError(
-            f"duration is {duration:g} s, over which the state transition overflows; shorten it"
+            f"duration is {duration:g} s, over which the state transition matrix overflows; give "
+            "a shorter duration"
         )
     reach, show = (0.5 * (W + W.T) for W in found)
     return Gramians(reach, show, np.inf if duration is None else duration)
@@ -246,8 +247,8 @@ def _require_decay(lin: LinearModel) -> None:
     if growth >= -_DECAY * (1.0 if lin.dt else size):
         slow = f"a pole of modulus {1.0 + growth:.6g}" if lin.dt else f"a pole at {growth:.3g} 1/s"
         raise InputError(
-            f"the model is not asymptotically stable ({slow}), so its Gramians are not finite; "
-            "give duration="
+            f"the model is not asymptotically stable ({slow}), so its infinite-time Gramians are "
+            "not finite; give duration= for finite-time Gramians"
         )
 
 

@@ -185,9 +185,9 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
         axes.set_xlabel("relative error (dot) and tolerance (bar)")
         verdict = f"OK: {len(check.rows)} errors within tolerance"
         if bad:
-            verdict = f"FAILED: {len(bad)} of {len(check.rows)} exceed their tolerance"
+            verdict = f"FAILED: {len(bad)} of {len(check.rows)} errors exceed their tolerance"
         exact = len(check.rows) - len(rows)
-        axes.set_title(f"{check.title}\n{verdict}; {exact} are zero, not drawn", loc="left")
+        axes.set_title(f"{check.title}\n{verdict}; {exact} are zero (not drawn)", loc="left")
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)
     return figure
 

@@ -305,7 +305,8 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     rest = [name for name in part.state_names if name not in angles]
     if len(rest) == len(part.M):
         raise StabilizabilityError(
-            "the model contains wheel speeds alone; remove the damping of the wheels"
+            "wheel speeds would be the only states of the reduced model; remove the damping of "
+            "the wheels"
         )
     return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
 

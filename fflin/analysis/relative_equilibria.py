@@ -83,7 +83,9 @@ class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
             growth = float(one.poles.real.max()) if one.stable is False else 0.0
             sizes = [f"{moment:.5g}" for moment in one.moments]
             rows.append([*sizes, said, f"{growth:.4g}" if growth else "."])
-        return f"principal moments of inertia, 4 attitudes per row\n{grid(rows, 'rrrlr')}"
+        return (
+            f"principal moments of inertia; each row stands for 4 attitudes\n{grid(rows, 'rrrlr')}"
+        )
 
 
 def relative_equilibria(
@@ -141,8 +143,8 @@ def relative_equilibria(
     field = field_of(robot, frame_of(robot, frame))
     if field is None:
         raise InputError(
-            f"'{robot.name}' is not in orbit; give it an orbit: "
-            "robot.replace(orbit=fflin.CircularOrbit(altitude=...)), --orbit on the command line"
+            f"'{robot.name}' is not in orbit; give it an orbit by "
+            "robot.replace(orbit=fflin.CircularOrbit(altitude=...)) or --orbit"
         )
     if robot.stored_momentum:
         raise InputError(

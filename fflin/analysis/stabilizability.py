@@ -44,7 +44,7 @@ def require_stabilizable(lin: LinearModel) -> None:
         words = missed.format(listed(grouped(lost)))
         if count:
             words += (
-                ", give each joint that no input moves a spring (--stiffness, stiffness=), or "
+                ", add a spring to any joint that no input moves (--stiffness, stiffness=), or "
                 "design on fflin.momentum_reduction(lin)"
             )
     _conclude(StabilizabilityError, words, found.notes, found.margin)
@@ -52,7 +52,7 @@ def require_stabilizable(lin: LinearModel) -> None:
 
 def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` that names what no output shows and what does not settle."""
-    missed = "the outputs do not observe {}, which do not decay by themselves; add outputs"
+    missed = "the outputs do not observe {}, whose motion does not decay by itself; add outputs"
     if len(lin.A) < 2 * len(lin.M):
         _check_reach(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, DetectabilityError)
         return
@@ -76,15 +76,15 @@ def _conclude(
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
     """Raise `InputError` that names the marginally stable modes without a weight in Q."""
-    missed = "Q has no weight on {}, which do not decay by themselves; give these states weights"
+    missed = "Q has no weight on {}, whose motion does not decay by itself; add a weight there"
     _check_reach(lin, A.T, _root(Q), "weighted by Q", missed)
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
     """Raise `InputError` that names the modes on the boundary that no disturbance reaches."""
     missed = (
-        "W does not excite {}, which do not decay by themselves, so that a steady-state filter "
-        "would not correct these states; give the noise on these states an intensity"
+        "W does not excite {}, whose motion does not decay by itself, so a steady-state filter "
+        "would not correct its estimate; give the noise there a positive intensity"
     )
     _check_reach(lin, lin.A, _root(W), "excited by W", missed)
 
@@ -138,9 +138,9 @@ def _check_reach(
         missed += list(vectors[rank:])
         margin &= judged(ratios, vectors.T, rank)
     doubts = tuple(
-        f"undecided: {_dominant(at[None], lin.state_names)} is taken as "
-        f"{'' if change < 0 else 'not '}{what}; the test value is "
-        f"{ratio:.2g} times its rounding error; another machine may decide otherwise"
+        f"undecided: {_dominant(at[None], lin.state_names)} counts as "
+        f"{'' if change < 0 else 'not '}{what}, but the test value is only {ratio:.2g} times its "
+        "rounding error, so another machine may decide otherwise"
         for ratio, at, change in margin.doubts
     )
     words = complaint.format(_dominant(np.array(missed), lin.state_names)) if missed else ""

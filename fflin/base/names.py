@@ -113,5 +113,5 @@ def joints_by_name(
     return found
 
 
-def _is_pattern(key: Any) -> bool:
+def _is_pattern(key: object) -> bool:
     return "*" in str(key) or "?" in str(key)

@@ -63,7 +63,7 @@ class NoRoomError(FileError):
     """Error for a file whose content does not fit into memory."""
 
 
-def write_record(path: Path, record: Mapping[str, Any], *, checksummed: bool) -> None:
+def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool) -> None:
     """Write a record in the format of the ending, with its digest if `checksummed`."""
     check_ending(path, FORMATS)
     require_finite(record)
@@ -99,7 +99,7 @@ def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
         raise FileError(f"{shown(path)}: not a {what} saved by {by} ({reason(error)})") from None
 
 
-def require_finite(record: Mapping[str, Any]) -> None:
+def require_finite(record: Mapping[str, object]) -> None:
     """Raise `InputError` if a value is not finite."""
     for key, value in record.items():
         if isinstance(value, np.ndarray | float) and not np.isfinite(value).all():
@@ -108,7 +108,7 @@ def require_finite(record: Mapping[str, Any]) -> None:
             )
 
 
-def text(value: Any) -> str:
+def text(value: object) -> str:
     """Return a text of a record."""
     return value if isinstance(value, str) else str(np.asarray(value).item())
 
@@ -120,12 +120,12 @@ def texts(value: Any) -> tuple[str, ...]:
     return (value,) if isinstance(value, str) else tuple(map(text, value))
 
 
-def figure(value: Any) -> float:
+def figure(value: object) -> float:
     """Return a figure of a record."""
     return float(np.asarray(value).item())
 
 
-def figures(value: Any) -> dict[str, float]:
+def figures(value: object) -> dict[str, float]:
     """Return a group of figures of a record."""
     group = value if isinstance(value, dict) else json.loads(text(value))
     return {key: figure(x) for key, x in group.items()}
@@ -151,7 +151,7 @@ def content_digest(entries: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def _to_npz(record: Mapping[str, Any], checksummed: bool) -> bytes:
+def _to_npz(record: Mapping[str, object], checksummed: bool) -> bytes:
     buffer = io.BytesIO()
     groups = {k: json.dumps(group) for k, group in record.items() if isinstance(group, dict)}
     plain: dict[str, Any] = {key: np.asarray(value) for key, value in {**record, **groups}.items()}
@@ -179,7 +179,7 @@ def verify_checksum(record: Record) -> bool:
     return checksum is not None
 
 
-def _to_mat(record: Mapping[str, Any], checksummed: bool) -> bytes:
+def _to_mat(record: Mapping[str, object], checksummed: bool) -> bytes:
     from scipy.io import savemat
 
     buffer = io.BytesIO()
@@ -203,13 +203,15 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
     elif _MAT_NEARLY.search(content[:_MAT_TEXT]):
         raise ValueError("its header was damaged or edited")
     if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
-        hint = ", but of version 7.3; write it with save -v7" * (content[124:128] == b"\0\2IM")
+        hint = ", but of version 7.3; save the data in MATLAB with save -v7" * (
+            content[124:128] == b"\0\2IM"
+        )
         raise ValueError(f"not a MATLAB file of level 5{hint}")
     record = {key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()}
     return {key: value for key, value in record.items() if key[:2] != "__"}, checksummed
 
 
-def _of_mat(value: Any) -> Any:
+def _of_mat(value: object) -> Any:
     """Return a variable of MATLAB: an array, text, a list of cells or rows, a dict of a struct."""
     if not isinstance(value, np.ndarray):
         return value
@@ -221,8 +223,8 @@ def _of_mat(value: Any) -> Any:
     return [_of_mat(cell) for cell in value.ravel(order="F")] if value.dtype.kind == "O" else value
 
 
-def _to_json(record: Mapping[str, Any], checksummed: bool) -> bytes:
-    def plain(value: Any) -> Any:
+def _to_json(record: Mapping[str, object], checksummed: bool) -> bytes:
+    def plain(value: object) -> Any:
         if isinstance(value, np.ndarray) and value.dtype.kind == "c":
             return {"real": value.real.tolist(), "imag": value.imag.tolist()}
         return value.tolist() if isinstance(value, np.ndarray) else value
@@ -238,10 +240,14 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
     if found:
         body = content[: len(content) - len(found.group())]
         if hashlib.sha256(body).hexdigest().encode() != found.group(1):
-            raise ValueError(f"{DAMAGED}; to read it as it is, delete the line {CHECKSUM}")
+            raise ValueError(
+                f"{DAMAGED}; to read the file without this check, delete its line {CHECKSUM}"
+            )
     record: Record = json.loads(content)
     if record.pop(CHECKSUM, None) is not None and not found:
-        raise ValueError(f"its line {CHECKSUM} is not in the form that fflin writes; delete it")
+        raise ValueError(
+            f"its line {CHECKSUM} is not in the form that fflin writes; delete this line"
+        )
     return record, bool(found)
 
 
@@ -298,7 +304,7 @@ class Design(FrozenArrays):
         return cls._read(path)
 
     @classmethod
-    def _read(cls: type[Kind], path: str | Path, **given: Any) -> Kind:
+    def _read(cls: type[Kind], path: str | Path, **given: object) -> Kind:
         """Do what `load` does; what no file has is `given`."""
         source, name = as_path(path), cls.__name__
         with reading(source, name):
@@ -331,7 +337,7 @@ def _saved(cls: type[Design]) -> list[Field[Any]]:
     return [item for item in own if item.type != "Robot"]
 
 
-def _value(cls: type[Design], item: Field[Any], raw: Any) -> Any:
+def _value(cls: type[Design], item: Field[object], raw: object) -> Any:
     """Return a field's value, with the type of its annotation."""
     for kind, of_kind in (("float", figure), ("str", text), ("tuple", texts)):
         if str(item.type).startswith(kind):

@@ -48,7 +48,7 @@ class TomlFile:
             text = content.decode("utf-8-sig").replace("\r\n", "\n")
             for number, written in enumerate(text.split("\n"), start=1):
                 if written.count(".") > _DOTS_LIMIT:
-                    raise ValueError(f"more than {_DOTS_LIMIT} dots (at line {number})")
+                    raise ValueError(f"more than {_DOTS_LIMIT} dots in one line (at line {number})")
             self.record: dict[str, Any] = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
             found = re.search(r"at line (\d+)", str(error))
@@ -61,7 +61,11 @@ class TomlFile:
         for place, value in _values(self.record):
             # Python refuses to write longer integers, as a message would.
             if type(value) is int and value.bit_length() > 10_000:
-                raise self.error(f"{place[-1]} has too many digits; write it as 1e30", *place)
+                raise self.error(
+                    f"{place[-1]} has too many digits; write a number of this size in the form "
+                    "1e30",
+                    *place,
+                )
 
     def line(self, *place: str | int) -> int:
         """Return the line number of a key, or of the table that contains it."""
@@ -105,7 +109,7 @@ class TomlFile:
         return *table, *[key for key in keys if stands_for_any(key, names)][:1]
 
 
-def flat(table: Mapping[str, Any]) -> dict[str, Any]:
+def flat(table: Mapping[str, object]) -> dict[str, Any]:
     """Return a table in which ``a.b = 1``, read as a table in a table, is the name "a.b"."""
     while any(isinstance(value, dict) and value for value in table.values()):
         pairs = []
@@ -116,7 +120,7 @@ def flat(table: Mapping[str, Any]) -> dict[str, Any]:
     return dict(table)
 
 
-def _values(record: Mapping[str, Any]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+def _values(record: Mapping[str, object]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
     """Yield (place, value) of all values that are not tables or arrays, at any depth."""
     left: list[tuple[tuple[str | int, ...], Any]] = [((), record)]
     while left:

@@ -69,7 +69,7 @@ def number(name: str, value: Any) -> float:
     return result
 
 
-def positive(name: str, value: Any, unit: str = "", hint: str = "") -> float:
+def positive(name: str, value: object, unit: str = "", hint: str = "") -> float:
     """Return a number above 0, or raise `InputError`."""
     found = number(name, value)
     if found <= 0.0:
@@ -78,7 +78,7 @@ def positive(name: str, value: Any, unit: str = "", hint: str = "") -> float:
     return found
 
 
-def share(name: str, value: Any) -> float:
+def share(name: str, value: object) -> float:
     """Return a number between 0 and 1, or raise `InputError`."""
     found = number(name, value)
     if not 0.0 < found < 1.0:
@@ -86,7 +86,7 @@ def share(name: str, value: Any) -> float:
     return found
 
 
-def refuse_masked(name: str, value: Any) -> None:
+def refuse_masked(name: str, value: object) -> None:
     """Raise `InputError` if an entry is masked, because NumPy may ignore the mask."""
     ma: Any = sys.modules.get("numpy.ma")  # what is masked has loaded it
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
@@ -100,12 +100,12 @@ def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
     return value
 
 
-def truth(name: str, value: Any) -> bool:
+def truth(name: str, value: object) -> bool:
     """Return whether a switch is on, or raise `InputError` if it is not True or False."""
     return bool(instance(name, value, bool | np.bool_ | int, "True or False"))
 
 
-def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
+def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int:
     """Return a whole number within limits, or raise `InputError` with the given value."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise InputError(f"{name} is {value!r}, expected a whole number of at least {least}")
@@ -115,13 +115,13 @@ def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
     return int(value)
 
 
-def by_name(name: str, value: Any, of_what: str) -> Mapping[str, Any]:
+def by_name(name: str, value: object, of_what: str) -> Mapping[str, Any]:
     """Return a mapping whose keys are names, or raise `InputError`."""
     mapping: Mapping[str, Any] = instance(name, value, Mapping, f"{{{of_what}: value}}")
     return mapping
 
 
-def untied(key: str, value: Any) -> tuple[Any, bool]:
+def untied(key: str, value: object) -> tuple[Any, bool]:
     """Return a range, and whether one value in it is meant for all that its key names."""
     if not isinstance(value, Mapping):
         return value, False
@@ -130,13 +130,13 @@ def untied(key: str, value: Any) -> tuple[Any, bool]:
     return value["range"], truth(f"tied of '{key}'", value["tied"])
 
 
-def numbers(name: str, value: Any, of_what: str, each: str) -> dict[str, float]:
+def numbers(name: str, value: object, of_what: str, each: str) -> dict[str, float]:
     """Return {name: finite float} of a mapping by names; an error calls one of them `each`."""
     values = by_name(name, value, of_what)
     return {key: number(f"{each} '{key}'", entry) for key, entry in values.items()}
 
 
-def dimension(name: str, value: Any) -> int:
+def dimension(name: str, value: object) -> int:
     """Return the number of dimensions of an array, or raise `InputError`."""
     return _as_array(name, value).ndim
 
@@ -168,7 +168,7 @@ def as_double(name: str, value: ArrayLike) -> Array:
     return array.astype(np.float64)
 
 
-def _as_array(name: str, value: Any) -> Any:
+def _as_array(name: str, value: object) -> Any:
     try:
         return np.asarray(value)
     except ValueError:
@@ -185,7 +185,7 @@ class FrozenArrays:
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 object.__setattr__(self, item.name, frozen(value.copy()))
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         # NumPy makes arrays anew, and writeable, for deepcopy and most of pickle's protocols.
         for value in state.values():
             if isinstance(value, np.ndarray):

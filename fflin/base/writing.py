@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fflin.base.errors import FileError, InputError
 
@@ -34,7 +34,7 @@ class CommandFiles(NamedTuple):
 _of_command: ContextVar[CommandFiles | None] = ContextVar("files of a command", default=None)
 
 
-def as_path(path: Any) -> Path:
+def as_path(path: object) -> Path:
     """Return a path, or raise `InputError` if the value is not a path."""
     if not isinstance(path, str | os.PathLike) or "\0" in str(path):
         raise InputError(f"{path!r} is not a path")
@@ -110,7 +110,7 @@ def _same_file(path: str | Path, other: Path) -> bool:
         return False
 
 
-def csv_table(rows: Iterable[Iterable[Any]]) -> bytes:
+def csv_table(rows: Iterable[Iterable[object]]) -> bytes:
     """Return the content of a CSV file."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)

@@ -174,7 +174,7 @@ def grid(
     """
     start = configuration(robot, joints, base)
     if not isinstance(axes, Mapping) or not axes:
-        raise InputError(f"the axes of the grid are {axes!r}, expected {{joint: values}}")
+        raise InputError(f"the axes of the grid are {axes!r}, expected a mapping {{joint: values}}")
     checked: dict[str, Array] = {}
     for name, values in axes.items():
         robot.joint(name)
@@ -244,7 +244,7 @@ def random_configurations(
     count, seed = whole("count", count, 1), whole("seed", seed, 0)
     start = configuration(robot, base=base)
     if not (ranges is None or isinstance(ranges, Mapping)):
-        raise InputError(f"ranges is {ranges!r}, expected {{joint: (low, high)}}")
+        raise InputError(f"ranges is {ranges!r}, expected a mapping {{joint: (low, high)}}")
     names = robot.joint_names
     given = joints_by_name("joint", ranges or {}, names, lambda name: robot.joint(name).name)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
@@ -288,7 +288,9 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
         if not low <= high:
             raise InputError(f"{what} is {low:g} to {high:g}, expected low <= high")
         if math.isinf(high - low):
-            raise InputError(f"{what} is {low:g} to {high:g}, its width overflows; narrow it")
+            raise InputError(
+                f"{what} is {low:g} to {high:g}, and its width overflows; give a narrower range"
+            )
         return low, high
     if joint.unbounded:
         return _TURN

@@ -118,7 +118,7 @@ def _chunk_checksums(varying: Mapping[str, Array], count: int, chunk: int) -> ND
 
 
 def file_checksum(
-    texts: Mapping[str, str], chunk: int, checksums: Any, constants: Mapping[str, Array]
+    texts: Mapping[str, str], chunk: int, checksums: object, constants: Mapping[str, Array]
 ) -> NDArray[np.uint8]:
     """Return the SHA-256 (32,) of a file's content, with the checksums of its chunks of rows."""
     whole = content_digest({**texts, "chunk": chunk, CHUNK_CHECKSUMS: checksums, **constants})

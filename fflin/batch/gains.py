@@ -113,13 +113,15 @@ class GainBatch(Design):
         axes = {name: np.unique(column) for name, column in columns.items() if np.ptp(column) > 0.0}
         if not axes:
             raise InputError(
-                "all points of the batch are the same, expected a grid; make one with fflin.grid"
+                "all points of the batch are the same, expected a grid; make the points with "
+                "fflin.grid"
             )
         points = np.unique(self.joint_positions, axis=0)
         if not len(points) == len(self) == np.prod([len(values) for values in axes.values()]):
             raise InputError(
-                f"the {len(self)} points are not on a grid over {', '.join(axes)}, which "
-                "interpolation needs; make the points with fflin.grid"
+                f"interpolation needs all points of a grid over {', '.join(axes)}, but the "
+                f"{len(self)} points of the batch are not a full grid; make the points with "
+                "fflin.grid"
             )
         return axes
 

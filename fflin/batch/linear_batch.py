@@ -134,7 +134,7 @@ class LinearBatch(FrozenArrays):
     @overload
     def __getitem__(self, index: slice | Sequence[int] | Array) -> LinearBatch: ...
 
-    def __getitem__(self, index: Any) -> LinearModel | LinearBatch:
+    def __getitem__(self, index: object) -> LinearModel | LinearBatch:
         if isinstance(index, int | np.integer):
             if not -len(self) <= index < len(self):
                 raise IndexError(f"index is {index}, but the batch has {len(self)} points")
@@ -297,7 +297,7 @@ class LinearBatch(FrozenArrays):
         if own != (found["urdf_sha256"], found["locked"], _joints(found["state_names"]), n):
             raise InputError(
                 f"robot '{robot.name}' differs from the robot '{found['robot']}' of the batch in "
-                "its URDF, joints or orbit; give the robot that the batch was made of"
+                "its URDF, joints or orbit; give the robot for which the batch was made"
             )
         from fflin.linear.linearization import prepare
 
@@ -337,7 +337,7 @@ class LinearBatch(FrozenArrays):
         x0[:, 6 : 6 + q_m.shape[1]] = q_m
         return frozen(x0)
 
-    def _named(self, joints: Mapping[str, Any]) -> dict[int, Any]:
+    def _named(self, joints: Mapping[str, object]) -> dict[int, Any]:
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
         require_known("joint", joints, self.joint_names)
@@ -353,7 +353,7 @@ _OPTIONAL_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array | None
 _TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
 
 
-def fields_of_model(common: Mapping[str, Any]) -> dict[str, Any]:
+def fields_of_model(common: Mapping[str, object]) -> dict[str, Any]:
     """Return the fields that are the same for all models and that a batch does not have."""
     return {key: value for key, value in common.items() if key not in _KINDS}
 
@@ -381,7 +381,7 @@ def _checked_fields(
     shapes = {"A": (nx, nx), "B_lower": (nx // 2, nu), "C": (ny, nx), "D": (ny, nu), "f0": (nx,)}
     for key, shape in shapes.items():
         if found[key].shape[1:] != shape:
-            raise ValueError(f"{key} has shape {found[key].shape[1:]} a point, expected {shape}")
+            raise ValueError(f"{key} has shape {found[key].shape[1:]} per point, expected {shape}")
     return found
 
 
@@ -391,8 +391,8 @@ def _joints(state_names: Sequence[str]) -> tuple[str, ...]:
 
 def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:
     raise InputError(
-        f"the {what} is not in the file and is computed from the robot; load the batch with "
-        f"LinearBatch.load(path, robot), with the unchanged robot '{name}'"
+        f"the {what} is computed from the robot, which the file does not contain; load the batch "
+        f"with LinearBatch.load(path, robot), where robot is the unchanged '{name}'"
     )
 
 

@@ -59,7 +59,9 @@ class Job(Protocol):
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         """Shape of each array that it makes, for one row."""
 
-    def run(self, rows: Any, start: int, out: Mapping[str, Array] | None = None, /) -> ChunkResult:
+    def run(
+        self, rows: object, start: int, out: Mapping[str, Array] | None = None, /
+    ) -> ChunkResult:
         """Do the rows from number `start` on, into arrays `out` or new ones; on any thread."""
 
 
@@ -137,7 +139,7 @@ def failure(
     failed: list[Done],
     store: FileStore | MemoryStore,
     of_what: str,
-    made: Callable[[Any], Any],
+    made: Callable[[object], object],
 ) -> SweepError:
     """Return the error that names the chunks that failed."""
     kept = np.ones(store.count, dtype=bool)
@@ -154,14 +156,15 @@ def failure(
         store.discard()
     elif store.part is not None:
         message += (
-            f"; the results of the other chunks are in {store.part}, from which the same call "
-            "resumes"
+            f"; the results of the other chunks are in {store.part}, and the same call resumes "
+            "from this file"
         )
     else:
         batch = made(kept)
         message += (
             "; the results of the other chunks are in the attribute `batch` of this error. With "
-            "out='NAME.h5' (-o NAME.h5), the same call resumes"
+            "out='NAME.h5' (-o NAME.h5), the results would be saved, and the same call would "
+            "resume"
         )
     return SweepError(message, tuple((*span, reason) for span, _, reason in failed), batch)
 
@@ -241,7 +244,7 @@ def executor_of(executor: Executor | None, workers: int | None) -> Iterator[Exec
         yield pool
 
 
-def work(job: bytes, rows: Any, start: int) -> ChunkResult:
+def work(job: bytes, rows: object, start: int) -> ChunkResult:
     """Process a chunk in a worker, by a pickled job."""
     return _unpickled(job).run(rows, start)
 

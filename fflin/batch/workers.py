@@ -45,7 +45,7 @@ class OwnWorkers(Executor):
         self._lock, self._closed = Lock(), False
         self._processes: dict[Any, Connection] = {}
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(self, fn: Callable[..., object], /, *args: object, **kwargs: object) -> Future[Any]:
         """Have a process call a function; `WorkerDied` is raised where it dies of it."""
         return self._threads.submit(self._do, (fn, args, kwargs))
 
@@ -61,7 +61,7 @@ class OwnWorkers(Executor):
         for process in list(self._processes):
             self._end(process)
 
-    def _do(self, task: Any) -> Any:
+    def _do(self, task: object) -> Any:
         process = getattr(self._mine, "process", None) or self._start()
         pipe = self._processes[process]
         try:

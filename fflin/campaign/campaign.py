@@ -243,7 +243,7 @@ class Campaign(FrozenArrays):
     def _beyond(self, sizes: Array) -> Array:
         return np.where(self.stopped[:, None], np.inf, sizes)
 
-    def met(self, condition: Any) -> Any:
+    def met(self, condition: object) -> Any:
         """Return a mask (N,) of the runs that meet a condition.
 
         Parameters
@@ -266,7 +266,7 @@ class Campaign(FrozenArrays):
             met = met & bound.met
         return met
 
-    def fraction(self, condition: Any, *, confidence: float = 0.95) -> Estimate:
+    def fraction(self, condition: object, *, confidence: float = 0.95) -> Estimate:
         """Return the fraction of runs that meet a condition, with its Clopper-Pearson interval."""
         met, sure = int(self.met(condition).sum()), share("confidence", confidence)
         return intervals.clopper_pearson(met, len(self), sure)

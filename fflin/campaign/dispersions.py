@@ -51,14 +51,13 @@ class Column(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """Drawn values (N, k) of some runs, and the numbers of these runs (N,)."""
+    """Drawn values (N, k) of some runs."""
 
     drawn: Array
-    run: Array
 
     def part(self, start: int, stop: int) -> Draws:
         """Return the runs from `start` up to `stop`."""
-        return Draws(self.drawn[start:stop], self.run[start:stop])
+        return Draws(self.drawn[start:stop])
 
 
 class Bound(NamedTuple):
@@ -72,7 +71,7 @@ class Dispersions:
     """Dispersions of `monte_carlo`: draws, and the robots and initial states that they give."""
 
     def __init__(
-        self, given: Any, plant: Plant, policy: Any, x0: Array, seed: int, times: Times
+        self, given: object, plant: Plant, policy: object, x0: Array, seed: int, times: Times
     ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
@@ -106,8 +105,9 @@ class Dispersions:
             own, tied = untied(str(key), spread)
             if kind == "fails" and isinstance(own, int | float):
                 raise InputError(
-                    f"'{key}' is {own:g}, a standard deviation, which does not describe a time of "
-                    "failure; give (least, largest) in s, a list of times in s or a distribution"
+                    f"'{key}' is {own:g}, a standard deviation, but a time of failure needs "
+                    "another description; give (least, largest) in s, a list of times in s or a "
+                    "distribution"
                 )
             inverse = deviation_of if kind == "noise" else inverse_of
             spreads = by_kind.setdefault(kind, {})
@@ -133,7 +133,7 @@ class Dispersions:
             one, two = pieces[at], pieces[of]
             if at == of or (one.joint == two.joint and (one.whole or two.whole)):
                 names = f"'{self.names[column]}' and '{self.names[other]}'"
-                raise InputError(f"{names} disperse the same mass; disperse only one of the two")
+                raise InputError(f"{names} disperse the same mass; disperse only one of them")
 
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:
@@ -144,8 +144,8 @@ class Dispersions:
             )
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
-                f"{kind} is dispersed, but this policy is continuous, and only a sampled policy "
-                f"has a {kind}; give sample=, a multiple of dt (--sample on the command line)"
+                f"{kind} is dispersed, but the policy is continuous, and {kind} applies only to "
+                "a sampled policy; give sample=, a multiple of dt (--sample on the command line)"
             )
         label = dict(zip(names, names, strict=True))
         try:
@@ -177,7 +177,7 @@ class Dispersions:
                 self.columns.append(Column(name, kind, where, inverse))
 
     def _by_piece(
-        self, kind: str, spreads: Mapping[str, Any]
+        self, kind: str, spreads: Mapping[str, object]
     ) -> tuple[dict[str, Any], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: name} where it is named alone."""
         robot, found, named = self._plant.robot, dict[str, Any](), dict[str, str]()
@@ -186,7 +186,7 @@ class Dispersions:
             for name in bodies_named(robot, f"{kind} to disperse", key):
                 if name in named:
                     raise InputError(
-                        f"'{named[name]}' and '{key}' are one link; give its {kind} only once"
+                        f"'{named[name]}' and '{key}' are the same link; give its {kind} only once"
                     )
                 found[name] = spreads[key]
                 named |= {name: key} if key in alone else {}
@@ -212,7 +212,7 @@ class Dispersions:
                 low, high = max(start, first), min(stop, first + _BLOCK)
                 values = self._drawn(column, first // _BLOCK, high - first)
                 drawn[low - start : high - start, at] = values[low - first : high - first]
-        return Draws(drawn, np.arange(start, stop, dtype=float))
+        return Draws(drawn)
 
     def _uniform(self, column: Column, block: int) -> Array:
         key = (self._seed, zlib.crc32(column.name.encode()))
@@ -234,7 +234,8 @@ class Dispersions:
                 kept = np.asarray(column.inverse(uniform[:count]), dtype=float)
             except Exception as error:  # each distribution has its own
                 raise InputError(
-                    f"the distribution of '{column.name}' cannot be drawn: {reason(error)}"
+                    f"no values can be drawn from the distribution of '{column.name}': "
+                    f"{reason(error)}"
                 ) from None
             self._kept[column.name, block] = kept
         return kept

@@ -49,7 +49,7 @@ _OPTIONS = {each.name for each in fields(SimulationOptions)} - {
 
 def monte_carlo(
     robot: Robot,
-    policy: Any,
+    policy: object,
     dispersions: Mapping[str, Any],
     *,
     runs: int,
@@ -68,7 +68,7 @@ def monte_carlo(
     out: str | Path | None = None,
     overwrite: bool = False,
     engine: str | None = None,
-    **options: Any,
+    **options: object,
 ) -> Campaign:
     r"""Run a Monte Carlo campaign: simulate a policy many times with dispersed parameters.
 
@@ -257,7 +257,7 @@ def monte_carlo(
     return replace(Campaign.load(store.path), _job=job)
 
 
-def _goals(given: Any, until: Any, shapes: Any, header: dict[str, Any]) -> list[str]:
+def _goals(given: object, until: object, shapes: Any, header: dict[str, Any]) -> list[str]:
     """Return the goals; an invalid goal is refused before any run."""
     goals = [given] if isinstance(given, str) else given
     if not isinstance(goals, list | tuple):
@@ -298,8 +298,8 @@ def _earlier(path: Path, request: str) -> Campaign | None:
         if read_rows(path, verify=False)[2].get("request") == request:
             return Campaign.load(path)
     raise FileError(
-        f"{path} exists, and this call did not make it; name another file, or replace it with "
-        "overwrite=True (--force)"
+        f"{path} exists and was not written by this call; name another file, or replace the file "
+        "with overwrite=True (--force)"
     )
 
 
@@ -319,7 +319,9 @@ def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
         return chunk_size(min(_STAGE, runs) if staged else runs, workers)
     size = -(-given // LANES) * LANES
     if staged and _STAGE % size:
-        raise InputError(f"chunk is {given}, expected a divisor of {_STAGE} with until, such as 32")
+        raise InputError(
+            f"chunk is {given}, but with until it must be a divisor of {_STAGE}, such as 32"
+        )
     return size
 
 

@@ -202,8 +202,8 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
         axes[-1].set(xlabel="t [s]", ylabel="success rate [%]", ylim=(0.0, 102.0))
         figure.legend(loc="outside lower center", ncols=2)
         figure.suptitle(
-            f"{funnel.robot.name}: errors from which every run ends with {funnel.goal}\n"
-            f"half-axes; {percent * funnel.confidence:g} % confidence",
+            f"{funnel.robot.name}: initial errors from which every run ends with "
+            f"{funnel.goal}\nhalf-axes; {percent * funnel.confidence:g} % confidence",
             fontsize=10,
         )
     return figure

@@ -121,17 +121,17 @@ class Validity(FrozenArrays):
         order = "the order of the error cannot be determined"
         if np.isfinite(self.slope):
             order = f"the error grows with the displacement to the power {self.slope:.3f}"
-        beyond = " and beyond" if self.trusted == self.largest else ""
+        beyond = ", the largest displacement tested" if self.trusted == self.largest else ""
         first = shown(_scaled(self.largest, float(self.sampled[0])), self.joint_unit)
         lines = [
             f"{self.robot}: the linear loop predicts the nonlinear loop within "
             f"{100.0 * TRUSTED:g} % up to {trusted}{beyond}; {order}",
-            f"every run settled up to {holds}: {self.inside} of {self.inside} runs, "
-            f"so at least {100.0 * self.inside_rate:.1f} % settle there ({sure} confidence)"
+            f"up to {holds}, every run settled ({self.inside} of {self.inside}), so at least "
+            f"{100.0 * self.inside_rate:.1f} % of such displacements settle ({sure} confidence)"
             if self.inside
             else f"the run from the smallest displacement tried, {first}, did not settle",
-            f"up to {largest}: {self.settled} of {count} runs settled, "
-            f"so {100.0 * low:.1f} to {100.0 * high:.1f} % settle there ({sure} confidence)"
+            f"up to {largest}, {self.settled} of {count} runs settled, so {100.0 * low:.1f} to "
+            f"{100.0 * high:.1f} % of such displacements settle ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]
         return folded(lines)
@@ -147,7 +147,7 @@ _ENDS = {
 def validity(
     robot: Robot,
     lin: LinearModel,
-    gain: Any,
+    gain: object,
     *,
     attitude: float = 90.0,
     position: float = 0.5,
@@ -155,7 +155,7 @@ def validity(
     samples: int = 100,
     seed: int = 0,
     confidence: float = 0.95,
-    limits: Any = None,
+    limits: object = None,
     executor: Executor | None = None,
     workers: int | None = None,
     threads: int | None = None,
@@ -235,29 +235,29 @@ def validity(
     confidence = share("confidence", confidence)
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
+    sets, work = [], []
     # Level and random stream of each run that predicts, and of each random run.
-    sets = {
-        True: (np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
-        False: (levels, _DIRECTIONS + np.arange(samples)),
-    }
-    starts = {key: partial(_starts, loop, largest, seed, *each) for key, each in sets.items()}
-    runs_of = {key: partial(settling_runs, loop, key, limits, largest["joint"]) for key in sets}
-    work = []
-    for key, (at, _) in sets.items():
-        job = runs_of[key]()
+    for predicts, at, streams in (
+        (True, np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
+        (False, levels, _DIRECTIONS + np.arange(samples)),
+    ):
+        runs_of = partial(settling_runs, loop, predicts, limits, largest["joint"])
+        starts = partial(_starts, loop, largest, seed, at, streams)
+        sets.append((runs_of, starts, len(at)))
+        job = runs_of()
         job.choose(engine)  # a wrong argument is refused before anything is compiled
-        some = np.arange(min(LANES, len(at)))
-        work.append((job, Draws(starts[key](some), some.astype(float)), len(at)))
-    total, done, found = len(_LEVELS) * _DIRECTIONS + samples, 0, {}
+        work.append((job, Draws(starts(np.arange(min(LANES, len(at))))), len(at)))
+    total, done, found = sum(count for *_, count in sets), 0, []
     with executor_of(executor, workers) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         expect(progress, work, others, threads)
-        for key, (at, _) in sets.items():
+        for runs_of, starts, count in sets:
             how["progress"] = progress and partial(_report, progress, done, total)
-            found[key] = settle(runs_of[key], starts[key], np.arange(len(at)), engine, **how)
-            done += len(at)
-    error = found[True]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
-    outcomes = tuple(OUTCOMES[int(code)] for code in found[False]["outcome"])
+            found.append(settle(runs_of, starts, count, engine, **how))
+            done += count
+    predicted, random = found
+    error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
+    outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])
     failed = np.array([outcome != "settled" for outcome in outcomes])
     inside, bound, rate = until_failure(failed, confidence)
     return Validity(

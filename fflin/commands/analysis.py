@@ -128,7 +128,7 @@ def _add_uncertain(commands: parser.Commands) -> None:
         repeatable=True,
         required=True,
     )
-    what = "A, B1 .. D22 and the blocks"
+    what = "the matrices A, B1 .. D22 and the blocks of Delta"
     options.add_output_file(uncertain.group(parser.OUTPUT), what, parser.RECORD, "LFT")
 
 

@@ -190,7 +190,7 @@ def start_of(
 ) -> tuple[Array, Array | None]:
     """Return the initial q (nq,) and v (nv,) of the arguments or of the robot."""
     from fflin.base.names import rates_by_name
-    from fflin.robot.fields import combined
+    from fflin.dynamics.points import combined
 
     point, number = robot.point, arguments.relative_equilibrium
     if number:  # the start is relative to this pose, which replaces the pose of the point
@@ -340,7 +340,7 @@ def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
 
 def target_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:
     """Return q (nq,) and v (nv,) of the target, which is the point of the robot by default."""
-    from fflin.robot.fields import combined
+    from fflin.dynamics.points import combined
 
     refuse_pose(arguments, "target_")
     state = combined(robot.point, robot.target)

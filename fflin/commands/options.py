@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from typing import Any
 
 from fflin.base.errors import FflinWarning
 from fflin.commands.parser import (
@@ -27,7 +26,9 @@ from fflin.commands.parser import (
 class _FormerName(argparse.Action):
     """Option under its former name, which warns of the new one."""
 
-    def __call__(self, _: Any, given: argparse.Namespace, value: Any, option: Any = None) -> None:
+    def __call__(
+        self, _: object, given: argparse.Namespace, value: object, option: object = None
+    ) -> None:
         new = f"--{self.dest.replace('_', '-')}"
         warnings.warn(
             f"{option} has the new name {new}; write {new} {value}", FflinWarning, stacklevel=2
@@ -268,7 +269,7 @@ def add_output_file(
     if kinds:
         group.switch(
             "--force",
-            "replace the file of -o whatever it contains. Without --force, -o replaces only a "
+            "replace the file of -o, whatever it contains. Without --force, -o replaces only a "
             "file that contains a result of the same kind",
         )
         group.set_defaults(kinds=kinds)

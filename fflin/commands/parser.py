@@ -238,7 +238,9 @@ def command(
 class _Help(argparse.Action):
     """Option that prints the short help, or the full help if its value is `all`."""
 
-    def __call__(self, parser: argparse.ArgumentParser, _: Any, value: Any, *__: Any) -> None:
+    def __call__(
+        self, parser: argparse.ArgumentParser, _: object, value: object, *__: object
+    ) -> None:
         text = parser.format_help() if value == "all" else short_help(parser)
         parser._print_message(text, sys.stdout)
         parser.exit()

@@ -77,7 +77,7 @@ def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> Non
         raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 
-def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def once(option: str, pairs: list[tuple[str, object]]) -> dict[str, Any]:
     """Return the pairs of a repeatable option; refuse a name that is given twice."""
     values = dict(pairs)
     if len(values) < len(pairs):
@@ -106,7 +106,7 @@ def configuration_of(
 def placed(
     robot: Robot,
     option: str,
-    pairs: list[tuple[str, Any]],
+    pairs: list[tuple[str, object]],
     base: pin.SE3 | None = None,
     of_state: Mapping[str, float] | None = None,
 ) -> Array:

@@ -79,9 +79,9 @@ def _add_funnel(commands: parser.Commands) -> None:
         "contains. This option replaces --trajectory",
         Path,
     )
-    goal = f"largest error allowed at the end of a run. NAME is {_ERRORS}"
+    goal = f"largest error allowed at the end of a run: {_ERRORS}"
     runs.add("--goal", goal, parser.assignment, repeatable=True)
-    within = "largest error allowed at any time of a run. NAME is as in --goal"
+    within = "largest error allowed at any time of a run, named as in --goal"
     runs.add("--within", within, parser.assignment, repeatable=True)
     options.add_limits(runs)
     runs.add("--knots", "number of knots to test", int, default=10)

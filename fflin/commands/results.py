@@ -111,7 +111,7 @@ def _record(command: str, report: Report, files: list[Path]) -> dict[str, Any]:
     return head | {key: x for key, x in plain(report.result).items() if key not in head}
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return a value of JSON: arrays as lists, results as objects, and null if not finite."""
     import numpy as np
 
@@ -127,7 +127,7 @@ def plain(value: Any) -> Any:
     return value if not isinstance(value, float) or math.isfinite(value) else None
 
 
-def _fields(value: Any) -> Any:
+def _fields(value: object) -> Any:
     """Return the fields of a result, as its file has them if it can be saved."""
     from fflin.base.record import Design, record_of
     from fflin.linear.files import record_of as record_of_model

@@ -139,7 +139,7 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
 
 def _plan(arguments: argparse.Namespace) -> Report:
     from fflin.control.plan import plan
-    from fflin.robot.fields import combined
+    from fflin.dynamics.points import combined
 
     robot = load_robot(arguments)
     state = combined(robot.point, robot.start)

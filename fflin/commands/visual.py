@@ -106,7 +106,7 @@ def pictures(
 
 
 def _view(arguments: argparse.Namespace) -> Report:
-    from fflin.robot.fields import combined
+    from fflin.dynamics.points import combined
     from fflin.view.live import Live
     from fflin.view.visualize import visualize
 

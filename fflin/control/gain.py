@@ -130,7 +130,7 @@ class Gain(Design):
         if self.K.size <= _LARGE:
             shown = f"\n\n{matrix(self.K, self.input_names, self.state_names)}"
         else:
-            shown = ": large, not shown; save() writes every entry (-o FILE)"
+            shown = " is too large to show; save() (-o FILE) writes every entry"
         fold = partial(textwrap.fill, width=width())
         more = {
             "not regulated": _unregulated(self),
@@ -185,8 +185,8 @@ class Gain(Design):
 
         if self._lin is None:
             raise InputError(
-                "the gain was read from a file, which does not contain the model; design the gain "
-                "again, or use lin.to(tool) and T_u K T_left"
+                "the gain was read from a file, which does not contain the model; design the "
+                "gain again, or compute T_u K T_left with the matrices of lin.to(tool)"
             )
         return tool_gain(self._lin, self.K, tool)
 
@@ -250,11 +250,15 @@ def fragility(gain: Gain) -> str:
     margins = gain.margins
     if margins.disk >= _FRAGILE:
         return ""
-    remedy = "shorten dt, or slow the loop" if gain.dt else "give a diagonal R"
+    remedy = (
+        "shorten dt, or slow the loop as the default weights do"
+        if gain.dt
+        else "give a diagonal R, such as the R of the default weights"
+    )
     return (
         f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
         f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or model error makes the loop "
-        f"unstable; {remedy}, as the default weights do"
+        f"unstable; {remedy}"
     )
 
 
@@ -267,10 +271,10 @@ def one_sided(gain: Gain) -> str:
     if not thrusters:
         return ""
     return (
-        f"the design requires thrusters to pull ({listed(thrusters)}): negative thrust is cut at "
-        "zero, so the poles and margins do not hold; design with torque and force on the base, "
-        "and allocate them to thrusters with fflin.Allocation. `fflin lqr` and `fflin "
-        "simulate` allocate by default if the thrusters push in every direction"
+        f"the gain commands negative thrust ({listed(thrusters)}), which is cut at zero, so the "
+        "poles and margins do not hold; design with torque and force on the base, and allocate "
+        "them to the thrusters with fflin.Allocation. `fflin lqr` and `fflin simulate` do so by "
+        "default if the thrusters can push in every direction"
     )
 
 
@@ -280,7 +284,7 @@ def _unregulated(gain: Gain) -> str:
     if not left:
         return ""
     return (
-        f"{listed(left)} (no input reaches them, or other states determine them; "
+        f"{listed(left)} (not reached by any input, or determined by other states; "
         "wheel_speeds=True (--wheel-speeds) regulates all controllable wheel speeds)"
     )
 

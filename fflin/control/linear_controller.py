@@ -130,17 +130,17 @@ class LinearController(Feedback):
         felt = lin.D.any(axis=1) & by.D.any(axis=0)
         if felt.any():
             raise InputError(
-                "D of the controller forms an algebraic loop with "
-                f"{listed(compress(lin.output_names, felt))}, which depends directly on the "
-                "inputs; set D to 0 for this output, for example with a low-pass filter"
+                "the controller and the model form an algebraic loop through "
+                f"{listed(compress(lin.output_names, felt))}, because D of both is nonzero "
+                "there; set D of the controller to 0 there, for example with a low-pass filter"
             )
         dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
         dt = lin.dt or dt if dt < 0.0 else dt  # of a sampled system without a sampling time
         if dt < 0.0 or (lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt):
             raise InputError(
-                f"the controller has dt = {'unknown' if dt < 0.0 else f'{dt:g} s'}, the model has "
-                f"dt = {lin.dt:g} s (0: continuous); give the controller the dt of the model, or "
-                "the continuous model and the controller's own dt"
+                f"the controller has dt = {'unknown' if dt < 0.0 else f'{dt:g} s'}, but the "
+                f"model has dt = {lin.dt:g} s (0: continuous); give a controller with the dt of "
+                "the model, or give the continuous model"
             )
         self.system = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
         self.sign = 1.0  # `system` has it from here on
@@ -305,7 +305,7 @@ def _system_of(given: Any) -> System:
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
 
-def _realised(given: Any) -> Any:
+def _realised(given: object) -> Any:
     try:
         if hasattr(given, "to_ss"):
             return given.to_ss()
@@ -387,8 +387,9 @@ def _indices(
     named = not all(map(_NUMBERED.fullmatch, names))
     if size != len(names if named else known):
         raise InputError(
-            f"the controller has {size} {kind}s and {len(names) if named else 'no'} names, "
-            f"expected a name for each, or one {kind} for each {of} of the model: {listed(known)}"
+            f"the controller has {size} {kind}s and {len(names) if named else 'no'} names for "
+            f"them, expected a name for each {kind}, or one {kind} for each {of} of the model: "
+            f"{listed(known)}"
         )
     if not named:
         return list(range(size))

@@ -137,9 +137,7 @@ def lqr(
     if Q is None and R is None and N is None:
         Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
     elif weights is not None or Q is None or R is None:
-        raise InputError(
-            "give the weights either by both Q and R, or by weights='urdf' or 'identity' alone"
-        )
+        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     Q, R, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:

@@ -41,7 +41,7 @@ def mpc(
     *,
     horizon: int = 20,
     dt: float | None = None,
-    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = "urdf",
+    limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     Qf: Weight | str = "steady",
     weights: str | None = None,
 ) -> Mpc | TrajectoryMpc:
@@ -135,8 +135,8 @@ def mpc(
     names, at, rows = _limits(source, limits)
     if samples**2 * (len(at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
         raise InputError(
-            f"horizon is {samples} samples with {len(at)} limits, which makes the program too "
-            "large; give a shorter horizon or fewer limits"
+            f"horizon is {samples} samples with {len(at)} limits, which makes the optimisation "
+            "problem too large; give a shorter horizon or fewer limits"
         )
     designed: Any = _along if isinstance(source, LinearTrajectory) else _about
     made, stages = designed(source, (Q, R, weights), Qf, samples, dt, names, rows)

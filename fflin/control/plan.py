@@ -47,7 +47,7 @@ def plan(
     v0: ArrayLike | None = None,
     knots: int = 101,
     hold: str = "previous",
-    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = "urdf",
+    limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     R: Weight | None = None,
     free: Sequence[str] = (),
     progress: bool | None = None,
@@ -251,14 +251,15 @@ def _failure(
         if far[i] > _REACHED
     ]
     advice = (
-        "give a longer duration, wider limits, more knots, or name states with a free end value by "
-        "`free` (--free-end)"
+        "give a longer duration, wider limits or more knots, or leave the final value of some "
+        "states free with `free` (--free-end)"
     )
     internal = all(isinstance(each, JointTorque | ReactionWheel) for each in robot.inputs)
     if internal and asked[state.groups.omega_b].any() and asked[state.groups.v_b].any():
         advice = (
-            "the inputs cannot change the momentum, which determines omega_b and v_b at the end; "
-            "name omega_b and v_b by `free` (--free-end), and r_b or q_b if the goal moves the base"
+            "the inputs cannot change the momentum, so omega_b and v_b at the end cannot be "
+            "chosen; leave them free with `free` (--free-end), and also r_b or q_b if the goal "
+            "moves the base"
         )
     return InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
@@ -274,4 +275,4 @@ def _note(shooting: Shooting, made: _Made, size: Array) -> str:
         at = (k + (part + 1) / _PARTS) * shooting.h[0]
         percent = f"{100.0 * made.most:.2g} %"
         most = f"exceeds the limit of {shooting.state.names[i]} by {percent} at t = {at:.4g} s"
-    return f"the integrated motion {most}, checked at {_PARTS} points per interval"
+    return f"the integrated motion {most} (checked at {_PARTS} points per interval)"

@@ -117,9 +117,10 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
         poles.set_title("poles of A - B K as ln(z)/dt" if gain.dt else "poles of A - B K")
         low, high = gain.margins.gain
         figure.suptitle(
-            f"{gain.robot}{f', sampled at {gain.dt:g} s' if gain.dt else ''}: loop of each input, "
-            f"the others closed\nmargins for simultaneous changes: phase {gain.margins.phase:.3g} "
-            f"deg, gain {low:.2g} to {high:.3g} (disk margin {gain.margins.disk:.3g})",
+            f"{gain.robot}{f', sampled at {gain.dt:g} s' if gain.dt else ''}: open loop at each "
+            "input, with the loops of all other inputs closed\nmargins for simultaneous "
+            f"changes: phase {gain.margins.phase:.3g} deg, gain {low:.2g} to {high:.3g} (disk "
+            f"margin {gain.margins.disk:.3g})",
             x=0.02,
             ha="left",
         )

@@ -329,8 +329,9 @@ class Loop(Compensation):
             self._clock.tick(t)
         elif len(self.estimate) and len(self.rates) != self.stages + 1:
             raise InputError(
-                "the states of a continuous controller are integrated by fflin.simulate; give it "
-                "the LinearController itself as the policy, or sample the controller"
+                "the states of a continuous controller are integrated by fflin.simulate; pass "
+                "the LinearController itself to fflin.simulate as the policy, or sample the "
+                "controller"
             )
         measure, near = self._there(t)
         state, x = measure.state, measure.state.read(q, v, near=near)

@@ -113,9 +113,7 @@ def tvlqr(
     steady = asks_steady(Qf)
     given, by_rule = list[Any]((Q, R)), Q is None and R is None
     if not by_rule and (weights is not None or Q is None or R is None):
-        raise InputError(
-            "give the weights either by both Q and R, or by weights='urdf' or 'identity' alone"
-        )
+        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     end: Any = steady_end(traj) if steady or by_rule else None
     if by_rule:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
@@ -160,7 +158,7 @@ _OF_REGULATOR = ("state_names", "input_names", "verified", "q", "v", "u", "hold"
 _OF_FILTER = ("state_names", "input_names", "output_names", "verified")
 
 
-def asks_steady(value: Any, name: str = "Qf", kind: str = "a weight") -> bool:
+def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool:
     """Return whether a value is "steady"; raise `InputError` if it is another string."""
     if isinstance(value, str) and value != "steady":
         raise InputError(f"{name} is {value!r}, expected 'steady' or {kind}")

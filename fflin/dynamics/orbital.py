@@ -73,7 +73,7 @@ class OrbitField:
             f"frame, where the linear gravity gradient has an error of up to {100.0 * error:.2g} %"
         )
         if error > _USELESS:
-            raise InputError(f"{message}; give it an orbit nearer to the robot")
+            raise InputError(f"{message}; choose an orbit that is nearer to the robot")
         if error > _COARSE:
             warnings.warn(message, FflinWarning, stacklevel=7)
 

@@ -11,7 +11,6 @@ from fflin.base.names import by_name, input_keys, rates_by_name
 from fflin.base.validation import Array, instance, numbers, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.robot.fields import combined
 from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, by_joint
 from fflin.robot.robot import Robot
@@ -79,6 +78,15 @@ def base_of(state: Mapping[str, Any]) -> pin.SE3:
     return pin.SE3(rotation, np.array(state.get("position", np.zeros(3))))
 
 
+def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a state whose parts, joints and rates are replaced by the entries of another state."""
+    both = {**state, **other}
+    for part in ("joints", "velocity"):
+        if part in both:
+            both[part] = {**state.get(part, {}), **other.get(part, {})}
+    return both
+
+
 def start_of(robot: Robot) -> tuple[Array, Array]:
     """Return the initial configuration (nq,) and velocity (nv,) of a robot."""
     start = combined(robot.point, robot.start)
@@ -93,7 +101,7 @@ def point_of(
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:
-            raise InputError("x0 is given together with q0 or v0; give x0 alone, or q0 and v0")
+            raise InputError("x0 is given together with q0 or v0; give either x0, or q0 and v0")
         return state.to_pinocchio(x0)
     if q0 is None and v0 is None:
         return default()

@@ -107,14 +107,14 @@ class Inertia:
         involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
         if lost:
             raise SingularInertiaError(
-                f"the mass matrix of '{name}' is singular at this configuration: a motion of "
-                f"{involved} moves no mass; choose another configuration, give the links an "
-                "inertia, or lock one of the joints"
+                f"the mass matrix of '{name}' is singular at this configuration, because a "
+                f"motion of {involved} moves no mass; choose another configuration, give the "
+                "links an inertia, or lock a joint"
             )
         warnings.warn(
-            f"the mass matrix of '{name}' is ill-conditioned, so that A and B have a relative "
-            f"error of about {coupling * _EPS:.0e}: {involved} move almost no mass relative to "
-            "each other; check the inertias of the links",
+            f"the mass matrix of '{name}' is ill-conditioned, so A and B have a relative error "
+            f"of about {coupling * _EPS:.0e}. A joint motion of {involved} moves almost no mass; "
+            "check the inertias of the links",
             FflinWarning,
             stacklevel=6,
         )

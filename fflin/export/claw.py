@@ -90,8 +90,8 @@ class CLaw:
         ]
         if len(found) != 1:
             raise FileError(
-                f"{source}: contains {len(found)} pairs of .json and .c, expected one pair that "
-                "fflin.write_c wrote; if there are several laws, choose one with name="
+                f"{source}: contains {len(found)} pairs of .json and .c files, expected one pair "
+                "that fflin.write_c wrote; if there are several pairs, choose one with name="
             )
         [self.name] = found
         about, header, code = (source / f"{self.name}.{end}" for end in ("json", "h", "c"))
@@ -221,4 +221,4 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
         try:
             return ctypes.CDLL(str(library))
         except OSError as error:
-            raise InputError(f"'{compiler}' made no library of {source}: {error}") from None
+            raise InputError(f"'{compiler}' made no library from {source}: {error}") from None

@@ -195,7 +195,7 @@ _KINDS = (
 )
 
 
-def law_of(given: Any, robot: Any, limits: Any) -> StateLaw | OutputLaw:
+def law_of(given: object, robot: object, limits: object) -> StateLaw | OutputLaw:
     """Return the tables of a policy or design; `limits` as in `simulate`."""
     if not isinstance(given, _KINDS) or isinstance(given, TrajectoryOutputFeedback):
         raise InputError(
@@ -208,8 +208,8 @@ def law_of(given: Any, robot: Any, limits: Any) -> StateLaw | OutputLaw:
         return _output_law(given, lin, robot, limits)
     if robot is None:
         raise InputError(
-            f"'{getattr(lin or given, 'robot', '')}', the robot of this {type(given).__name__}, is "
-            "not among the robots that load knows by name; give the robot with robot= (--robot)"
+            f"the robot of this {type(given).__name__} is not known, and the C code depends on "
+            "its continuous joints; give the robot with robot= (--robot)"
         )
     if isinstance(given, GainSchedule):
         given = TrajectoryFeedback(given.trajectory(robot), given)
@@ -260,24 +260,24 @@ def _model_of(gain: Gain, robot: Robot) -> LinearModel:
     if gain.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
             f"the gain was designed for another '{gain.robot}' than the given '{robot.name}': "
-            "their masses or URDFs differ; give robot= (--robot), the robot of the design, or "
-            "design the gain again"
+            "their masses or URDFs differ; give the robot of the design with robot= (--robot), "
+            "or design the gain again"
         )
     frame: Any = gain.frame
     state = StateMap(robot, frame=frame, reference=pin.XYZQUATToSE3(gain.placement))
     if gain.state_names != state.names:
         raise InputError(
-            f"the states of the gain differ from those of '{robot.name}'; give robot= (--robot), "
-            "the robot that the gain was designed for"
+            f"the states of the gain differ from those of '{robot.name}'; give the robot of the "
+            "design with robot= (--robot)"
         )
     q, v = state.to_pinocchio(gain.x0)
     return linearize(robot, q, v, gain.u0, frame=frame, reference=state.reference)
 
 
 def _common(
-    given: Any,
+    given: object,
     robot: Robot | None,
-    limits: Any,
+    limits: object,
     names: tuple[str, ...],
     units: tuple[str, ...],
 ) -> dict[str, Any]:
@@ -287,15 +287,15 @@ def _common(
         own = [x for _, group in named_inputs(robot.inputs if robot else ()) for x in group]
         if robot is None or tuple(own) != names:
             raise InputError(
-                "limits need the robot with the inputs of the law; give robot= (--robot), the "
-                "robot that the law was designed for"
+                "limits need the robot with the inputs of the law; give the robot of the design "
+                "with robot= (--robot)"
             )
         low, high = input_limits(robot, chosen_limits(robot, limits)[0])
     common = {"title": type(given).__name__, "robot": robot, "low": low, "high": high}
     return {**common, "input_names": names, "input_units": units}
 
 
-def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: Any) -> StateLaw:
+def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: object) -> StateLaw:
     if not policy.schedule.dt:
         raise InputError(
             "the gains are continuous in time, expected sampled gains; design sampled gains with "
@@ -343,8 +343,8 @@ def _output_law(
         units = [lin.input_units, lin.output_units]
     if not given.dt and len(terms.A):
         raise InputError(
-            "the controller is continuous, expected a sampled one; use "
-            "LinearController.sampled(dt), or design it for lin.discretize(dt)"
+            "the controller is continuous, expected a sampled controller; use "
+            "LinearController.sampled(dt), or design the controller for lin.discretize(dt)"
         )
     return OutputLaw(
         **_common(given, robot, limits, inputs, units[0]),

@@ -29,11 +29,11 @@ _DOUBLE_ERROR = 1e-14
 
 
 def write_c(
-    law: Any,
+    law: object,
     folder: str | Path,
     *,
     robot: Robot | None = None,
-    limits: Any = None,
+    limits: object = None,
     name: str = "controller",
     real: str = "double",
 ) -> Path:
@@ -120,7 +120,7 @@ def write_c(
     return target
 
 
-def digest_of(about: dict[str, Any], header: bytes, source: bytes) -> str:
+def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
     """Return the digest that ties the description of a law to its code."""
     parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
     return content_digest(parts)
@@ -266,7 +266,7 @@ class _Texts:
             "continuous": _whole(law.continuous),
         }
 
-    def array(self, values: Any) -> str:
+    def array(self, values: object) -> str:
         """Return an initialiser of an array."""
         values = np.asarray(values)
         if values.ndim > 1:
@@ -275,7 +275,9 @@ class _Texts:
             with np.errstate(over="ignore"):
                 narrow = values.astype(np.float32)
             if (np.isfinite(values) & ~np.isfinite(narrow)).any():
-                raise InputError("the law has numbers too large for a float; take real='double'")
+                raise InputError(
+                    "the law has numbers that are too large for a float; use real='double'"
+                )
             values = narrow.astype(float)
         end = "F" if self.real == "float" else ""
         shown = ", ".join(f"{x!r}{end}" for x in values.tolist())

@@ -23,10 +23,10 @@ BODIES = {
     "saturn": (3.793120749e16, 60268000.0),
 }
 
-# A lower altitude [m] over the earth is probably in km.
+# An altitude [m] over the earth below this value was probably meant in km.
 _LOWEST = 80e3
 
-_FOLLOWS: Any = None  # from the others
+_FOLLOWS: Any = None  # default of fields that follow from other fields
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class CircularOrbit:
         given = [value for value in (self.altitude, self.mean_motion) if value is not None]
         if len(given) != 1:
             raise InputError(
-                f"an orbit has altitude {self.altitude} [m] and mean_motion {self.mean_motion} "
-                "[rad/s]; give exactly one of the two"
+                f"altitude is {self.altitude} [m] and mean_motion is {self.mean_motion} [rad/s]; "
+                "give exactly one of them"
             )
         size = self.mu, self.body_radius
         mu, ground = (
@@ -122,16 +122,16 @@ class CircularOrbit:
             altitude = (mu / n) ** (1.0 / 3.0) / n ** (1.0 / 3.0) - ground
         if not 0.0 < altitude < 1e15:
             raise InputError(
-                f"an altitude of {altitude:g} m over {self.body} is no orbit; give an altitude "
-                "above 0, or a smaller mean motion"
+                f"an altitude of {altitude:g} m over {self.body} is not an orbit; give an "
+                "altitude above 0 and below 1e15 m, or another mean motion"
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
-            # Not for an orbit that was saved, nor for another body called earth.
+            # No warning for a saved orbit, or for another body that is named earth.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
                 warnings.warn(
-                    f"an altitude of {altitude:.8g} m over earth: altitudes are in metres; write "
-                    "400 km as 400e3",
+                    f"an altitude of {altitude:.8g} m over earth is too low for an orbit; "
+                    "altitudes are in metres, so write 400 km as 400e3",
                     FflinWarning,
                     stacklevel=3,
                 )
@@ -169,8 +169,8 @@ class CircularOrbit:
         )
 
 
-def checked_orbit(value: Any) -> CircularOrbit | None:
-    """Return the orbit of a field: an orbit, an altitude [m], a mapping of parts, or None."""
+def checked_orbit(value: object) -> CircularOrbit | None:
+    """Return the orbit from an orbit, an altitude [m], a mapping of parts, or None."""
     if value is None or isinstance(value, CircularOrbit):
         return value
     if not isinstance(value, Mapping):

@@ -158,8 +158,8 @@ def difference(derivatives: ModelDerivatives, one: Parameter) -> float:
     """Return the relative error of the derivatives of A and B, by fourth-order differences."""
     if not one.bodies:
         raise InputError(
-            f"'{one.name}' is not a parameter of a link or body; check takes only these, such as "
-            "'base.mass'"
+            f"'{one.name}' is not a parameter of a link or body; only such parameters can be "
+            "checked, for example 'base.mass'"
         )
     lin, robot = derivatives.lin, derivatives.robot
     step = _STEP / derivatives.bodies.fraction(one.bodies)

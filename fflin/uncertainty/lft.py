@@ -96,7 +96,7 @@ class LFT(Design):
             ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
             rows.append((name, "." if unit == "1" else unit, *ends, f"{repeats:g}"))
         many, count = counted(len(self.repeats), "parameter"), f"{self.repeats.sum():g}"
-        said = f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count} in all"
+        said = f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count}"
         return f"{folded([said])}\n\n{grid(cut(rows), 'll')}"
 
     @property

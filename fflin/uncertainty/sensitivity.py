@@ -257,8 +257,14 @@ class Sensitivity:
         most = [row[1:] for row in rows[: whole("top", top, 1)]]
         if not most:
             return f"{lin.robot}: none of these parameters changes A or B"
-        largest = f"{most[0][0]} changes A and B most, by {100.0 * rows[0][0]:.2g} %"
-        title = folded([f"{lin.robot}: {largest} of their largest entry, to first order"])
+        name, unit, _, step, *_ = most[0]
+        change = step if unit == "." else f"{step} {unit}"
+        title = folded(
+            [
+                f"{lin.robot}: {name} changes A and B most: if it changes by {change}, A or B "
+                f"changes by {100.0 * rows[0][0]:.2g} % of its largest entry, to first order"
+            ]
+        )
         heads = ("parameter", "unit", "value", "change", "A [%]", "B [%]")
         more = f"... and {len(rows) - top} more, see --top"
         return "\n".join([title, "", grid([heads, *most], "ll"), *[more] * (len(rows) > top)])

@@ -177,7 +177,7 @@ class Uncertain:
         return [self.at(self.values(delta)) for delta in self.draws(n, seed=seed)[0]]
 
     def worst(
-        self, gain: Any, q: Array | None = None, *, samples: int = 200, seed: int = 0
+        self, gain: object, q: Array | None = None, *, samples: int = 200, seed: int = 0
     ) -> Worst:
         """Search the ranges for the worst closed loop u = -K x.
 
@@ -212,7 +212,7 @@ class Uncertain:
         return searched(self, self.lft(q), gain, whole("samples", samples, 1), seed)
 
 
-def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
+def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     """Define the uncertain parameters of a robot and their ranges.
 
     Parameters
@@ -284,7 +284,9 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     made = Uncertain(robot, (*alone.values(), *together), variants)
     _refuse_overlap(variants.pieces, made.ranges)
     if why := made._refusal(np.zeros(len(made.blocks))):
-        raise InputError(f"no robot exists at the middle of the ranges: {why}; give other ranges")
+        raise InputError(
+            f"the robot at the middle of the ranges is not valid: {why}; give other ranges"
+        )
     return made
 
 
@@ -292,8 +294,8 @@ def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> N
     names = [each.parameter.name for each in ranges]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(
-            f"'{twice[0]}' is tied to other parameters and also has another range; give only one "
-            "of the two"
+            f"'{twice[0]}' is tied to other parameters and also has a range of its own; give "
+            "only one of these ranges"
         )
     asked = {each.parameter.of for each in ranges} & pieces.keys()
     for name, other in permutations(asked, 2):
@@ -303,7 +305,7 @@ def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> N
             )
 
 
-def _range(one: Parameter, value: Any) -> Range:
+def _range(one: Parameter, value: object) -> Range:
     if one.part[:9] == "direction":
         said = (
             "rotates a unit vector, so that the model is not a rational function of it; use "

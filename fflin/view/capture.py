@@ -49,7 +49,7 @@ def find_chromium() -> str:
     if found is None:
         raise MissingPackageError(
             "Chromium, which takes the pictures, is not found; install it (Debian: apt install "
-            "chromium), or open the HTML file and take them by hand"
+            "chromium), or open the HTML file in a browser and take screenshots"
         )
     return found
 
@@ -169,7 +169,7 @@ class _Browser:
         self._number = 0
         self._session: dict[str, str] = {}
 
-    def tell(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def tell(self, method: str, **parameters: object) -> dict[str, Any]:
         """Send a command and return the answer."""
         self._number += 1
         command = {"id": self._number, "method": method, "params": parameters, **self._session}

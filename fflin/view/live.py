@@ -118,7 +118,7 @@ class Live:
             self.q = q
         self._server.update(json.dumps(state))
 
-    def __call__(self, t: float, q: Array, *_: Any) -> None:
+    def __call__(self, t: float, q: Array, *_: object) -> None:
         """Show a step of a running simulation, delayed to the playback speed."""
         now = monotonic()
         if self._began is None or t <= self._began[1]:
@@ -276,7 +276,8 @@ def _listen(port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         raise InputError(
-            f"port {port} is not available: {error.strerror}; give another one, or 0 for a free one"
+            f"port {port} is not available: {error.strerror}; give another port, or 0 for a free "
+            "port"
         ) from None
     listener.setblocking(False)
     return listener
@@ -285,7 +286,7 @@ def _listen(port: int) -> socket.socket:
 class _Guarded(RequestHandler):
     """Answers only to this machine's own names, so that no other site's page gets through."""
 
-    def initialize(self, hosts: set[str], **fields: Any) -> None:
+    def initialize(self, hosts: set[str], **fields: object) -> None:
         self._hosts = hosts
         self._fields = fields
 

@@ -44,7 +44,8 @@ def mode_page(
     if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
         raise InputError(
             f"the modes belong to a model of '{lin.robot}' with {len(lin.state_names)} states, "
-            f"expected the {state.nx} states of '{robot.name}'; give its robot, unreduced"
+            f"expected the {state.nx} states of '{robot.name}'; give the robot and the modes of "
+            "the same unreduced model"
         )
     if not found.vibrations:
         raise InputError(

@@ -37,7 +37,9 @@ _ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 class _Piece(MeshcatMesh):
     """A three.js mesh as it is sent; its material, and geometry sent before, are in the page."""
 
-    def __init__(self, geometry: dict[str, Any], matrix: Array, about: dict[str, Any]) -> None:
+    def __init__(
+        self, geometry: dict[str, object], matrix: Array, about: dict[str, object]
+    ) -> None:
         self._geometry, self._matrix, self._about = geometry, matrix, about
 
     def lower(self) -> dict[str, Any]:
@@ -136,7 +138,7 @@ def _link(robot: Robot, shape: Shape) -> list[float]:
 class Animation(SetAnimation):
     """Animation of all moving nodes, in the form that is sent."""
 
-    def __init__(self, clips: Sequence[dict[str, Any]]) -> None:
+    def __init__(self, clips: Sequence[dict[str, object]]) -> None:
         self._clips = list(clips)
 
     def lower(self) -> dict[str, Any]:

@@ -163,7 +163,8 @@ def visualize(
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
             raise InputError(
-                "a file is named but no motion is given; give one, as fflin.simulate returns it"
+                "a file is named but no motion is given; give a motion, as fflin.simulate "
+                "returns it"
             )
         port = whole("port", port, 0, 2**16 - 1)
         start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
@@ -182,7 +183,9 @@ def visualize(
     contents: dict[Path, bytes] = {}
     if isinstance(motion, Modes):
         if {*outputs} - {".html"}:
-            raise InputError("png or gif is given with modes, which have no pictures; give html=")
+            raise InputError(
+                "png or gif is given, but modes can be shown only in an HTML page; give html="
+            )
         from fflin.view.mode_page import mode_page
 
         page, notes = mode_page(robot, motion, scene=scene, tool=tool)

@@ -57,6 +57,7 @@ def defined(job, target, q, nu, u, stop):
     if target.ndim == 2:
         e = unwound(state, moving_errors(state.frame, x, target))
     kind = kinds_of(state)
+    signed = e.copy()
     e[:, kind < 0] = 0.0
     sizes = [np.abs(e[:, kind == k]).max(axis=1, initial=0.0) for k in range(len(KINDS))]
     sizes = np.column_stack([attitude_errors(x, target), *sizes[1:]])
@@ -70,6 +71,7 @@ def defined(job, target, q, nu, u, stop):
         **{"errors": sizes[-1], "largest": largest},
         "settle": np.where(late, np.inf, settled * dt),
         **{"error_history": sizes[job.steps], "input_history": u[job.steps]},
+        "state_errors": signed[job.steps],
         **{"stop": stop, "end": (len(x) - 1) * dt},
     }
 
@@ -89,8 +91,9 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
         run = Recording(t, q, v, u, *rest, STEPS - 1, "", "python")
         outcome = outcome_of(job.plan, state, target, job.steps, run)
         for name, expected in defined(job, target, q, nu, u, 0.0).items():
-            value = outcome[name][0]
-            np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-10, err_msg=name)
+            np.testing.assert_allclose(
+                outcome[name], expected, rtol=1e-12, atol=1e-10, err_msg=name
+            )
         # The kernel's statistics, uncompiled.
         path = [each.ravel() for each in star] if follows else []
         marks = as_lists(marks_of(job.plan, state, target, job.steps, path))
@@ -107,6 +110,7 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
             ("largest", marks.largest),
             ("error_history", np.reshape(marks.errors, (-1, len(KINDS)))),
             ("settle", settled),
+            ("state_errors", np.reshape(marks.states, (-1, state.nx))),
             ("x", marks.law.x),
         ):
             np.testing.assert_allclose(value, expected[name], rtol=1e-12, atol=1e-10)

@@ -39,7 +39,7 @@ def test_in_orbit_its_field_acts_on_all_momenta():
 def test_points_off_rest_are_told():
     code, out, err = run("analyze", "ets_vii", "--velocity", "omega_b.z=0.1")
     assert code == 0 and not err
-    assert "not an equilibrium" in out and says(out, "frozen A and B")
+    assert "not an equilibrium" in out and says(out, "A and B frozen")
 
 
 def test_bad_input_is_one_line():

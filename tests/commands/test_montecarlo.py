@@ -107,7 +107,7 @@ def test_noise_has_a_report_and_another_campaign_is_replaced_by_force(folder, mo
     assert (code, error) == (0, "")
     before = (folder / "c.npz").read_bytes()
     code, _, error = run(*command, "--seed", "1")
-    assert code == 2 and "did not make it" in error and "--force" in error
+    assert code == 2 and "was not written by this call" in error and "--force" in error
     assert (folder / "c.npz").read_bytes() == before
     code, _, error = run(*command, "--seed", "1", "--force")
     assert (code, error) == (0, "")

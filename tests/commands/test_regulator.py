@@ -153,10 +153,10 @@ def test_thrusters_that_are_to_pull_are_warned_of_where_they_are_designed_with(c
     with warnings.catch_warnings():
         warnings.simplefilter("always", fflin.FflinWarning)
         code, out, err = run(capsys, "cubesat", "--inputs", "cubesat", "--no-allocate")
-        assert code == 0 and "pull" not in out
-        assert says(err, "fflin: warning: ", "pull", "x_plus_top")
+        assert code == 0 and "negative thrust" not in out
+        assert says(err, "fflin: warning: ", "negative thrust", "x_plus_top")
         code, out, err = run(capsys, "cubesat")
-        assert (code, err) == (0, "") and "pull" not in out
+        assert (code, err) == (0, "") and "negative thrust" not in out
 
 
 def test_the_loop_that_lqr_reports_is_the_loop_that_is_simulated(capsys, tmp_path):
