@@ -57,7 +57,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments, unknown = main_parser.parse_known_args(argv)
         if unknown:  # its command has the list of options
             chosen = getattr(arguments, "command", main_parser)
-            chosen.error(f"unrecognized arguments: {' '.join(unknown)}")
+            from difflib import get_close_matches
+
+            near = get_close_matches(unknown[0], chosen._option_string_actions, n=1, cutoff=0.75)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            chosen.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         with files_of_command(*parser.files_of(arguments)):
             check_outputs(arguments)
             code = finish(arguments.run(arguments), arguments)

@@ -192,8 +192,9 @@ class Command(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Report wrong arguments in one line, with the meaning of missing ones, and exit."""
-        if message.endswith("required: DISPERSIONS"):
-            message += ', a TOML file with lines such as [dispersions] and "base.mass" = 0.05'
+        if "required: DISPERSIONS" in message:
+            message += "; DISPERSIONS is a TOML file with lines such as [dispersions] and "
+            message += '"base.mass" = 0.05'
         print_error(f"fflin: error: {message} (see {self.prog} --help)")
         self.exit(BAD_INPUT)
 

@@ -292,8 +292,10 @@ def _export(arguments: argparse.Namespace) -> Report:
 
     kinds = {kind.__name__: kind for kind in (Gain, GainSchedule, Compensator)}
     with reading(arguments.file, "Gain, GainSchedule or Compensator"):
-        kind = kinds[text(read_record(arguments.file)[0]["kind"])]
-    law = kind.load(arguments.file)
+        found = text(read_record(arguments.file)[0]["kind"])
+        if found not in kinds:
+            raise ValueError(f"the file contains: {found}")
+    law = kinds[found].load(arguments.file)
     robot = robot_of_design(load(arguments.robot), None, law) if arguments.robot else None
     folder = write_c(
         law,

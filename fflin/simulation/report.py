@@ -337,7 +337,7 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
         said = f"settled after {when:.3g}\u00a0s to within {100.0 * SETTLED:g}\u00a0%"
         if late := [kind.last for kind in kinds if kind.late and kind.steered]:
             what = "positions" if judged[0].title in _PLACES else "rates"
-            said = f"{what} {said}; not yet: {_and(late)}"
+            said = f"{what} {said}; not yet settled: {_and(late)}"
     else:
         which = f"{_and([kind.title for kind in judged])} " * bool(aside)
         said = f"settled: {which}at the target throughout the run"
