@@ -30,6 +30,7 @@ from fflin.base.validation import (
 )
 from fflin.base.writing import as_path
 from fflin.batch.run import Progress, check_workers, executor_of
+from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, KINDS, kind_named
 from fflin.control.gain_schedule import GainSchedule
@@ -383,7 +384,8 @@ def funnel(
             starts = Starts(job.x0, by.P[first], ellipsoid_axes(by.P[first]), rng)
 
             def simulate(roots: Array, job: CampaignJob = job, starts: Starts = starts) -> Array:
-                return completed(job, starts.drawn(roots), others, workers, threads)["outcome"]
+                rows = Draws(starts.drawn(roots)).part
+                return completed(job, rows, len(roots), others, workers, threads)["outcome"]
 
             root = _largest_root(simulate, _widest(starts.axes, robot))
             tried[knot] = root**2

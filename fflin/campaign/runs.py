@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from time import perf_counter
@@ -66,7 +66,9 @@ class CampaignJob:
     ) -> None:
         self._arguments: tuple[Any, ...] = (robot, policy, given, seed, engine, options, judge)
         self.judge, options = judge, dict(options)
-        histories, unlimited = options.pop("histories", 0), options.pop("unlimited", False)
+        # A judge compares with the start.
+        histories = options.pop("histories", 0 if judge is None else 1)
+        unlimited = options.pop("unlimited", False)
         options = SimulationOptions(linear=False, progress=False, **options)
         self.plan, self.plant = planned(robot, policy, options)
         if unlimited:
@@ -291,20 +293,21 @@ def chunk_size(count: int, workers: int, least: int = LANES) -> int:
 
 def completed(
     job: CampaignJob,
-    starts: Array,
+    rows: Callable[[int, int], Draws],
+    count: int,
     executor: Executor | None = None,
     workers: int | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Run a job from all deviations (N, nx) of the initial state, and return its arrays."""
-    count, compiled = len(starts), job.engine == "compiled"
+    """Run a job on all its rows, and return its arrays."""
+    compiled = job.engine == "compiled"
     threads = (threads or available_cores()) if compiled else 1
     size = chunk_size(count, workers or threads, LANES if compiled else 1)
     store = MemoryStore(count, size, job.shapes)
     failed = run_chunks(
         job,
-        Draws(starts).part,
+        rows,
         store,
         executor=executor,
         threads=threads,

@@ -17,7 +17,8 @@ from fflin.analysis.names import rate_of
 from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
-from fflin.base.validation import Array, Mask, as_double
+from fflin.base.validation import Array, Indices, Mask, as_double
+from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, Over
 from fflin.control.policies import StateFeedback
@@ -148,7 +149,8 @@ def settling_runs(
     options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
     options |= {"limits": limits, "project": not predicts}
     # Without limits no input saturates, and thrusters may pull.
-    options |= {"unlimited": limits is None, "histories": checks + 1 if predicts else 1}
+    options |= {"unlimited": limits is None}
+    options |= {"histories": checks + 1} if predicts else {}
     judge = Settling(loop, _transition(loop, dt, every) if predicts else None)
     return CampaignJob(loop.robot, StateFeedback(lin, loop.K), None, 0, "python", options, judge)
 
@@ -211,17 +213,26 @@ class Settling:
 
 
 def settle(
-    runs_of: Callable[[int], CampaignJob], starts: Array, engine: str | None = None, **how: Any
+    runs_of: Callable[[int], CampaignJob],
+    starts: Callable[[Indices], Array],
+    count: int,
+    engine: str | None = None,
+    **how: Any,
 ) -> dict[str, Array]:
-    """Return the figures of runs from deviations (N, nx); those that diverge take shorter steps.
+    """Return the figures of runs; those that diverge are repeated in shorter steps.
 
-    `runs_of` makes the runs in steps that have been shortened so many times.
+    `runs_of` makes the runs in steps that have been shortened so many times, and `starts` returns
+    the deviations (N, nx) from which runs (N,) start.
     """
-    arrays, left = dict[str, Array](), np.arange(len(starts))
+    arrays, left = dict[str, Array](), np.arange(count)
     for fine in range(_FINEST + 1):
-        job, some = runs_of(fine), starts[left]
+        job = runs_of(fine)
         job.choose(engine)
-        found = completed(job, some, **how)
+
+        def rows(start: int, stop: int, left: Indices = left) -> Draws:
+            return Draws(starts(left[start:stop]))
+
+        found = completed(job, rows, len(left), **how)
         for key, values in found.items():
             arrays.setdefault(key, values)[left] = values
         left = left[found["outcome"] == OUTCOMES.index("diverged")]

@@ -18,6 +18,7 @@ from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, Loop, checked_loop, settle, settling_runs
+from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -233,28 +234,29 @@ def validity(
     confidence = share("confidence", confidence)
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
+    sets, work = [], []
     # Level and random stream of each run that predicts, and of each random run.
-    sets = {
-        True: (np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
-        False: (levels, _DIRECTIONS + np.arange(samples)),
-    }
-    starts = {key: _starts(loop, largest, seed, *each) for key, each in sets.items()}
-    runs_of = {key: partial(settling_runs, loop, key, limits, largest["joint"]) for key in sets}
-    work = []
-    for key, x in starts.items():
-        job = runs_of[key]()
+    for predicts, at, streams in (
+        (True, np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
+        (False, levels, _DIRECTIONS + np.arange(samples)),
+    ):
+        runs_of = partial(settling_runs, loop, predicts, limits, largest["joint"])
+        starts = partial(_starts, loop, largest, seed, at, streams)
+        sets.append((runs_of, starts, len(at)))
+        job = runs_of()
         job.choose(engine)  # a wrong argument is refused before anything is compiled
-        work.append((job, Draws(x), len(x)))
-    total, done, found = len(_LEVELS) * _DIRECTIONS + samples, 0, {}
+        work.append((job, Draws(starts(np.arange(min(LANES, len(at))))), len(at)))
+    total, done, found = sum(count for *_, count in sets), 0, []
     with executor_of(executor, workers) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         expect(progress, work, others, threads)
-        for key, x in starts.items():
+        for runs_of, starts, count in sets:
             how["progress"] = progress and partial(_report, progress, done, total)
-            found[key] = settle(runs_of[key], x, engine, **how)
-            done += len(x)
-    error = found[True]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
-    outcomes = tuple(OUTCOMES[int(code)] for code in found[False]["outcome"])
+            found.append(settle(runs_of, starts, count, engine, **how))
+            done += count
+    predicted, random = found
+    error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
+    outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])
     failed = np.array([outcome != "settled" for outcome in outcomes])
     inside, bound, rate = until_failure(failed, confidence)
     return Validity(
@@ -282,10 +284,11 @@ def _starts(
     seed: int,
     levels: Array,
     streams: Indices,
+    runs: Indices,
 ) -> Array:
-    """Return deviations (N, nx) of the initial states, each from its own random stream."""
+    """Return deviations of the initial states of some runs, each from its own random stream."""
     x = []
-    for level, stream in zip(levels.tolist(), streams.tolist(), strict=True):
+    for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
         x.append(loop.displaced(rng, **_scaled(largest, level)))
     return np.array(x) - loop.start

@@ -351,7 +351,8 @@ def along(motion: Motion, robot: Robot | None) -> Trajectory:
         )
     if robot is None:
         raise InputError(
-            "the motion was read from a file, which does not contain its robot; give the robot"
+            "the motion was read from a file, which does not contain its robot; give the robot, "
+            "motion.trajectory(robot)"
         )
     entries = {name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")}
     from fflin.linear.files import arguments

@@ -16,10 +16,10 @@ from fflin.base.writing import reason
 Color = tuple[float, float, float, float]
 Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 
-# Details smaller than this part of a mesh's extent are not drawn; it halves most CAD exports.
+# Details smaller than this fraction of a mesh's extent are dropped, which halves most CAD meshes.
 _RESOLUTION = 1.0 / 400.0
 
-# Above this many triangles the grid is made coarser until they are fewer.
+# Largest number of triangles; the grid is made coarser until a mesh has fewer.
 _LARGEST = 20_000
 
 
@@ -29,7 +29,7 @@ class Mesh:
 
     vertices: Array  # (V, 3) of float32
     faces: Indices  # (F, 3) of uint32
-    color: Color | None  # where the file says one
+    color: Color | None  # None without a colour in the file
 
 
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
@@ -108,7 +108,7 @@ def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    # The same triangle may be left many times.
+    # Several triangles may have become the same.
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(kept)]
     used, compact = np.unique(faces, return_inverse=True)
