@@ -108,7 +108,7 @@ def resting_from(motion: Any) -> float | None:
 
 
 def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None) -> Figure:
-    """Draw a motion, see `plot_motion`."""
+    """Draw a motion; see `plot_motion`."""
     states, panels = _selected(motion, show)
     what, errors = _errors(motion)
     per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of states and of their errors below

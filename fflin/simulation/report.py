@@ -140,7 +140,7 @@ def settled_at(sizes: Array) -> NDArray[np.intp]:
 def is_late(settled: Array | NDArray[np.intp] | int, count: int) -> Any:
     """Return whether errors settle too late in a run of `count` rows to count as settled.
 
-    An error that passes through zero is small for a moment.
+    So an error that only passes through zero at the end does not count as settled.
     """
     return settled > (1.0 - DWELL) * count
 
