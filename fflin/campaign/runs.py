@@ -66,7 +66,9 @@ class CampaignJob:
     ) -> None:
         self._arguments: tuple[Any, ...] = (robot, policy, given, seed, engine, options, judge)
         self.judge, options = judge, dict(options)
-        histories, unlimited = options.pop("histories", 0), options.pop("unlimited", False)
+        # A judge compares with the start.
+        histories = options.pop("histories", 0 if judge is None else 1)
+        unlimited = options.pop("unlimited", False)
         options = SimulationOptions(linear=False, progress=False, **options)
         self.plan, self.plant = planned(robot, policy, options)
         if unlimited:

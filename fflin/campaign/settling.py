@@ -150,7 +150,8 @@ def settling_runs(
     options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
     options |= {"limits": limits, "project": not predicts}
     # Without limits no input saturates, and thrusters may pull.
-    options |= {"unlimited": limits is None, "histories": checks + 1 if predicts else 1}
+    options |= {"unlimited": limits is None}
+    options |= {"histories": checks + 1} if predicts else {}
     judge = Settling(loop, _transition(loop, dt, every) if predicts else None)
     return CampaignJob(loop.robot, StateFeedback(lin, loop.K), None, 0, "python", options, judge)
 
