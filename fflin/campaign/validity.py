@@ -328,8 +328,8 @@ def _checked_displacement(
     given = {key: number(key, value) for key, value in given.items()}
     if not 0.0 <= given["attitude"] < 175.0 or min(given.values()) < 0.0:
         raise InputError(
-            f"the displacements are {shown(given)}; expected values of 0 or more, and an "
-            "attitude below 175 deg, because the chart ends at 180 deg"
+            f"the displacements are {shown(given)}, but each must be 0 or more, and the rotation "
+            "must be less than 175 deg, because the attitude chart ends at 180 deg"
         )
     if max(given.values()) > _FARTHEST:
         raise InputError(

@@ -310,7 +310,7 @@ def least_norm(C: Array, d: Array, one_sided: Mask) -> tuple[Array, Array]:
 
 
 def _pseudo_solve(C: Array, d: Array) -> Array:
-    """Return the u of least norm among those with the least ``|C u - d|``."""
+    """Return the minimum-norm u that minimises ``|C u - d|``."""
     u: Array = np.linalg.lstsq(C, d, rcond=None)[0]
     u += np.linalg.lstsq(C, d - C @ u, rcond=None)[0]
     # Inputs below the rounding error of the largest input are noise, and set to zero.

@@ -175,7 +175,7 @@ class Coordinates:
 
     @cached_property
     def unbounded(self) -> dict[int, str]:
-        """Continuous joints: {index of the cosine in q: joint name}."""
+        """Continuous joints as {index of the cosine in q: joint name}."""
         joints = (*self.joints, *(follower.joint for follower in self.followers))
         return {joint.idx_q: joint.name for joint in joints if joint.unbounded}
 

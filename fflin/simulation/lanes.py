@@ -269,7 +269,7 @@ class LaneRows:
 
     @property
     def counts(self) -> list[int]:
-        """Numbers of rows before the ends of the runs."""
+        """Number of rows of each run before its end."""
         return [-(-int(steps) // self.every) for steps in self.ends["steps"]]
 
     def over(self, q: Array, v: Array) -> Mask:

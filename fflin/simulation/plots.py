@@ -110,7 +110,7 @@ def resting_from(motion: Motion) -> float | None:
 
 
 def draw_motion(motion: Motion, path: str | Path | None, show: Sequence[str] | None) -> Figure:
-    """Draw a motion, see `plot_motion`."""
+    """Draw a motion; see `plot_motion`."""
     states, panels = _selected(motion, show)
     what, errors = _errors(motion)
     per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of states and of their errors below

@@ -144,7 +144,7 @@ def settled_at(sizes: Array) -> Indices:
 def is_late(settled: Array | Indices | int, count: int) -> Mask | bool:
     """Return whether errors settle too late in a run of `count` rows to count as settled.
 
-    An error that passes through zero is small for a moment.
+    So an error that only passes through zero at the end does not count as settled.
     """
     return settled > (1.0 - DWELL) * count
 

@@ -287,7 +287,7 @@ def perron(Z: Array) -> Array:
 
 
 def bound_of(Z: Array, scaling: Scaling) -> float:
-    """Return the least b with Z^H D^2 Z + j (G Z - Z^H G) <= b^2 D^2 for all of Z (k, n, n)."""
+    """Return the least b with Z^H D^2 Z + j (G Z - Z^H G) <= b^2 D^2 for all Z in Z (k, n, n)."""
     d, g = scaling
     scaled, turned = d[:, None] * Z / d, (g / d)[:, None] * Z / d
     form = scaled.conj().mT @ scaled + 1j * (turned - turned.conj().mT)

@@ -305,7 +305,7 @@ class _Page(_Guarded):
 
 
 class _Socket(_Guarded, WebSocketHandler):
-    """Connection to one browser, which receives the newest state after the previous state."""
+    """Connection to one browser, which gets the newest state when the previous one has arrived."""
 
     _busy = False
     _behind = False
