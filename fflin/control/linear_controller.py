@@ -399,7 +399,7 @@ def _indices(
     for name, key in zip(names, own, strict=True):
         if key not in there:
             text = unknown(f"{of} of the model", name, known)
-            raise InputError(f"{kind} of the controller: {text} (or leave out all names)")
+            raise InputError(f"{kind} of the controller: {text}; or omit all {kind} names")
         if own.count(key) > 1:
             raise InputError(
                 f"two {kind}s of the controller are named '{name}'; give them different names"
