@@ -212,7 +212,7 @@ class _Ball(NamedTuple):
     r: Array  # (3,) rotation part of the participation about the ball's centre
     center: Array
     mass: float  # [kg] mass with which no rotor is needed
-    moment: float  # [kg m^2]
+    moment: float  # [kg m^2] moment of inertia of the ball
     lever: float  # [m] distance from the appendage's frame; 0 if it is too small for a rotation
 
     @property
