@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -32,6 +32,9 @@ from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
+
+if TYPE_CHECKING:
+    from fflin.robot.equipment.appendages import Appendage
 
 _BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
@@ -263,7 +266,9 @@ class Dispersions:
             if appendages := self._plant.robot.appendages:
                 self._require_realisable(appendages, drawn, start)
 
-    def _require_realisable(self, appendages: Any, drawn: Array, start: int) -> None:
+    def _require_realisable(
+        self, appendages: Sequence[Appendage], drawn: Array, start: int
+    ) -> None:
         """Raise `InputError` if a body cannot have the participation of its modes."""
         refused = first_impossible(self._model, appendages, self.bodies(drawn))
         if refused is not None:

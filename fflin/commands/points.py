@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
     from fflin.base.validation import Array
+    from fflin.dynamics.state import Frame
     from fflin.linear.model import LinearModel
     from fflin.robot.inputs import Input
     from fflin.robot.robot import Robot
@@ -213,7 +214,7 @@ def held_at(
     return held.q, held.u, reference
 
 
-def attitude(robot: Robot, q: Array, number: int, frame: Any) -> tuple[Array, pin.SE3]:
+def attitude(robot: Robot, q: Array, number: int, frame: Frame) -> tuple[Array, pin.SE3]:
     """Return q (nq,) and base placement of the relative equilibrium with a number from 1 to 24."""
     import pinocchio as pin
 

@@ -143,7 +143,7 @@ def _fields(entries: Record) -> dict[str, Any]:
     }
 
 
-def given(value: Any, _: object) -> Any:
+def given(value: T, _: object) -> T:
     """Return an entry of a file unchanged."""
     return value
 
@@ -289,7 +289,7 @@ def arguments(
     return found_as | {"q": q, "v": v}
 
 
-def _require_inputs(known: Sequence[str], names: Any, count: int) -> None:
+def _require_inputs(known: Sequence[str], names: object, count: int) -> None:
     """Raise `InputError` if the names or the number of a file's inputs differ from the robot's."""
     given = texts(names)
     if given == tuple(known):
