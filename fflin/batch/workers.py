@@ -165,7 +165,7 @@ def _serve(pipe: Connection) -> None:
         pipe.send(None)
         while True:
             function, args, kwargs = pipe.recv()
-            answer: tuple[Exception | None, Any]
+            answer: tuple[Exception | None, object]
             try:
                 answer = None, function(*args, **kwargs)
             except Exception as error:

@@ -98,7 +98,7 @@ class Dispersions:
             known["frequency"] = modes
         # Joints of the modes, in the order of the names.
         self._modes = [plant.robot.joint_names.index(name) for name in modes]
-        by_kind: dict[str, dict[str, Any]] = {}
+        by_kind: dict[str, dict[str, object]] = {}
         self.columns: list[Column] = []
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
@@ -183,7 +183,7 @@ class Dispersions:
         self, kind: str, spreads: Mapping[str, object]
     ) -> tuple[dict[str, Any], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: name} where it is named alone."""
-        robot, found, named = self._plant.robot, dict[str, Any](), dict[str, str]()
+        robot, found, named = self._plant.robot, dict[str, object](), dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
         for key in sorted(spreads, key=lambda key: key in alone):  # names go before patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):

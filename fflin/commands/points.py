@@ -29,7 +29,7 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
         first["damping"] = "urdf"
     robot = load(arguments.robot, lock=lock, **first)
     given = {name: getattr(arguments, name, None) for name in ("gravity", "orbit")}
-    fields: dict[str, Any] = {name: value for name, value in given.items() if value}
+    fields: dict[str, object] = {name: value for name, value in given.items() if value}
     for name in ("stiffness", "damping"):
         values = getattr(arguments, name, [])
         for_all = [value for joint, value in values if joint is None]

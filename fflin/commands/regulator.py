@@ -374,7 +374,10 @@ def check_along(arguments: argparse.Namespace) -> Report:
 
 
 def checked(
-    robot: Robot, found: Check, text: str, files: Mapping[Path | None, Callable[[Path], object] | None] = MappingProxyType({}),
+    robot: Robot,
+    found: Check,
+    text: str,
+    files: Mapping[Path | None, Callable[[Path], object] | None] = MappingProxyType({}),
 ) -> Report:
     """Return the report of a check, with the exit code."""
     result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
