@@ -22,7 +22,7 @@ from fflin.commands.points import linear_model, load_robot, once, refuse
 from fflin.commands.results import Report, figure_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from fflin.control.gain import Gain
     from fflin.control.gain_schedule import GainSchedule
