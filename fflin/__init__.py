@@ -156,7 +156,7 @@ def __getattr__(name: str) -> Any:
     return value
 
 
-def _untyped(function: Any) -> None:
+def _untyped(function: object) -> None:
     """Remove the types from the signature that help shows; the docstring describes them."""
     from inspect import Parameter, signature
 

@@ -243,7 +243,7 @@ class Campaign(FrozenArrays):
     def _beyond(self, sizes: Array) -> Array:
         return np.where(self.stopped[:, None], np.inf, sizes)
 
-    def met(self, condition: Any) -> Any:
+    def met(self, condition: object) -> Any:
         """Return a mask (N,) of the runs that meet a condition.
 
         Parameters
@@ -266,7 +266,7 @@ class Campaign(FrozenArrays):
             met = met & bound.met
         return met
 
-    def fraction(self, condition: Any, *, confidence: float = 0.95) -> Estimate:
+    def fraction(self, condition: object, *, confidence: float = 0.95) -> Estimate:
         """Return the fraction of runs that meet a condition, with its Clopper-Pearson interval."""
         met, sure = int(self.met(condition).sum()), share("confidence", confidence)
         return intervals.clopper_pearson(met, len(self), sure)
@@ -300,7 +300,7 @@ class Campaign(FrozenArrays):
         return intervals.mean(values, share("confidence", confidence))
 
     def worst(self, k: int = 5, name: str | None = None) -> list[int]:
-        """Return the indices of the k runs with the largest values of a figure.
+        """Return the indices of the k runs in which a figure, such as ``attitude``, is largest.
 
         The default figure is `about`. Runs that were stopped early come first, the earliest stop
         before the others.

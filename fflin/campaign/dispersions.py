@@ -51,14 +51,13 @@ class Column(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """Drawn values (N, k) of some runs, and the numbers of these runs (N,)."""
+    """Drawn values (N, k) of some runs."""
 
     drawn: Array
-    run: Array
 
     def part(self, start: int, stop: int) -> Draws:
         """Return the runs from `start` up to `stop`."""
-        return Draws(self.drawn[start:stop], self.run[start:stop])
+        return Draws(self.drawn[start:stop])
 
 
 class Bound(NamedTuple):
@@ -72,7 +71,7 @@ class Dispersions:
     """Dispersions of `monte_carlo`: draws, and the robots and initial states that they give."""
 
     def __init__(
-        self, given: Any, plant: Plant, policy: Any, x0: Array, seed: int, times: Times
+        self, given: object, plant: Plant, policy: object, x0: Array, seed: int, times: Times
     ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
@@ -178,7 +177,7 @@ class Dispersions:
                 self.columns.append(Column(name, kind, where, inverse))
 
     def _by_piece(
-        self, kind: str, spreads: Mapping[str, Any]
+        self, kind: str, spreads: Mapping[str, object]
     ) -> tuple[dict[str, Any], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: name} where it is named alone."""
         robot, found, named = self._plant.robot, dict[str, Any](), dict[str, str]()
@@ -213,7 +212,7 @@ class Dispersions:
                 low, high = max(start, first), min(stop, first + _BLOCK)
                 values = self._drawn(column, first // _BLOCK, high - first)
                 drawn[low - start : high - start, at] = values[low - first : high - first]
-        return Draws(drawn, np.arange(start, stop, dtype=float))
+        return Draws(drawn)
 
     def _uniform(self, column: Column, block: int) -> Array:
         key = (self._seed, zlib.crc32(column.name.encode()))

@@ -49,7 +49,7 @@ _OPTIONS = {each.name for each in fields(SimulationOptions)} - {
 
 def monte_carlo(
     robot: Robot,
-    policy: Any,
+    policy: object,
     dispersions: Mapping[str, Any],
     *,
     runs: int,
@@ -68,7 +68,7 @@ def monte_carlo(
     out: str | Path | None = None,
     overwrite: bool = False,
     engine: str | None = None,
-    **options: Any,
+    **options: object,
 ) -> Campaign:
     r"""Run a Monte Carlo campaign: simulate a policy many times with dispersed parameters.
 
@@ -257,7 +257,7 @@ def monte_carlo(
     return replace(Campaign.load(store.path), _job=job)
 
 
-def _goals(given: Any, until: Any, shapes: Any, header: dict[str, Any]) -> list[str]:
+def _goals(given: object, until: object, shapes: Any, header: dict[str, Any]) -> list[str]:
     """Return the goals; an invalid goal is refused before any run."""
     goals = [given] if isinstance(given, str) else given
     if not isinstance(goals, list | tuple):

@@ -20,7 +20,7 @@ from fflin.robot.robot import Robot
 _ALONG: dict[type[Any], str] = {Thruster: "direction", ReactionWheel: "axis"}
 
 
-def turned(direction: Any, angles: Array) -> Array:
+def turned(direction: object, angles: Array) -> Array:
     """Rotate a direction (3,) by angles (N, 2) [rad] about two perpendicular axes; (N, 3)."""
     first, second, along = turned_to(np.array(direction, dtype=float)).T
     size = np.linalg.norm(angles, axis=1)[:, None]

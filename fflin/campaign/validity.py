@@ -147,7 +147,7 @@ _ENDS = {
 def validity(
     robot: Robot,
     lin: LinearModel,
-    gain: Any,
+    gain: object,
     *,
     attitude: float = 90.0,
     position: float = 0.5,
@@ -155,7 +155,7 @@ def validity(
     samples: int = 100,
     seed: int = 0,
     confidence: float = 0.95,
-    limits: Any = None,
+    limits: object = None,
     executor: Executor | None = None,
     workers: int | None = None,
     threads: int | None = None,
@@ -235,29 +235,29 @@ def validity(
     confidence = share("confidence", confidence)
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
+    sets, work = [], []
     # Level and random stream of each run that predicts, and of each random run.
-    sets = {
-        True: (np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
-        False: (levels, _DIRECTIONS + np.arange(samples)),
-    }
-    starts = {key: partial(_starts, loop, largest, seed, *each) for key, each in sets.items()}
-    runs_of = {key: partial(settling_runs, loop, key, limits, largest["joint"]) for key in sets}
-    work = []
-    for key, (at, _) in sets.items():
-        job = runs_of[key]()
+    for predicts, at, streams in (
+        (True, np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
+        (False, levels, _DIRECTIONS + np.arange(samples)),
+    ):
+        runs_of = partial(settling_runs, loop, predicts, limits, largest["joint"])
+        starts = partial(_starts, loop, largest, seed, at, streams)
+        sets.append((runs_of, starts, len(at)))
+        job = runs_of()
         job.choose(engine)  # a wrong argument is refused before anything is compiled
-        some = np.arange(min(LANES, len(at)))
-        work.append((job, Draws(starts[key](some), some.astype(float)), len(at)))
-    total, done, found = len(_LEVELS) * _DIRECTIONS + samples, 0, {}
+        work.append((job, Draws(starts(np.arange(min(LANES, len(at))))), len(at)))
+    total, done, found = sum(count for *_, count in sets), 0, []
     with executor_of(executor, workers) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         expect(progress, work, others, threads)
-        for key, (at, _) in sets.items():
+        for runs_of, starts, count in sets:
             how["progress"] = progress and partial(_report, progress, done, total)
-            found[key] = settle(runs_of[key], starts[key], np.arange(len(at)), engine, **how)
-            done += len(at)
-    error = found[True]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
-    outcomes = tuple(OUTCOMES[int(code)] for code in found[False]["outcome"])
+            found.append(settle(runs_of, starts, count, engine, **how))
+            done += count
+    predicted, random = found
+    error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
+    outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])
     failed = np.array([outcome != "settled" for outcome in outcomes])
     inside, bound, rate = until_failure(failed, confidence)
     return Validity(
@@ -329,8 +329,8 @@ def _checked_displacement(
     given = {key: number(key, value) for key, value in given.items()}
     if not 0.0 <= given["attitude"] < 175.0 or min(given.values()) < 0.0:
         raise InputError(
-            f"the displacements are {shown(given)}; expected values of 0 or more, and an "
-            "attitude below 175 deg, because the chart ends at 180 deg"
+            f"the displacements are {shown(given)}, but each must be 0 or more, and the rotation "
+            "must be less than 175 deg, because the attitude chart ends at 180 deg"
         )
     if max(given.values()) > _FARTHEST:
         raise InputError(

@@ -1,4 +1,4 @@
-"""The commands `analyze`, `modes`, `sensitivity` and `uncertain`."""
+"""Commands `analyze`, `modes`, `equilibrium`, `sensitivity` and `uncertain`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FflinWarning, InputError
-from fflin.base.tables import counted, signals
+from fflin.base.errors import FflinWarning, InputError, listed
+from fflin.base.tables import counted, folded, signals
 from fflin.commands import options, parser
 from fflin.commands.points import (
     attitude,
@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
 
+_SLACK = 1e-9  # up to which a value is at its limit, in SI units
+
+
 def add_commands(commands: parser.Commands) -> None:
-    """Add analyze, modes, sensitivity and uncertain."""
+    """Add the commands analyze, modes, equilibrium, sensitivity and uncertain."""
     analyze = parser.command(
         commands,
         "analyze",
@@ -128,7 +131,7 @@ def _add_uncertain(commands: parser.Commands) -> None:
         repeatable=True,
         required=True,
     )
-    what = "A, B1 .. D22 and the blocks"
+    what = "the matrices A, B1 .. D22 and the blocks of Delta"
     options.add_output_file(uncertain.group(parser.OUTPUT), what, parser.RECORD, "LFT")
 
 
@@ -200,6 +203,7 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
     from fflin.base.record import write_record
     from fflin.linear.equilibrium import equilibrium
     from fflin.linear.linearization import linearize
+    from fflin.robot.limits import limits_of
 
     if arguments.effort:
         raise InputError(
@@ -223,8 +227,16 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
         signals("x0", lin.x0, lin.state_names, lin.state_units) if lin.x0.any() else "x0: all zero",
         str(held),
     ]
+    names = (*lin.state_names, *lin.input_names)
+    there = dict(zip(names, (*lin.x0, *held.u), strict=True))
+    limits = limits_of(robot).items()
+    excess = {k: max(low - there[k], there[k] - high) for k, (low, high) in limits if k in there}
+    beyond = [name for name, size in excess.items() if size > _SLACK]
+    if beyond:
+        lines.append(folded([f"beyond their limits: {listed(beyond)}"]))
     result = {
         **plain(held),
+        "beyond_limits": beyond,
         "state_names": lin.state_names,
         "state_units": lin.state_units,
         "x0": lin.x0,
@@ -240,7 +252,6 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
 
 def _momentum(lin: LinearModel) -> str:
     from fflin.analysis.reduction import momentum_reduction
-    from fflin.base.tables import folded
 
     try:
         reduced = momentum_reduction(lin)

@@ -115,7 +115,10 @@ def wheel_report(properties: Mapping[str, Any]) -> str:
         f"{('no', 'only one', 'only two', 'three')[properties['axes']]} axes"
     )
     if least is not None:
-        text += f", with at least {least:.4g} N m s in every direction at their largest speeds"
+        text += (
+            f", and they store at least {least:.4g} N m s in every direction at their largest "
+            "speeds"
+        )
     return folded([text])
 
 

@@ -128,7 +128,7 @@ class Horizon:
 class Receding:
     """Policy that applies the first input of each plan; `at(t, q, v)` returns u* and e."""
 
-    def __init__(self, horizon: Horizon, at: Any = None) -> None:
+    def __init__(self, horizon: Horizon, at: object = None) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
         self.solves = self.softened = self.unfinished = self.exceeded = 0

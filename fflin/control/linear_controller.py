@@ -305,7 +305,7 @@ def _system_of(given: Any) -> System:
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
 
-def _realised(given: Any) -> Any:
+def _realised(given: object) -> Any:
     try:
         if hasattr(given, "to_ss"):
             return given.to_ss()
@@ -399,7 +399,7 @@ def _indices(
     for name, key in zip(names, own, strict=True):
         if key not in there:
             text = unknown(f"{of} of the model", name, known)
-            raise InputError(f"{kind} of the controller: {text} (or leave out all names)")
+            raise InputError(f"{kind} of the controller: {text}; or omit all {kind} names")
         if own.count(key) > 1:
             raise InputError(
                 f"two {kind}s of the controller are named '{name}'; give them different names"

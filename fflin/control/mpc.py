@@ -41,7 +41,7 @@ def mpc(
     *,
     horizon: int = 20,
     dt: float | None = None,
-    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = "urdf",
+    limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     Qf: Weight | str = "steady",
     weights: str | None = None,
 ) -> Mpc | TrajectoryMpc:

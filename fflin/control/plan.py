@@ -47,7 +47,7 @@ def plan(
     v0: ArrayLike | None = None,
     knots: int = 101,
     hold: str = "previous",
-    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = "urdf",
+    limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     R: Weight | None = None,
     free: Sequence[str] = (),
     progress: bool | None = None,

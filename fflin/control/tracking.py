@@ -208,7 +208,7 @@ class TrajectoryFeedback(Feedback):
         return policy
 
 
-def followed(policy: Any, robot: Robot, held: float = 0.0) -> Any:
+def followed(policy: object, robot: Robot, held: float = 0.0) -> Any:
     """Return a policy as it is simulated, with commands held for `held` [s].
 
     A gain schedule becomes the feedback along its trajectory.

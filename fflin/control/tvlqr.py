@@ -158,7 +158,7 @@ _OF_REGULATOR = ("state_names", "input_names", "verified", "q", "v", "u", "hold"
 _OF_FILTER = ("state_names", "input_names", "output_names", "verified")
 
 
-def asks_steady(value: Any, name: str = "Qf", kind: str = "a weight") -> bool:
+def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool:
     """Return whether a value is "steady"; raise `InputError` if it is another string."""
     if isinstance(value, str) and value != "steady":
         raise InputError(f"{name} is {value!r}, expected 'steady' or {kind}")

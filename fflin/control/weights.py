@@ -227,7 +227,9 @@ def sampled_cost(
     0.1
     """
     if not isinstance(lin, LinearModel) or lin.dt:
-        raise InputError("lin must be a continuous LinearModel; give the model that was sampled")
+        raise InputError(
+            "lin must be a continuous LinearModel; give the model before it is sampled"
+        )
     h = positive("dt", dt, "s")
     Q, R, cross = cost_weights(lin, Q, R, N)
     nx, nu = lin.B.shape
@@ -266,7 +268,7 @@ def _negative(what: str, value: float, where: str, definite: bool) -> InputError
 def rule_weights(
     lin: LinearModel,
     name: str | None,
-    given: Mapping[str, Any] | None = None,
+    given: Mapping[str, object] | None = None,
     *,
     wheel_speeds: bool | None = None,
     pace: Pace = AT_A_POINT,

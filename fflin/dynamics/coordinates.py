@@ -44,7 +44,7 @@ IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
 
 # Rows of the base's angular and linear part in a velocity or force (6 + n) of state order,
 ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
-# and in Pinocchio's v and spatial vectors.
+# The same rows in Pinocchio's v and spatial vectors.
 PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 
 

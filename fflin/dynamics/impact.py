@@ -185,7 +185,7 @@ def struck(
 
 
 def inertia_at(robot: Robot, q: Array) -> Array:
-    """Return M (nv, nv) over Pinocchio's v."""
+    """Return the joint-space inertia M (nv, nv) for Pinocchio's v."""
     M = np.triu(pin.crba(robot.model, robot.create_data(), q.copy()))
     full: Array = M + np.triu(M, 1).T
     return full
@@ -344,7 +344,7 @@ def capture(
             )
     if other.stored_momentum:
         raise InputError(
-            "a wheel of the payload has a momentum but no inertia, so that its momentum would be "
+            "a wheel of the payload has a momentum but no inertia, so its momentum would be "
             "lost; give the wheel an inertia, and its speed in payload_v"
         )
     at = pin.SE3.Identity() if placement is None else checked_placement("placement", placement)

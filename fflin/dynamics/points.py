@@ -11,7 +11,6 @@ from fflin.base.names import by_name, input_keys, rates_by_name
 from fflin.base.validation import Array, instance, numbers, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.robot.fields import combined
 from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, by_joint
 from fflin.robot.robot import Robot
@@ -77,6 +76,15 @@ def base_of(state: Mapping[str, Any]) -> pin.SE3:
     """Return the base placement of a robot's point, start or target."""
     rotation = pin.rpy.rpyToMatrix(*np.radians(state.get("rpy", np.zeros(3))))
     return pin.SE3(rotation, np.array(state.get("position", np.zeros(3))))
+
+
+def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a state whose parts, joints and rates are replaced by the entries of another state."""
+    both = {**state, **other}
+    for part in ("joints", "velocity"):
+        if part in both:
+            both[part] = {**state.get(part, {}), **other.get(part, {})}
+    return both
 
 
 def start_of(robot: Robot) -> tuple[Array, Array]:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     Mask: TypeAlias = NDArray[np.bool_]
 
-# Round-off of M a and of the accelerations themselves, relative to the terms that they sum.
+# Rounding errors of M a and of the accelerations, relative to the terms that they sum.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
@@ -166,7 +166,7 @@ def equilibrium(
     state = StateMap(robot, frame=frame, reference=reference)
     given = robot.neutral() if q is None else robot.checked_configuration(q)
     axes: Any = {"moving": True}
-    if robot.orbit:  # its own placement, so that there too forces and inputs are in base axes
+    if robot.orbit:  # reference at the base, so that forces and inputs are in base axes
         own = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
         axes = {"frame": frame, "reference": own}
     linearizer = Linearizer(robot, **axes)
@@ -174,7 +174,7 @@ def equilibrium(
     free = {f"tau_m.{name}" for name, k in robot.stiffness.items() if k} - set(actuation.names)
     soft = np.array([name in free for name in pushes])
     tolerance = (balance := _Balance(linearizer, given, v)).tolerance
-    for _ in range(20):  # Newton's method: a few do
+    for _ in range(20):  # Newton's method, which needs a few steps
         loose = soft & (np.abs(balance.residual) > tolerance)
         if not loose.any():
             break
@@ -218,7 +218,7 @@ class _Balance:
         self.residual, self.tolerance = self.left / mobility, rounding + terms
 
     def newton_step(self, linearizer: Linearizer, soft: Mask) -> Array:
-        """Return Newton's step (6 + n,) of the joints whose rows of the forces are `soft`."""
+        """Return Newton's step (6 + n,), which moves only the coordinates in the mask `soft`."""
         robot, lin = linearizer.robot, linearizer(self.lin.q, self.lin.v, self.u)
         hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
         own = np.sqrt(robot.springs.stiffness[soft[6:]])
@@ -234,7 +234,7 @@ class _Balance:
 
 
 def _require_steady(lin: LinearModel, drift: Array) -> None:
-    """Refuse a motion of coordinates on which the forces depend."""
+    """Raise `EquilibriumError` if a joint moves on whose position the forces depend."""
     moving = [
         f"{name} at {rate:.3g} {unit}/s"
         for name, unit, rate in zip(lin.state_names, lin.state_units, drift.tolist(), strict=True)
@@ -260,7 +260,7 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
 
 
 def _rounding(robot: Robot, lin: LinearModel, M: Array) -> Array:
-    """Return the rounding errors of the forces (6 + n,) from terms that cancel."""
+    """Return bounds of the rounding errors of the forces (6 + n,), where large terms cancel."""
     state = StateMap(robot)
     field = field_of(robot, lin.frame)
     speed = np.abs(state.velocities(field.absolute(lin.q, lin.v) if field else lin.v))
@@ -290,19 +290,20 @@ def _unbalanced(
 
 _EPS = float(np.finfo(float).eps)
 
-# Largest fraction of what is to be balanced that may be left over.
+# Largest allowed residual, as a fraction of the forces to be balanced.
 TOLERANCE = 1e-9
 
 
 def least_norm(C: Array, d: Array, one_sided: Mask) -> tuple[Array, Array]:
-    """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``."""
+    """Return the minimum-norm u with ``C u = d`` and ``u[one_sided] >= 0``, and ``C u - d``."""
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
         from fflin.kernel.allocation import nearest
 
         least, most = np.where(one_sided, 0.0, -np.inf), np.full(len(u), np.inf)
         u = nearest(C, d, least, most)
-        # The same without the rounding of the bounded problem: inputs at zero stay out.
+        # Solve again without bounds for the nonzero inputs, to remove the rounding errors of the
+        # bounded problem.
         pushing = ~one_sided | (u > TOLERANCE * float(np.abs(u).max(initial=0.0)))
         polished: Array = np.zeros(len(u))
         polished[pushing] = _pseudo_solve(C[:, pushing], d)
@@ -312,9 +313,9 @@ def least_norm(C: Array, d: Array, one_sided: Mask) -> tuple[Array, Array]:
 
 
 def _pseudo_solve(C: Array, d: Array) -> Array:
-    """Return the u of least norm among those with the least ``|C u - d|``."""
+    """Return the minimum-norm u that minimises ``|C u - d|``."""
     u: Array = np.linalg.lstsq(C, d, rcond=None)[0]
     u += np.linalg.lstsq(C, d - C @ u, rcond=None)[0]
-    # An input below the rounding of the largest one is noise: it counts as zero.
+    # Inputs below the rounding error of the largest input are noise, and set to zero.
     u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
     return u

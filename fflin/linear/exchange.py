@@ -20,7 +20,7 @@ from fflin.linear.model import LinearModel, StateSpace
 from fflin.linear.tool_coordinates import Jacobians, ToolCoordinates, tool_coordinates
 from fflin.robot.robot import Robot
 
-_ROUNDING = 1e-12  # of the largest entry, by which another route to a matrix may miss a zero
+_ROUNDING = 1e-12  # smaller entries, relative to the largest, count as zero
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -187,11 +187,11 @@ class ToolGain(Design):
 
 
 def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
-    """Return the gain of a model in a tool's coordinates; its closed-loop poles are the same."""
+    """Convert a gain K of a model to a tool's coordinates; the closed-loop poles do not change."""
     model, whole = lin.to(tool), lin.generator
     assert whole is not None and lin._robot is not None
     _, own, to, _ = _jacobians_at(lin._robot, whole, tool)
-    # An input that is held in one of the two axes turns in the other (15.4).
+    # An input that is constant in the axes of the model rotates in the axes of the tool (15.4).
     turned = np.linalg.solve(to.V, (to.H - own.H) @ to.left)
     return ToolGain(model.T_u @ K @ model.T_left + turned, model, verified=lin.verified)
 
@@ -267,7 +267,7 @@ def from_tool(
     ours = transformed(own, to, lin.A, lin.B)
     ours = _euler_step(*ours, to.P @ rates, step)[:2] if step else ours
     changes = [_difference(*each) for each in zip("AB", (A, B), ours, strict=True)]
-    if step:  # the rows of positions follow from those of rates
+    if step:  # only the rows of rates count: the rows of positions follow from them
         nv = len(ours[0]) // 2
         changes = [np.vstack((0.0 * each[:nv], each[nv:] / step)) for each in changes]
     own, to = (each._replace(rate=0.0 * each.rate, extra=0.0 * each.extra) for each in (own, to))
@@ -281,7 +281,7 @@ def from_tool(
 def _jacobians_at(
     robot: Robot, lin: LinearModel, tool: str
 ) -> tuple[ToolCoordinates, Jacobians, Jacobians, Array]:
-    """Return a tool's coordinates, the derivatives of the model's and the tool's, and dy/dt."""
+    """Return a tool's coordinates, the derivatives of the model's and tool's states, and dy/dt."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError("lin lacks some states of the robot; use the full model of the robot")
@@ -289,21 +289,21 @@ def _jacobians_at(
     kind = tool_coordinates(robot, tool, moving=lin.moving)
     nu, rates = state.velocities(lin.v), lin.drift
     point = lin.q, nu, own.actuation.in_base_axes(state.chart(lin.q), lin.u0)
-    if rates is None:  # f0 is P times the rate of y
+    if rates is None:  # f0 = P dy/dt
         rates = own.jacobians(*point, 0.0 * nu).left @ lin.f0
     rates = rates[len(nu) :]
     return kind, own.jacobians(*point, rates), kind.jacobians(*point, rates), np.append(nu, rates)
 
 
 def transformed(source: Jacobians, to: Jacobians, A: Array, B: Array) -> tuple[Array, Array]:
-    """Return A and B in other coordinates (15.3), (15.4)."""
+    """Transform A and B from one set of coordinates to another (15.3), (15.4)."""
     B = source.left @ B @ np.linalg.inv(source.V)
     A = source.left @ (A @ source.P - source.rate) + B @ (to.H - source.H)
     return (to.P @ A + to.rate) @ to.left + to.extra, to.P @ B @ to.V
 
 
 def _step(tool: str, dt: float | None) -> float:
-    """Return the time step, 0 if none is given."""
+    """Return the checked time step, or 0 without one."""
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(
@@ -313,7 +313,7 @@ def _step(tool: str, dt: float | None) -> float:
 
 
 def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
-    """Return A, B and f0 of a step of semi-implicit Euler (15.6); of the base linear, angular."""
+    """Return A, B and f0 of a semi-implicit Euler step (15.6), with linear before angular rows."""
     v, a = np.split(rate, 2)
     nv, moved = len(v), h * (v + h * a)
     K, G = np.eye(nv), h * np.eye(nv)
@@ -325,6 +325,6 @@ def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array
 
 
 def _difference(name: str, given: ArrayLike | None, expected: Array) -> Array:
-    """Return by how much a matrix of the caller is more than expected."""
+    """Return the caller's matrix minus the expected matrix, or zero without a matrix."""
     array = expected if given is None else shaped(name, given, expected.shape)
     return np.asarray(array - expected)

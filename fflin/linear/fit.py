@@ -16,7 +16,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
-# Names and units, in their order.
+# Names and units of signals, in the same order.
 Signals: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
 
 
@@ -25,7 +25,7 @@ def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
     made, actuation = f"the model was made for '{lin.robot}'", Actuation(state)
     inputs = (lin.input_names, lin.input_units)
     require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
-    # A reduced model has a part of the states.
+    # A reduced model has only some of the states.
     units = dict(zip(state.names, state.units, strict=True))
     there = tuple(name for name in lin.state_names if name in units)
     states = (lin.state_names, lin.state_units)
@@ -40,14 +40,14 @@ def require_sensed(lin: LinearModel, robot: Robot, state: StateMap) -> None:
 
 
 def sensed(state: StateMap) -> Signals:
-    """Return names and units of a robot's outputs."""
+    """Return the names and units of a robot's outputs."""
     outputs = state.robot.outputs
     found = state if outputs == (FullState(),) else Sensing(state, outputs)
     return found.names, found.units
 
 
 def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signals) -> None:
-    """Raise `InputError` that lists names and units that differ from the robot's."""
+    """Raise `InputError` if names or units differ from the robot's; the message lists them."""
     mine, others = (dict(zip(*each, strict=True)) for each in (own, there))
     lacking, beside = ([n for n in a if n not in b] for a, b in ((mine, others), (others, mine)))
     if names := lacking or beside:
@@ -67,7 +67,7 @@ def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signal
 
 
 def require_turns(made: str, size: int, robot: Robot) -> None:
-    """Raise `InputError` if a configuration has another size than the robot's."""
+    """Raise `InputError` if a configuration of `size` entries does not fit the robot."""
     if size != robot.nq:
         raise InputError(
             f"{made}, but the given robot '{robot.name}' has other continuous joints, so that its "
@@ -143,8 +143,8 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
 
     Use `line_up` to keep a gain after a change of the robot, such as a jammed joint or a captured
     payload, which leaves most states the same. Columns of K belong to states, and rows to inputs.
-    If the gain lacks a state or an input of the model, the column or row is zero. If the model
-    lacks a state or an input of the gain, the column or row is dropped.
+    A state of the model that K does not have gets a zero column, and such an input a zero row.
+    Columns and rows of K for states and inputs that the model does not have are dropped.
 
     Parameters
     ----------

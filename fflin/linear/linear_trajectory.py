@@ -119,8 +119,8 @@ class LinearTrajectory(Trajectory):
         """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), with one matrix pair per time."""
         placements = [interval_of(self.t, t) for t in times.tolist()]
         sampled = bool(self.dt)
-        knot = np.array([k + (share == 1.0 and not sampled) for k, share in placements])
-        inside = np.array([0.0 < share < 1.0 and not sampled for _, share in placements])
+        knot = np.array([k + (s == 1.0 and not sampled) for k, s in placements])
+        inside = np.array([0.0 < s < 1.0 and not sampled for _, s in placements])
         A, B = self.A[knot], self.B[knot]
         if inside.any():
             found = self._linearizer.along(*self.flow.points(times[inside]))
@@ -249,24 +249,24 @@ def along(motion: Trajectory) -> LinearTrajectory:
     found: dict[str, Any] = motion._given | linearizer.along(motion.q, motion.v, motion.u_base)
     names = ("state_names", "input_names", "output_names")
     made = LinearTrajectory(**found, **{key: linearizer.prepared.common[key] for key in names})
-    object.__setattr__(made, "flow", motion.flow)  # what it has found of the same motion
+    object.__setattr__(made, "flow", motion.flow)  # keep cached results of the same motion
     return made
 
 
-# Steps are halved until the transition of a sample is this accurate.
+# Steps are halved until the transition matrix of a sample has this accuracy.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
-# Samples that are integrated at once.
+# Number of samples that are integrated at once.
 _BATCH = 64
 
 
 class Steps(NamedTuple):
-    """Steps (m,) of constant F = [[A, B], [0, 0]] through a sample."""
+    """Steps (m,) through a sample, each with constant F = [[A, B], [0, 0]]."""
 
     F: Array  # (m, nx + nu, nx + nu)
     h: Array  # (m,) [s]
     maps: Array  # (m, nx, nx + nu)
-    nodes: Array  # (m, 2) times of the heavy and the light node of F [s]
+    nodes: Array  # (m, 2) [s] times of the nodes of F with the larger and the smaller weight
 
 
 def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
@@ -299,15 +299,15 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
 
 
 def _agree(whole: Array, coarse: Array) -> bool:
-    # Halves are more accurate by sixteen times, of which four are kept in reserve.
+    # Half steps are 16 times as accurate. A factor of 4 of this is assumed, the rest is a reserve.
     apart, size = (np.abs(each).max(axis=0) for each in (whole - coarse, whole))
     return bool((0.25 * apart <= _ACCURACY * size).all())
 
 
 def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:
-    """Return the steps and transition of samples, with so many parts between their cuts."""
-    share = np.arange(parts) / parts
-    start = [(t[:-1, None] + np.diff(t)[:, None] * share).ravel() for t in cuts]
+    """Return the steps and transition of samples, with `parts` steps between their cuts."""
+    fraction = np.arange(parts) / parts
+    start = [(t[:-1, None] + np.diff(t)[:, None] * fraction).ravel() for t in cuts]
     h = np.concatenate([np.repeat(np.diff(t) / parts, parts) for t in cuts])
     nodes = np.concatenate(start)[:, None] + np.array(GAUSS) * h[:, None]
     A, B = traj.matrices_at(nodes.ravel())

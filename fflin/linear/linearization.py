@@ -29,7 +29,7 @@ from fflin.robot.mass_properties import require_inertia, rotor_names
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
-# A model whose squares add up to more counts as not finite, since its eigenvalues would overflow.
+# Models with a larger sum of squared entries are refused, since their eigenvalues would overflow.
 LARGEST = 1e200
 
 if TYPE_CHECKING:
@@ -44,24 +44,24 @@ class Prepared:
     robot: Robot
     map: StateMap
     actuation: Actuation
-    sensing: Sensing | None  # None where the outputs are the state
+    sensing: Sensing | None  # None if the outputs are the state
     moving: bool
-    own_reference: bool  # the base's own placement at each point, not that of `map`
-    reference: Array  # (7,) the placement of `map`: position [m] and quaternion x, y, z, w
-    free: bool  # whether at rest all of a model but M^-1 is in `common` and `rest`
-    common: Mapping[str, Any]  # fields of a model that are the same about all points
-    rest: Mapping[str, Array]  # its A, f0, u0 and v where nothing moves, pulls or pushes
+    own_reference: bool  # whether the reference is the base placement at each point
+    reference: Array  # (7,) reference of `map`: position [m] and quaternion x, y, z, w
+    free: bool  # whether `common` and `rest` contain all of a model at rest except M^-1
+    common: Mapping[str, Any]  # fields of a model that are the same at all points
+    rest: Mapping[str, Array]  # A, f0, u0 and v of a model at rest without any forces
 
     @cached_property
     def fields(self) -> dict[str, Any]:
-        """Fields of a model at rest except B and q; expensive fields are computed on demand."""
+        """Fields of a model at rest except B and q; slow ones are computed at their first use."""
         state = partial(_state_at, self)
         asked = {"x0": state, "y0": state, "_reference": partial(own_reference, self.robot)}
         other = {} if self.own_reference else {"_reference": self.reference}
         return {**self.common, **self.rest, "_computed": asked, **other}
 
     def kernel(self) -> RowAccelerations:
-        """Return the compiled accelerations; `InputError` if the robot has none."""
+        """Return the compiled accelerations; raise `InputError` if the robot has none."""
         from fflin.kernel.derivatives import RowAccelerations
         from fflin.kernel.tree import batch_tree
 
@@ -74,7 +74,7 @@ class Prepared:
 
     @property
     def not_compilable(self) -> str:
-        """Reason why the robot has no compiled accelerations; empty if it has."""
+        """Reason why the robot has no compiled accelerations, or an empty text."""
         from fflin.kernel.tree import batch_tree
 
         name = self.robot.name
@@ -94,7 +94,7 @@ def prepare(
         refuse_orbit(robot, "models with moving=True")
     if frame is None:
         frame = "local" if moving else None
-    elif not isinstance(frame, str):  # nor one whose comparison below is an array
+    elif not isinstance(frame, str):  # such as an array, which cannot be compared below
         raise unknown_frame(frame)
     if moving and (reference is not None or frame != "local"):
         raise InputError(
@@ -102,7 +102,7 @@ def prepare(
             "no frame other than 'local' can be given; leave out reference and frame"
         )
     state = StateMap(robot, reference=reference, frame=frame)
-    own = reference is None and robot.orbit is None  # in orbit it is the orbit's frame
+    own = reference is None and robot.orbit is None  # in orbit the reference is the orbit frame
     require_inertia(robot)
     actuation = Actuation(state)
     sensing = None
@@ -164,7 +164,7 @@ def _state_at(ready: Prepared, lin: LinearModel) -> Array:
 
 
 def own_reference(robot: Robot, lin: LinearModel) -> Array:
-    """Return the base placement (7,) of a model, its default reference."""
+    """Return the base placement (7,) at a model's point, which is the default reference."""
     q = lin.q
     root = robot.model.jointPlacements[ROOT]
     if root.isIdentity(0.0):
@@ -177,8 +177,8 @@ _STANDING: Chart = Standing()
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     """Return the names of the ignorable coordinates of a linear model of this robot."""
-    # Found on the robot and not at a point: uniform gravity is the same everywhere, and without it
-    # error dynamics do not depend on the attitude either. In an orbit all of it matters.
+    # They depend on the robot, not on the point. Uniform gravity is the same everywhere. Without
+    # gravity, error dynamics do not depend on the attitude. In orbit, position and attitude matter.
     if robot.orbit:
         return tuple(f"q_m.{name}" for name in rotor_names(robot))
     groups = ["r_b"] if any(robot.gravity) or not lin.moving else ["q_b", "r_b"]
@@ -273,14 +273,14 @@ class Linearizer:
         self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
         self.robot = robot
         self._data = robot.create_data()
-        self._lock = Lock()  # of the work space
+        self._lock = Lock()  # protects the work space
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
-        # What stands for rest and no input.
+        # Default velocity and inputs: rest and zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
-        # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
+        # If only inputs act at rest, a model at rest is known in advance except for M^-1 in B.
         self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
@@ -298,12 +298,12 @@ class Linearizer:
         with self._lock:
             if known:
                 return self._at_rest(q)
-            # An overflow is refused below, so NumPy need not warn of it.
+            # `_require_finite` reports an overflow, so NumPy need not warn of it.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A copy, in this process or another, needs a work space of its own.
+        # A copy needs its own work space, so it is built from the arguments.
         ready = self.prepared
         reference = None if ready.own_reference else ready.map.reference
         options: dict[str, Any] = {"frame": ready.map.frame, "reference": reference}
@@ -378,7 +378,7 @@ class Linearizer:
 def _require_finite(*arrays: Array) -> None:
     """Raise `InputError` if the squares of the entries of an array overflow."""
     for array in arrays:
-        if not np.vdot(array, array) < LARGEST:  # nor NaN
+        if not np.vdot(array, array) < LARGEST:  # true for NaN as well
             raise InputError(
                 "the model is not finite, because q, v or u is too large; check their units"
             )

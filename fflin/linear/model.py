@@ -159,18 +159,18 @@ class LinearModel(StateSpace):
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     _drift: Array | None = None
-    # Of a sampled model: its own fingerprint and the continuous model that it was made of, whose
-    # structure no exponential has blurred.
+    # Of a discrete-time model: its fingerprint and its continuous-time model, which still has the
+    # exact zeros that the matrix exponential loses.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
     weights: Mapping[str, Any] = field(default_factory=dict)
-    _robot: Robot | None = None  # that it was made of; None where it is from a file
+    _robot: Robot | None = None  # robot of the model; None for a model from a file
     mean_motion: float = 0.0
 
     def __init__(self, shared: Mapping[str, Any] | None = None, /, **fields: Any) -> None:
-        # The __init__ of a dataclass sets three dozen frozen fields one by one, which takes as long
-        # as the dynamics of a small robot. Most of them are `shared` by the models of a robot.
+        # A dataclass would set three dozen frozen fields one by one, which takes as long as the
+        # dynamics of a small robot. Here, most fields are in `shared` for all models of a robot.
         for name, value in fields.items():
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 fields[name] = frozen(value.copy())
@@ -451,6 +451,6 @@ def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
 
 
 def same_certificate(whole: LinearModel, fingerprint: str, made: LinearModel) -> Certificate:
-    """Return the certificate of the source of a model, if its matrices are unchanged."""
+    """Return the certificate of a continuous-time model, if a model made from it is unchanged."""
     made.require(fingerprint)
     return whole.certificate

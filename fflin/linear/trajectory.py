@@ -1,4 +1,4 @@
-"""Trajectory: a motion of a robot given by knots, with held or linear inputs in between."""
+"""Trajectory: motion of a robot given by knots, with constant or linear inputs between knots."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
 from fflin.robot.robot import Robot
 
-# The largest residual of a motion of the robot.
+# Largest residual up to which knots count as a motion of the robot.
 _MOTION = 1e-2
 
-# Between two knots the base goes the shorter way, of less than half a turn [rad].
+# Largest rotation of the base between two knots [rad], so that its direction is unambiguous.
 _FARTHEST_TURN = 2.5
 
 _CAUSES = (
@@ -96,7 +96,7 @@ class Trajectory(Design):
     u: Array
     hold: str | None = field(default=None, kw_only=True)
     frame: str = field(default="local", kw_only=True)
-    _note: str = field(default="", kw_only=True)  # what is printed below it; no file has it
+    _note: str = field(default="", kw_only=True)  # note printed below; not saved in files
 
     def __post_init__(self) -> None:
         refuse_orbit(self.robot, "trajectories")
@@ -143,7 +143,7 @@ class Trajectory(Design):
         )
 
     def __str__(self) -> str:
-        """Show the trajectory with its residual as a motion of the robot."""
+        """Return a text about the trajectory, with its residual as a motion of the robot."""
         said = self._fault or f"residual {self.residual.max():.1e}"
         note = f"\n{folded([self._note])}" if self._note else ""
         return f"{folded(super().__str__().splitlines())}\n{folded([said])}{note}"
@@ -229,7 +229,7 @@ class Trajectory(Design):
 
     @property
     def _fault(self) -> str:
-        """Return why the knots are not a motion of the robot; empty if they are."""
+        """Return why the knots are not a motion of the robot, or an empty text."""
         missed = self.flow.residual
         k = int(missed.argmax())
         where = f"'{self.robot.name}': from t = {self.t[k]:g} to {self.t[k + 1]:g} s"
@@ -324,7 +324,7 @@ class Trajectory(Design):
 
 
 def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
-    """Return q (count, nq); single angles are replaced by their cosine and sine."""
+    """Return q (count, nq); if continuous joints are given as angles, convert to (cos, sin)."""
     rows, cosines = as_double("q", q), np.array(list(robot.unbounded), dtype=int)
     narrow = (count, robot.nq - len(cosines))
     if rows.shape == (count, robot.nq):
@@ -341,14 +341,15 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
 
 
 def along(motion: Any, robot: Robot | None) -> Trajectory:
-    """Return a motion by knots, with held or linear inputs, whose residual is smaller."""
+    """Convert a motion to a trajectory with constant or linear inputs, by the smaller residual."""
     if motion.phases:
         raise InputError(
             "the motion has several phases, each with its own robot; convert each phase separately"
         )
     if robot is None:
         raise InputError(
-            "the motion was read from a file, which does not contain its robot; give the robot"
+            "the motion was read from a file, which does not contain its robot; give the robot, "
+            "motion.trajectory(robot)"
         )
     entries = {name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")}
     from fflin.linear.files import arguments

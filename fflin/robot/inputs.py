@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 
@@ -19,15 +19,15 @@ Vector3: TypeAlias = Sequence[float]
 class Input:
     """Base class of inputs, with their limits and names."""
 
-    KEY: ClassVar[str]  # its type in a TOML file
-    GROUP: ClassVar[str]  # what its inputs are called together, in weights and limits
+    KEY: ClassVar[str]  # `type` in a TOML file
+    GROUP: ClassVar[str]  # common name of all inputs of this class in weights and limits
     UNIT: ClassVar[str] = "N m"
     ENTRIES: ClassVar[str] = " "
     PULLS: ClassVar[bool] = True
 
-    # What it does not exceed, in its unit; one number, or three for torque and force on the base.
+    # Largest value, in UNIT: one number, or three for a torque or force on the base.
     max: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
-    # The least that it gives; by default -max, of a thruster 0.
+    # Least value: by default -max, or 0 for a thruster.
     min: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
@@ -47,12 +47,12 @@ class Input:
                     "than 0 and a min of at most max; leave out what is not limited"
                 )
 
-    def _set(self, name: str, value: Any) -> None:
+    def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
-        """(least, largest) value of each entry; infinite if there is no limit."""
+        """Least and largest value (least, largest) of each entry; infinite without a limit."""
         largest = np.broadcast_to(math.inf if self.max is None else self.max, len(self.ENTRIES))
         usual = -largest if self.PULLS else 0.0
         least = np.broadcast_to(usual if self.min is None else self.min, len(largest))
@@ -76,7 +76,7 @@ class Input:
 class WrenchInput(Input, ABC):
     """Base class of inputs whose wrench on a link is constant in a frame."""
 
-    frame: str | None  # of the model, on the base or on any link; None is the base's root frame
+    frame: str | None  # frame of the model on any link; None for the base's root frame
     name: str | None
 
     def names(self, count: int) -> tuple[str, ...]:
@@ -323,7 +323,7 @@ def unit_vector(what: str, value: Vector3, hint: str) -> tuple[float, float, flo
 
 
 def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]:
-    """Return inputs, each with the names of its entries in u."""
+    """Return (input, names of its entries in u) for each input."""
     seen: Counter[str] = Counter()
     found = []
     for item in inputs:
@@ -333,6 +333,6 @@ def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]
 
 
 def named_wheels(inputs: Sequence[Input]) -> list[tuple[str, ReactionWheel]]:
-    """Return the wheels among inputs, each with its name: wheel_1, wheel_2, ... by default."""
+    """Return (name, wheel) for the wheels among inputs; default names are wheel_1, wheel_2, ..."""
     found = named_inputs(inputs)
     return [(names[0], item) for item, names in found if isinstance(item, ReactionWheel)]

@@ -28,7 +28,7 @@ def load(
     *,
     lock: Lock | None = None,
     package_dirs: Sequence[str | Path] = (),
-    **fields: Any,
+    **fields: object,
 ) -> Robot:
     """Load a robot as a free flyer, by default in zero gravity.
 
@@ -107,12 +107,12 @@ def load(
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     if loaded.idle_coordinates:
-        # No warning: whatever needs the inverse of M refuses with this.
+        # A note instead of a warning, because every function that inverts M raises this error.
         notes.append(massless_note(loaded))
     return replace(loaded, notes=tuple(notes))
 
 
-def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
+def with_fields(robot: Robot, fields: Mapping[str, object]) -> Robot:
     """Return a robot with new fields; fields of joints are merged with the robot's."""
     if not fields:
         return robot
@@ -130,14 +130,14 @@ def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
 def _load(
     found: RobotFile, lock: Lock | None, package_dirs: tuple[Path, ...]
 ) -> tuple[Robot, tuple[Advice, ...]]:
-    """Return the robot of a URDF, and the warnings that its fields may still remove."""
+    """Return the robot of a URDF, and warnings that fields of the robot may make unnecessary."""
     description = read_urdf(found.path)
     loaded = _robot(description.model, found.name, lock, description.mimics)
     dirs = (*package_dirs, *found.package_dirs)
-    # Meshes are read when the robot is drawn, and no output may replace them before.
+    # Meshes are read when the robot is drawn, so output files must not overwrite them before.
     remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in description.meshes)))
     damping = {name: description.damping.get(name, 0.0) for name in loaded.joint_names}
-    # That of mimic joints counts with that of their leaders: the power is the same.
+    # Damping of a mimic joint is added to its leader with equal dissipated power.
     for joint, leader, multiplier, _ in loaded.followers:
         damping[leader.name] += multiplier**2 * description.damping.get(joint.name, 0.0)
     loaded = replace(
@@ -154,7 +154,7 @@ def _load(
 
 
 def from_model(
-    model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: Any
+    model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: object
 ) -> Robot:
     """Make a robot from a Pinocchio model that was built from MJCF, SDF or code.
 
@@ -225,7 +225,7 @@ def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, 
 
 
 def _check_root(model: pin.Model, name: str) -> None:
-    """Refuse a model that is not one tree on one free-flyer."""
+    """Raise `ModelError` unless the model is one tree with one free-flyer root joint."""
     root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
     if root != "JointModelFreeFlyer":
         raise ModelError(
@@ -241,7 +241,7 @@ def _check_root(model: pin.Model, name: str) -> None:
 
 
 def _check_order(model: pin.Model, name: str) -> None:
-    """Refuse joints that are not in depth-first order."""
+    """Raise `ModelError` if the joints are not in depth-first order."""
     above: list[int] = []
     for joint, parent in enumerate(model.parents.tolist()):
         while above and above[-1] != parent:
@@ -256,7 +256,7 @@ def _check_order(model: pin.Model, name: str) -> None:
 
 
 def _check_model(model: pin.Model, name: str) -> None:
-    """Refuse a model whose numbers no robot has, by the joint that has them."""
+    """Raise `ModelError` if a joint or body has physically impossible numbers."""
     for index in range(ROOT, model.njoints):
         body, joint, parent = model.inertias[index], model.joints[index], model.parents[index]
         armature = model.armature[joint.idx_v : joint.idx_v + joint.nv]
@@ -283,7 +283,7 @@ def _check_model(model: pin.Model, name: str) -> None:
 
 
 def body_alone(inertia: pin.Inertia, name: str) -> Robot:
-    """Return a body as a robot without joints."""
+    """Return a robot that consists of one body without joints."""
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
     model.appendBodyToJoint(1, inertia, pin.SE3.Identity())
@@ -292,5 +292,5 @@ def body_alone(inertia: pin.Inertia, name: str) -> Robot:
 
 
 def inertia_of(value: pin.Inertia) -> pin.Inertia:
-    """Return the inertia of a body that has mass, or raise `InputError`."""
+    """Return the inertia of a body, or raise `InputError` if it has no mass."""
     return given_body("payload", value, value)

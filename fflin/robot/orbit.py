@@ -23,10 +23,10 @@ BODIES = {
     "saturn": (3.793120749e16, 60268000.0),
 }
 
-# A lower altitude [m] over the earth is probably in km.
+# An altitude [m] over the earth below this value was probably meant in km.
 _LOWEST = 80e3
 
-_FOLLOWS: Any = None  # from the others
+_FOLLOWS: Any = None  # default of fields that follow from other fields
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class CircularOrbit:
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
-            # Not for an orbit that was saved, nor for another body called earth.
+            # No warning for a saved orbit, or for another body that is named earth.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
                 warnings.warn(
                     f"an altitude of {altitude:.8g} m over earth is too low for an orbit; "
@@ -169,8 +169,8 @@ class CircularOrbit:
         )
 
 
-def checked_orbit(value: Any) -> CircularOrbit | None:
-    """Return the orbit of a field: an orbit, an altitude [m], a mapping of parts, or None."""
+def checked_orbit(value: object) -> CircularOrbit | None:
+    """Return the orbit from an orbit, an altitude [m], a mapping of parts, or None."""
     if value is None or isinstance(value, CircularOrbit):
         return value
     if not isinstance(value, Mapping):

@@ -1,7 +1,7 @@
 """Outputs y of the linear model: measured quantities of a robot, in any mix and order.
 
-Reference axes are the axes of the reference placement that the state is relative to. The module
-`fflin.dynamics.outputs` holds the measured value of each kind and its derivatives.
+Reference axes are the axes of the state's reference placement. The module
+`fflin.dynamics.outputs` computes the outputs and their derivatives.
 """
 
 from dataclasses import dataclass, fields
@@ -14,11 +14,11 @@ from fflin.base.errors import InputError, require_known
 class Output:
     """Base class of outputs, with their names and units."""
 
-    # What it is called on a command line.
+    # Name on the command line.
     WORD: ClassVar[str]
-    # (name, unit) of each vector of three that it measures; empty where it is of states.
+    # (name, unit) of each measured vector (3,); empty if the output consists of states.
     VECTORS: ClassVar[tuple[tuple[str, str], ...]] = ()
-    # Whether it depends on the accelerations, and so on the inputs.
+    # Whether the output depends on accelerations, and so on the inputs.
     FEELS_ACCELERATION: ClassVar[bool] = False
 
     @property
@@ -35,7 +35,7 @@ class Output:
 
 @dataclass(frozen=True)
 class FrameOutput(Output):
-    """Base class of outputs of one or two frames of the model, on the base or on any link."""
+    """Base class of outputs that depend on one or two frames on the base or on links."""
 
     frame: str
 
@@ -80,7 +80,7 @@ class JointOutput(Output):
     joints: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        # A string is a sequence of names of one letter each.
+        # A string would be taken as a sequence of one-letter names.
         if isinstance(self.joints, str):
             given = repr(self.joints)
             raise InputError(f"joints is {given}, expected a tuple of names: write ({given},)")
@@ -275,7 +275,7 @@ class Accelerometer(FrameOutput):
     FEELS_ACCELERATION = True
 
 
-# In the order in which a command line lists them.
+# In the order of the list on the command line.
 KINDS: tuple[type[Output], ...] = (
     *(FullState, BasePose, JointPositions, JointVelocities, CenterOfMass, Momentum),
     *(FramePose, FrameVelocity, RelativePose, Gyroscope, Accelerometer),
@@ -283,7 +283,7 @@ KINDS: tuple[type[Output], ...] = (
 
 
 def parse_output(text: str) -> tuple[Output, ...]:
-    """Read outputs as a command line has them: WORD, joints:NAME, pose:NAME, relative:NAME:TO."""
+    """Read outputs of the command line: WORD, joints:NAME, pose:NAME or relative:NAME:TO."""
     word, colon, rest = text.partition(":")
     kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
     require_known("output", [word], kinds)

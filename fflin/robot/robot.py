@@ -40,7 +40,7 @@ class Springs(NamedTuple):
     rest: Array
 
     def force(self, q_m: Array, rates: Array) -> Array:
-        """Return the force (.., n) on joints at q_m (.., n) that move at rates (.., n)."""
+        """Return the forces (.., n) of springs and dampers at q_m (.., n) and rates (.., n)."""
         return self.stiffness * (self.rest - q_m) - self.damping * rates
 
 
@@ -148,22 +148,22 @@ class Robot(Coordinates):
     file_joints: tuple[str, ...] = ()
     attached: tuple[tuple[str, Robot], ...] = ()
     appendages: tuple[Appendage, ...] = ()
-    # Where some of its joints are wheels or modes: the same robot without them.
+    # The same robot without wheels and modes; None if no joint is a wheel or mode.
     _unequipped: Robot | None = None
-    # Wheels and modes that it had before its inputs or appendages were replaced.
+    # Wheels and modes that were removed when inputs or appendages were replaced.
     _removed: tuple[str, ...] = ()
-    # The model, and what it was when the first robot of it was made.
+    # The model, and a copy from when the first robot was made from it.
     _as_made: tuple[pin.Model, pin.Model] | None = None
 
     def __post_init__(self) -> None:
         if self._as_made is None or self._as_made[0] is not self.model:
             object.__setattr__(self, "_as_made", (self.model, self.model.copy()))
         if not self.inputs:
-            # One force for each degree of freedom.
+            # Default: one force or torque for each degree of freedom.
             default = (BaseTorque(), BaseForce(), *map(JointTorque, self.joint_names))
             object.__setattr__(self, "inputs", default)
 
-    def replace(self, **fields: Any) -> Robot:
+    def replace(self, **fields: object) -> Robot:
         """Return a copy of the robot with other inputs, springs, gravity, orbit or other fields.
 
         Parameters
@@ -248,7 +248,7 @@ class Robot(Coordinates):
         scope = Scope(robot.joint, joints, own, robot.inputs, self.urdf_damping)
         checked = checked_fields(fields, scope)
         for key in ("stiffness", "damping"):
-            if key in checked:  # modes keep theirs unless they are named
+            if key in checked:  # modes keep their values unless they are named
                 old = getattr(robot, key)
                 kept = {joint.name: old[joint.name] for joint in robot.modes if joint.name in old}
                 checked[key] = kept | checked[key]
@@ -262,7 +262,7 @@ class Robot(Coordinates):
             find_frame(robot.model, name)
         return robot
 
-    def with_mass_properties(self, bodies: Mapping[str, Any]) -> Robot:
+    def with_mass_properties(self, bodies: Mapping[str, object]) -> Robot:
         """Return a copy of the robot with other masses, centres of mass or inertias.
 
         Parameters
@@ -347,7 +347,7 @@ class Robot(Coordinates):
         changed: Robot = with_inputs(whole, self.inputs)
         if not self.modes:
             return changed
-        # On the same joints, so that a configuration keeps its amplitudes.
+        # The joints remain the same, so configurations keep their modal amplitudes.
         model, own = self.model.copy(), self.model.inertias
         for joint in bodies:
             at = self.model.getJointId(bare.model.names[joint]) if joint > ROOT else ROOT
@@ -360,7 +360,7 @@ class Robot(Coordinates):
     @cached_property
     def pieces(self) -> dict[str, Piece]:
         """Mass properties {name: piece} of all links, and of all bodies with several links."""
-        # Wheels stand between the joints of the whole robot.
+        # The joint indices of the bare robot change, because wheels are inserted between joints.
         names, at = self._bare.model.names, self.model.getJointId
         now = [at(name) if joint > ROOT else joint for joint, name in enumerate(names)]
         found = self._links_and_bodies[0]
@@ -452,11 +452,11 @@ class Robot(Coordinates):
 
     @property
     def _bare(self) -> Robot:
-        """The robot without the wheels and modes among its joints."""
+        """The robot without wheels and modes."""
         return self._unequipped or self
 
-    def _without_motors(self, passive: Any) -> Robot:
-        """Return the robot without the torques of joints that have no motor."""
+    def _without_motors(self, passive: object) -> Robot:
+        """Return the robot without the torque inputs of passive joints."""
         bare = self._bare
         joints = checked_passive(passive, bare.joint, bare.joint_names)
         inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)

@@ -146,8 +146,8 @@ class Motion(Design):
     urdf_sha256: str
     stopped: str
     com_drift: Array = field(default_factory=lambda: np.zeros(0))
-    _robot: Any = field(default=None, kw_only=True)  # that was simulated; no file has it
-    _nominal: str = field(default="", kw_only=True)  # checksum of its campaign's robot; as _robot
+    _robot: Any = field(default=None, kw_only=True)  # simulated robot; not saved in files
+    _nominal: str = field(default="", kw_only=True)  # checksum of a campaign's robot; not saved
     wheels: tuple[str, ...] = field(default_factory=tuple)
     wheel_inertias: Array = field(default_factory=lambda: np.zeros(0))
     steered: tuple[str, ...] = field(default_factory=tuple)
@@ -157,7 +157,7 @@ class Motion(Design):
     engine: str = field(default_factory=str)
     phases: tuple[str, ...] = field(default_factory=tuple)
     starts: Array = field(default_factory=lambda: np.zeros(0))
-    _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; as _robot
+    _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; not saved
     circles: str = field(default_factory=str)  # the orbit, as text
     modes: tuple[str, ...] = field(default_factory=tuple)
     mode_rotations: Array = field(default_factory=lambda: np.zeros(0))
@@ -168,9 +168,9 @@ class Motion(Design):
         count = len(self.t)
         if any(len(x) != count for x in rows) or any(len(x) not in (0, count) for x in may_lack):
             raise InputError(f"a motion has {count} times; every history needs as many rows")
-        if self.target.size in (0, self.x.shape[1]):  # of .mat, which knows no vectors
+        if self.target.size in (0, self.x.shape[1]):  # .mat files have no vectors
             object.__setattr__(self, "target", self.target.ravel())
-        if not len(self.prediction):  # of json, which knows no empty matrices
+        if not len(self.prediction):  # .json files have no empty matrices
             object.__setattr__(self, "prediction", np.zeros((0, self.x.shape[1])))
         object.__setattr__(self, "limits", self.limits.reshape(len(self.limit_names), 2))
         super().__post_init__()
@@ -311,7 +311,7 @@ class Motion(Design):
         return plot_motion(self, path, **options)
 
 
-def require_motion(motion: Any) -> Motion:
+def require_motion(motion: object) -> Motion:
     """Return the motion, or raise `InputError` if it is not a Motion."""
     found: Motion = instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def simulate(
     robot: Robot,
-    policy: Policy | StateFeedback | GainSchedule | Any = None,
+    policy: Policy | StateFeedback | GainSchedule | object = None,
     *,
     x0: ArrayLike | None = None,
     q0: ArrayLike | None = None,
@@ -238,7 +238,7 @@ def motion_of(plan: Plan, plant: Plant, conserved: Conserved, run: Recording) ->
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
         momentum_drift=conserved.momentum_drift(history, run.momentum),
-        # In orbit the centre of mass keeps to no line.
+        # In orbit, the centre of mass does not move along a straight line.
         com_drift=np.linalg.norm(history.center - run.center, axis=1)[: 0 if robot.orbit else None],
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,

@@ -23,7 +23,7 @@ from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.parameters import Parameter, Variants
 from fflin.uncertainty.worst import Worst, searched
 
-# Draws for one that makes a robot, before it is said that hardly any does.
+# Number of rejected draws per valid draw above which the ranges are refused.
 _TRIES = 1000
 
 
@@ -177,7 +177,7 @@ class Uncertain:
         return [self.at(self.values(delta)) for delta in self.draws(n, seed=seed)[0]]
 
     def worst(
-        self, gain: Any, q: Array | None = None, *, samples: int = 200, seed: int = 0
+        self, gain: object, q: Array | None = None, *, samples: int = 200, seed: int = 0
     ) -> Worst:
         """Search the ranges for the worst closed loop u = -K x.
 
@@ -212,7 +212,7 @@ class Uncertain:
         return searched(self, self.lft(q), gain, whole("samples", samples, 1), seed)
 
 
-def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
+def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     """Define the uncertain parameters of a robot and their ranges.
 
     Parameters
@@ -305,7 +305,7 @@ def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> N
             )
 
 
-def _range(one: Parameter, value: Any) -> Range:
+def _range(one: Parameter, value: object) -> Range:
     if one.part[:9] == "direction":
         said = (
             "rotates a unit vector, so that the model is not a rational function of it; use "
@@ -325,7 +325,7 @@ def _range(one: Parameter, value: Any) -> Range:
     expected = "" if least < largest else "least < largest"
     if least < 0.0 and one.part in ("stiffness", "damping"):
         expected = "values of 0 or more"
-    # The inertia is a wheel's.
+    # "inertia" without an entry is the inertia of a wheel.
     if least <= 0.0 and one.part in ("mass", "density", "inertia", "frequency"):
         expected = "values above 0"
     if expected:
@@ -337,7 +337,7 @@ def _range(one: Parameter, value: Any) -> Range:
 
 
 def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
-    """Return the block of parameters that have one delta."""
+    """Return the block of tied parameters, which have a common delta."""
     ranges = [_range(one, value) for one in parameters]
     units = {one.unit for one in parameters}
     if isinstance(value, tuple | list):
@@ -349,7 +349,7 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
     relative = abs(float(value))
-    # Of what is below 0 too, more is further from 0.
+    # A relative half width has the sign of the nominal value: delta > 0 increases the magnitude.
     scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
     return Block(key, "1", 1.0, relative, tuple(scaled))
 

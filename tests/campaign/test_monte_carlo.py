@@ -20,7 +20,7 @@ import fflin
 from fflin.campaign.report import influences, worst_runs
 from fflin.campaign.runs import ARRAYS, CampaignJob
 from fflin.campaign.statistics import KINDS
-from fflin.simulation.report import courses
+from fflin.simulation.report import error_histories
 from tests.support.campaigns import both
 from tests.support.measured import FELT, POSITIONS, designed
 from tests.support.messages import any_wording, says
@@ -519,7 +519,7 @@ def test_the_time_to_settle_is_that_of_the_motions_table(robots):
     )
     for run in range(3):
         motion = campaign.replay(run)
-        made = {course.title: course for course in courses(motion)}
+        made = {each.title: each for each in error_histories(motion)}
         # A motion and a campaign call the kinds of error by the same names.
         assert [*made] == [*KINDS]
         for title, course in made.items():

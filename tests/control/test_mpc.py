@@ -343,7 +343,7 @@ def test_campaigns_fly_it_and_the_compiled_loop_says_why_not(servicer):
     options = {"duration": 2.0, "dt": 0.05, "limits": ["urdf", WEAK]}
     campaign = fflin.monte_carlo(robot, policy, {"q_b": 0.05, "*.mass": 0.05}, runs=3, **options)
     again = campaign.replay(1)
-    assert len(campaign) == 3 and "8 plans of 8 samples" in again.notes[-1]
+    assert len(campaign) == 3 and "each of 8 samples of 0.25 s: 8" in again.notes[-1]
     with pytest.raises(fflin.InputError, match="Mpc"):
         fflin.simulate(robot, policy, engine="compiled", **options)
     with pytest.raises(fflin.InputError, match="`sample`"):

@@ -67,7 +67,7 @@ def test_the_headline_names_the_rates_that_the_table_calls_unsettled():
     x[:, at] = 1e-3
     headline = " ".join(motion_report(replace(motion, x=x)).split("ets_vii:")[0].split())
     assert headline.startswith("positions settled after 7.83")
-    assert says(headline, "not yet: omega_b 0.001 rad/s") and "joint rates" not in headline
+    assert says(headline, "not yet settled: omega_b 0.001 rad/s") and "joint rates" not in headline
     assert cells(replace(motion, x=x), "omega_b")[-2:] == ["not", "yet"]
     # A rate that is not fed back never settles, and its row says so.
     loose = replace(motion, x=x, steered=("q_b.x", "q_m.joint_1"))

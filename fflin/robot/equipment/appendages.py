@@ -1,12 +1,12 @@
 r"""Flexible appendages and slosh: passive degrees of freedom of a link, as bodies on joints.
 
-A clamped appendage with the twist V of its frame, modal amplitudes :math:`\eta` of unit modal mass
-and the participation L (6, k) has the kinetic energy
+An appendage that is clamped to a frame with the twist V, and has modal amplitudes :math:`\eta` of
+unit modal mass and the participation L (6, k), has the kinetic energy
 
 .. math:: T = \tfrac12 V^T M_{rr} V + V^T L \dot\eta + \tfrac12 \dot\eta^T \dot\eta.
 
-Each mode is equivalent to one ball on one screw joint, whose spatial inertia I and twist S for a
-unit of the amplitude satisfy I S = L and S^T I S = 1. The ball is taken out of the link's inertia,
+Each mode is equivalent to one ball on one screw joint. The ball's spatial inertia I and the twist S
+per unit amplitude satisfy I S = L and S^T I S = 1. The ball is subtracted from the link's inertia,
 so that the sum of both is the link in the URDF.
 """
 
@@ -25,7 +25,7 @@ from fflin.base.validation import Array, FrozenArrays, as_double, number, positi
 from fflin.robot.equipment.mounting import about_origin, inertia_of
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
-# First root of J_1'(x) = 0: k R of the first lateral mode of a circular cylinder.
+# First root of J_1'(x) = 0, which is k R of the first lateral mode in a circular cylinder.
 _FIRST_ROOT = 1.8411837813406593
 _FASTEST = 1e12  # [Hz]
 
@@ -33,7 +33,7 @@ _FASTEST = 1e12  # [Hz]
 class Appendage(FrozenArrays):
     """Base class of passive parts of a link."""
 
-    KEY: ClassVar[str]  # its table in a robot file
+    KEY: ClassVar[str]  # name of the table in a robot file
     frame: str
     name: str | None
 
@@ -111,8 +111,8 @@ class FlexibleAppendage(Appendage):
     rotation: Any
     damping: Any = 0.005
     name: str | None = None
-    # M_rr (6, 6) of a file about the frame's origin, translation over rotation, and whether it
-    # replaces the inertia of the URDF.
+    # M_rr (6, 6) from a file, about the frame's origin, with translation before rotation; `rigid`
+    # is true if it replaces the inertia of the URDF.
     inertia: Array | None = field(default=None, kw_only=True)
     rigid: bool = field(default=False, kw_only=True)
 
@@ -147,15 +147,15 @@ class FlexibleAppendage(Appendage):
     @classmethod
     def from_nastran(
         cls,
-        op4: Any,
-        asm: Any,
+        op4: object,
+        asm: object,
         *,
         frame: str,
-        origin: Any = None,
+        origin: object = None,
         modes: int | None = None,
         length: str = "m",
         mass: str = "kg",
-        damping: Any = 0.005,
+        damping: object = 0.005,
         name: str | None = None,
         rigid: bool = False,
     ) -> FlexibleAppendage:
@@ -477,7 +477,7 @@ class Slosh(Appendage):
         return np.column_stack((x, np.cross(z, x), z))
 
 
-def checked_appendages(value: Any) -> tuple[Appendage, ...]:
+def checked_appendages(value: object) -> tuple[Appendage, ...]:
     """Return flexible appendages and slosh, or raise `InputError`."""
     if isinstance(value, Appendage):
         value = [value]
@@ -489,7 +489,7 @@ def checked_appendages(value: Any) -> tuple[Appendage, ...]:
 
 
 def rigid_inertia(M: Array) -> pin.Inertia:
-    """Return the spatial inertia of a matrix (6, 6), translation over rotation."""
+    """Convert a rigid-body mass matrix (6, 6), translation before rotation, to an inertia."""
     mass = float(M[0, 0])
     lever = np.array([M[1, 5], M[2, 3], M[0, 4]]) / mass
     return inertia_of(
