@@ -13,48 +13,48 @@ from fflin.robot.robot import Robot
 
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
 
-# Jacobians are integrated by a quarter of these steps, but by no more than this number.
+# Jacobians are integrated in a quarter of the steps of the motion, but in at most this number.
 _MOST_OF_JACOBIANS = 16
 
 Point = tuple[Array, Array]
 
 
 class Shooting:
-    """Knots at times t (N + 1,): initial points of N motions with continuity constraints."""
+    """Multiple shooting from knots at times t (N + 1,), the initial points of N motions."""
 
-    # Steps between configurations and velocities are z = (theta_b, r_b, q_m, nu) (nx,) in base
-    # axes, those of the linear models with the rotation vector for twice q_b.
+    # A step from one point to another is z = (theta_b, r_b, q_m, nu) (nx,) in base axes. It has
+    # the states of the linear models, but the rotation vector theta_b replaces 2 q_b.
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
         self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
         self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
-        # Of one engine, so that a plan is the same to the last bit whatever ran before.
+        # The engine is fixed, so that a plan is the same bit for bit whatever ran before.
         self._linearizer = Linearizer(robot, moving=True)
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
     def between(self, start: Point, end: Point) -> Array:
-        """Return the step z (nx,) from a point to another; wheels may be at any angle."""
+        """Return the step z (nx,) from one point to another, in which wheel angles are zero."""
         state = self.state
-        way = pin.difference(state.robot.model, start[0], end[0])
-        z = np.concatenate((state.velocities(way), state.velocities(end[1] - start[1])))
+        difference = pin.difference(state.robot.model, start[0], end[0])
+        z = np.concatenate((state.velocities(difference), state.velocities(end[1] - start[1])))
         z[self.wheels] = 0.0
         return z
 
     def moved(self, q: Array, v: Array, z: Array) -> Point:
-        """Return knots a step z (N + 1, nx) further."""
-        model, (way, rates) = self.state.robot.model, np.split(z, 2, axis=1)
-        ways = self.state.spread(way)
-        rows = [pin.integrate(model, *each) for each in zip(q, ways, strict=True)]
+        """Return the knots after a step z (N + 1, nx)."""
+        model, (difference, rates) = self.state.robot.model, np.split(z, 2, axis=1)
+        differences = self.state.spread(difference)
+        rows = [pin.integrate(model, *each) for each in zip(q, differences, strict=True)]
         return np.array(rows), v + self.state.spread(rates)
 
     def missed(self, q: Array, v: Array, u: Array) -> Array:
-        """Return how far the ends of the intervals are from the next knots (N, nx)."""
+        """Return the gaps (N, nx) between the ends of the intervals and the next knots."""
         return self.apart(q, v, self.parts(q, v, u, 1))
 
     def apart(self, q: Array, v: Array, parts: Point) -> Array:
-        """Return how far the last parts of the intervals are from the next knots (N, nx)."""
+        """Return the gaps (N, nx) between the last parts of the intervals and the next knots."""
         knots, ends = zip(q[1:], v[1:], strict=True), (each[:, -1] for each in parts)
         return np.array(
             [self.between(*pair) for pair in zip(knots, zip(*ends, strict=True), strict=True)]
@@ -67,7 +67,7 @@ class Shooting:
         return np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
 
     def flown(self, start: Point, u: Array, parts: int = 1) -> Point:
-        """Return q and v of the motion from a point under inputs, so many rows an interval."""
+        """Return q and v of the motion from a point under inputs, `parts` rows per interval."""
         N, (q, v) = len(self.t) - 1, ([each] for each in start)
         flow = self._flow(np.tile(q, (N + 1, 1)), np.tile(v, (N + 1, 1)), u)
         for k in range(N):
@@ -86,7 +86,7 @@ class Shooting:
         return q, v
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
-        """Take so many steps that the ends of the intervals are this accurate in rad, m and s."""
+        """Increase the number of steps until interval ends have this accuracy [rad, m, s]."""
         self.steps = _FEWEST_STEPS
         missed = self.missed(q, v, u)
         while self.steps < _MOST_STEPS:
@@ -98,12 +98,12 @@ class Shooting:
     def jacobians(
         self, q: Array, v: Array, u: Array, parts: int = 1
     ) -> tuple[Array, Array, Array, Array]:
-        """Return Jacobians of the intervals' ends over z, the input there and the next one.
+        """Return Jacobians of interval ends with respect to z and the inputs at both knots.
 
-        The last array (N, parts - 1, nx, nx + 2 nu) has the Jacobians, side by side, of the points
-        between equal parts of the intervals.
+        The last array (N, parts - 1, nx, nx + 2 nu) contains the Jacobians, side by side, of the
+        points between the equal parts of the intervals.
         """
-        # By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
+        # Runge-Kutta steps of dZ/dt = A Z + B along the motions, for all intervals at once.
         flow, (nx, nu), steps = self._flow(q, v, u), (len(self._size), u.shape[1]), self.steps // 4
         steps = min(steps, _MOST_OF_JACOBIANS)
         h: Array = self.h[:, None, None] / steps
@@ -149,22 +149,23 @@ class Shooting:
         s, rates = self.t[:, None] / T, np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))
         rates[:, PIN_LINEAR] = (turned @ rates[:, PIN_LINEAR, None])[..., 0]
-        way, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
-        way[PIN_LINEAR] = end[0][:3] - start[0][:3]
+        difference, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
+        difference[PIN_LINEAR] = end[0][:3] - start[0][:3]
         turn = pin.log3(turned[0].T @ turned[1])
         axis = turn if turn.any() else mean[PIN_ANGULAR]
         axis = axis / (np.linalg.norm(axis) or 1.0)
         rounds = np.round((mean[PIN_ANGULAR] - turn) @ axis / (2.0 * np.pi))
-        way[PIN_ANGULAR] = turn + 2.0 * np.pi * rounds * axis
-        # Of the rotation vector at the end; on whole turns about the axis there is no other.
-        jacobian = pin.Jexp3(way[PIN_ANGULAR])
+        difference[PIN_ANGULAR] = turn + 2.0 * np.pi * rounds * axis
+        # Final rate of the rotation vector. Its Jacobian is singular after whole turns about the
+        # axis.
+        jacobian = pin.Jexp3(difference[PIN_ANGULAR])
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(jacobian, rates[1, PIN_ANGULAR], rcond=1e-6)[0]
-        late, bend = 3 * way - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * way
-        places = s * (rates[0] + s * (late + s * bend))
+        late, bend = 3 * difference - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * difference
+        displacements = s * (rates[0] + s * (late + s * bend))
         v = (rates[0] + s * (2 * late + 3 * s * bend)) / T
-        q = np.array([pin.integrate(model, start[0], step) for step in places])
-        q[:, :3] = start[0][:3] + places[:, PIN_LINEAR]
-        for turn, rate in zip(places[:, PIN_ANGULAR], v[:, PIN_ANGULAR], strict=True):
+        q = np.array([pin.integrate(model, start[0], step) for step in displacements])
+        q[:, :3] = start[0][:3] + displacements[:, PIN_LINEAR]
+        for turn, rate in zip(displacements[:, PIN_ANGULAR], v[:, PIN_ANGULAR], strict=True):
             rate[:] = pin.Jexp3(turn) @ rate
         v[:, PIN_LINEAR] = (v[:, None, PIN_LINEAR] @ rotation_matrices(q[:, 3:7]))[:, 0]
         q[-1], v[-1] = end
