@@ -123,8 +123,8 @@ def controllability(lin: LinearModel) -> Controllability:
       rank(B).
     - At rest with symmetric springs and dampers, the other states are tested in second-order form,
       :math:`M a + D v + K s = S u` with positions s, damping D and stiffness K, by the rank of
-      :math:`[p^2 M + p D + K, S]` at each pole p. Entries within rounding error are set to zero,
-      and each row is scaled to at most unit length.
+      :math:`[p^2 M + p D + K, S]` at each pole p. In this matrix, entries that are zero to within
+      rounding error are set to zero, and rows longer than 1 are scaled to length 1.
     - At nonzero velocity, or if springs or dampers are not symmetric, the Popov-Belevitch-Hautus
       test is applied: the rank of :math:`[A - p I, B]` at each pole p is found from its singular
       values, with the states scaled to units of energy.

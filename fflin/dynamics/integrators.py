@@ -32,11 +32,11 @@ class Integrator:
 
     def __init__(self, model: pin.Model, dt: float) -> None:
         self.model, self.dt = model, dt
-        self._displacement, self._speed = self.shares(dt)
+        self._displacement, self._speed = self.step_weights(dt)
         self._stages = np.zeros((1 + len(self.nodes), model.nv))  # v, l1, l2, ...
 
     @classmethod
-    def shares(cls, dt: float) -> tuple[Array, Array]:
+    def step_weights(cls, dt: float) -> tuple[Array, Array]:
         """Return the weights of v and of the stages' accelerations l in each step of q and of v."""
         raise NotImplementedError
 
@@ -65,7 +65,7 @@ class CommutatorFree4(Integrator):
     origins = (0, 0, 1, 0)
 
     @classmethod
-    def shares(cls, dt: float) -> tuple[Array, Array]:
+    def step_weights(cls, dt: float) -> tuple[Array, Array]:
         """Return the weights of v and of the accelerations l1, ..., l4 of the stages."""
         h, half, twelfth = dt, 0.5 * dt, dt * dt / 12.0
         displacement = [
@@ -92,7 +92,7 @@ class SemiImplicitEuler(Integrator):
     origins = (0,)
 
     @classmethod
-    def shares(cls, dt: float) -> tuple[Array, Array]:
+    def step_weights(cls, dt: float) -> tuple[Array, Array]:
         """Return the weights of v and of its derivative."""
         return np.array([[dt, dt * dt], [0.0, 0.0]]), np.array([[1.0, dt]])
 

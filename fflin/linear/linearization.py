@@ -164,7 +164,7 @@ def _state_at(ready: Prepared, lin: LinearModel) -> Array:
 
 
 def own_reference(robot: Robot, lin: LinearModel) -> Array:
-    """Return the base placement (7,) of a model, its default reference."""
+    """Return the base placement (7,) at a model's point, which is the default reference."""
     q = lin.q
     root = robot.model.jointPlacements[ROOT]
     if root.isIdentity(0.0):

@@ -1,4 +1,4 @@
-"""Marks fixed to the bodies of a robot: axes, thrusters, wheels; and links that can be picked."""
+"""Marks fixed to the bodies of a robot: axes, thrusters, wheels, and links that can be selected."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class Mesh:
 
 
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
-    """Read a mesh file, in its own unit of length, or raise ValueError where nothing is seen."""
+    """Read a mesh file in its own unit of length; raise ValueError if nothing is visible."""
     try:
         found = os.stat(path)
     except OSError as error:
@@ -43,7 +43,7 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
 
 @lru_cache(maxsize=256)
 def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
-    # Another time or size is another mesh.
+    # A changed time or size of the file is a new key of the cache, so a changed file is read again.
     parts = _colored(path) if path.suffix.lower() == ".dae" else []
     parts = parts or [(*_triangles(path), None)]
     corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
@@ -66,7 +66,7 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
 
 
 def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
-    """Return vertices, faces and colour of each part of a COLLADA file [m]; None if it is odd."""
+    """Return vertices [m], faces and colour of each part of a COLLADA file, [] if malformed."""
     import trimesh
 
     try:

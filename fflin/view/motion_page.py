@@ -163,7 +163,7 @@ def _step(rows: Array) -> int:
 
 
 def chart_of(robot: Robot, motion: Motion) -> StateMap:
-    """Return the map between a motion's states and configurations."""
+    """Return the state map with a motion's frame and reference."""
     return StateMap(robot, reference=motion.reference, frame=cast("Frame", motion.frame))
 
 
