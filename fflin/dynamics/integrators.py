@@ -15,8 +15,13 @@ Acceleration: TypeAlias = Callable[[float, Array, Array], Array]
 _integrate = pin.integrate
 
 
+def integrate_rows(model: pin.Model, q: Array, way: Array) -> Array:
+    """Return configurations (N, nq) that are displaced by tangent vectors (N, nv)."""
+    return np.array([_integrate(model, *each) for each in zip(q, way, strict=True)])
+
+
 class Integrator:
-    """Integrator with one step size for one model."""
+    """Integrator with one step size for one model, of one point or of N rows of points."""
 
     # Of the stages: their times in a step of length 1,
     nodes: ClassVar[tuple[float, ...]]
@@ -30,10 +35,12 @@ class Integrator:
     # second stage's.
     origins: ClassVar[tuple[int, ...]]
 
-    def __init__(self, model: pin.Model, dt: float) -> None:
+    def __init__(self, model: pin.Model, dt: float, rows: int | None = None) -> None:
         self.model, self.dt = model, dt
         self._way, self._speed = self.shares(dt)
-        self._stages = np.zeros((1 + len(self.nodes), model.nv))  # v, l1, l2, ...
+        self._integrate = _integrate if rows is None else integrate_rows
+        # v, l1, l2, ...
+        self._stages = np.zeros((*(() if rows is None else (rows,)), 1 + len(self.nodes), model.nv))
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
@@ -43,14 +50,15 @@ class Integrator:
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v one step later."""
         model, stages, begins = self.model, self._stages, list[Array]()
-        stages[0] = v
+        integrate = self._integrate
+        stages[..., 0, :] = v
         for k, node in enumerate(self.nodes, start=1):
-            stages[k] = f(t + node * self.dt, q, v)
-            done = stages[: k + 1]
+            stages[..., k, :] = f(t + node * self.dt, q, v)
+            done = stages[..., : k + 1, :]
             begins.append(q)
-            q = _integrate(model, begins[self.origins[k - 1]], self._way[k - 1, : k + 1].dot(done))
+            q = integrate(model, begins[self.origins[k - 1]], self._way[k - 1, : k + 1].dot(done))
             v = self._speed[k - 1, : k + 1].dot(done)
-        return _integrate(model, q, self._way[-1].dot(stages)), v
+        return integrate(model, q, self._way[-1].dot(stages)), v
 
 
 class CommutatorFree4(Integrator):
