@@ -28,7 +28,7 @@ _MEETS = 1e-10
 _NEARLY = 1e-3
 
 # Accuracy of the ends of intervals during the search, and at its end.
-_SEEKS, _FLIES = 1e-6, 1e-8
+_SEEKS, _FLIES, _STEPS = 1e-4, 1e-8, 8
 
 # Iterations go on until one would save less than this fraction of the effort, or so often.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
@@ -113,6 +113,8 @@ class Search(NamedTuple):
                     trial = there
                     break
                 fraction *= 0.5
+            if shooting.refine(*trial[:3], _SEEKS):
+                trial = self._trial(*trial[:3])
             near = near * (0.2 if fraction == 1.0 else 1.0 if fraction > 0.25 else 3.0)
             known, limited = limited, limited | self._exceeding(trial)
             if saved <= _SAVED * was and (limited == known).all():
@@ -180,7 +182,8 @@ class Search(NamedTuple):
     def _closed(self, trial: Trial, limited: Flags, near: Array) -> Trial:
         """Return a trial without gaps between intervals, by least changes, if possible."""
         shooting, last = self.shooting, _NEARLY
-        shooting.refine(trial.q, trial.v, trial.u, _FLIES)
+        shooting.steps = max(shooting.steps, _STEPS)
+        shooting.refine(*trial[:3], _FLIES)
         trial = self._trial(*trial[:3])
         for _ in range(_MOST_CLOSING):
             limited = limited | self._exceeding(trial)

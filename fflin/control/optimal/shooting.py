@@ -15,7 +15,7 @@ from fflin.linear.flow import cubic
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
 
-_MOST_STEPS = 128
+_FEWEST_STEPS, _MOST_STEPS = 2, 128
 
 # Jacobians are integrated by a quarter of these steps, but by no more than this number.
 _MOST_OF_JACOBIANS = 16
@@ -39,7 +39,7 @@ class Shooting:
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
         self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
-        self.steps = 1
+        self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
         self._aba = Aba(self.state)
         # Of one engine, so that a plan is the same to the last bit whatever ran before.
@@ -123,15 +123,19 @@ class Shooting:
         values[..., values.shape[-1] - n :] = first + s * (rate + s * (late + s * bend))
         return values
 
-    def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
-        """Take so many steps that the ends of the intervals are this accurate in rad, m and s."""
-        self.steps = 1
-        missed = self.missed(q, v, self.motions(q, v, u))
-        while self.steps < _MOST_STEPS:
-            self.steps *= 2
-            before, missed = missed, self.missed(q, v, self.motions(q, v, u))
-            if np.abs(missed - before).max() <= accuracy:
+    def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> bool:
+        """Take more steps until the ends of the intervals are this accurate in rad, m and s.
+
+        Return whether there are more steps than before.
+        """
+        before = self.steps
+        coarse = self.missed(q, v, self.motions(q, v, u, before // 2))
+        while self.steps <= _MOST_STEPS:
+            fine = self.missed(q, v, self.motions(q, v, u))
+            if np.abs(fine - coarse).max() <= accuracy or self.steps == _MOST_STEPS:
                 break
+            self.steps, coarse = 2 * self.steps, fine
+        return self.steps > before
 
     def jacobians(
         self, motions: Motions, u: Array, parts: int = 1
