@@ -33,6 +33,8 @@ _SEEKS, _FLIES, _STEPS = 1e-4, 1e-8, 8
 # Iterations go on until one would save less than this fraction of the effort, or so often.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 
+_STIFF = 1.0
+
 # What a step of wheels costs beside others, as they may take any.
 _OF_WHEELS = 1e-6
 
@@ -89,10 +91,11 @@ class Search(NamedTuple):
         wheels = [*shooting.wheels, *(shooting.state.nx // 2 + i for i in shooting.wheels)]
         near = np.where(np.isin(range(shooting.state.nx), wheels), _OF_WHEELS, 1.0) / len(q)
         first, trial = near, self._trial(q, v, u)
-        limited, price = self._exceeding(trial), 0.0 * trial.missed
+        limited, price, stiffness = self._exceeding(trial), 0.0 * trial.missed, 0.0
 
         def merit(u: Array, missed: Array, outside: float) -> float:
-            lost = (price * np.abs(missed)).sum() + _PRICE * outside
+            # The augmented Lagrangian, with the multipliers of the last step.
+            lost = (price * missed + 0.5 * stiffness * missed**2).sum() + _PRICE * outside
             return float((cost * u * u).sum() / 2.0 + lost)
 
         for iteration in range(_MOST):
@@ -101,8 +104,7 @@ class Search(NamedTuple):
             if step is None:
                 return self._acting(self._flown(trial.u))
             z, du, y, outside = step
-            # What the multipliers say that it costs to miss (Powell).
-            price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
+            price, stiffness = y, _STIFF * np.abs(y).max()
             was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
             saved = was - merit(trial.u + du, 0.0 * trial.missed, outside)
             for _ in range(_MOST_HALVINGS):
@@ -115,7 +117,7 @@ class Search(NamedTuple):
                 fraction *= 0.5
             if shooting.refine(*trial[:3], _SEEKS):
                 trial = self._trial(*trial[:3])
-            near = near * (0.2 if fraction == 1.0 else 1.0 if fraction > 0.25 else 3.0)
+            near = near * (0.2 if fraction == 1.0 and was - after >= 0.5 * saved else 1.0 if fraction > 0.25 else 3.0)
             known, limited = limited, limited | self._exceeding(trial)
             if saved <= _SAVED * was and (limited == known).all():
                 break
