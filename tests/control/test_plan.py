@@ -130,7 +130,7 @@ def test_what_is_planned_is_flown(servicer, tmp_path):
     def policy(t, q, v):
         return motion.u[min(int(t / dt + 1e-9), 39)]
 
-    run = fflin.simulate(robot, policy, v0=v, duration=20.0, dt=dt / 20, sample=dt, frame="local")
+    run = fflin.simulate(robot, policy, v0=v, duration=20.0, dt=dt / 40, sample=dt, frame="local")
     assert missed(robot, motion, run.q[-1], run.v[-1]) < 1e-5
     motion.save(tmp_path / "plan.csv")
     header, first, *_ = (tmp_path / "plan.csv").read_text().splitlines()
@@ -305,15 +305,16 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     shooting = Shooting(robot, t[:4], held)
     shooting.steps = 64
     q, v = shooting.flown((q[0], v[0]), u)
-    A, B, D, inside = shooting.jacobians(q, v, u, 4)
+    A, B, D, inside = shooting.jacobians(shooting.motions(q, v, u), u, 4)
     h, nx = 1e-5, A.shape[1]
 
     def ends(z, du):
-        return shooting.missed(*shooting.moved(q, v, z), u + du)
+        knots = shooting.moved(q, v, z)
+        return shooting.missed(*knots, shooting.motions(*knots, u + du))
 
     def third(z):
         """Return the third quarter's end of the second interval."""
-        return tuple(each[1, 2] for each in shooting.parts(*shooting.moved(q, v, z), u, 4))
+        return tuple(each[1, 48] for each in shooting.motions(*shooting.moved(q, v, z), u)[:2])
 
     for i in range(nx):
         z = np.zeros((4, nx))
@@ -330,6 +331,35 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
             assert slope == pytest.approx(maps[1][:, i], abs=1e-8)
 
 
+@pytest.mark.parametrize("held", [True, False])
+def test_limited_values_between_knots_are_those_of_finer_motions(servicer, held):
+    """The cubics between the ends of two steps: their errors fall with the fourth power of both."""
+    robot, v, goal = servicer
+    t = np.linspace(0.0, 4.0, 5)
+    shooting = Shooting(robot, t, held)
+    q, v, u = shooting.guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
+    exact = shooting.limited_values(*(x[:, 8:-1:8] for x in shooting.motions(q, v, u, 128)[:2]))
+    size = np.abs(exact).max()
+    errors = [
+        np.abs(shooting.inside(shooting.motions(q, v, u, steps), 16) - exact).max() / size
+        for steps in (4, 8, 16)
+    ]
+    assert errors[0] < 1e-3 and errors[1] < errors[0] / 8.0 and errors[2] < errors[1] / 8.0
+
+
+def test_rows_of_motions_are_those_of_single_motions(servicer):
+    """The motion flown from a start and the motions of its intervals are the same."""
+    robot, v, goal = servicer
+    shooting = Shooting(robot, np.linspace(0.0, 4.0, 5), False)
+    q, v, u = shooting.guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
+    q, v = shooting.flown((q[0], v[0]), u)
+    assert np.abs(shooting.missed(q, v, shooting.motions(q, v, u))).max() < 1e-13
+    motion = fflin.Trajectory(robot, shooting.t, q, v, u)
+    for k in range(4):
+        end = motion.flow.end(k, shooting.steps, q[k], v[k])
+        assert np.abs(shooting.between((q[k + 1], v[k + 1]), end)).max() < 1e-13
+
+
 def test_a_plan_meets_the_conditions_of_optimality(cube):
     """Where inputs are free, the slopes of the effort are those of the goal times multipliers; at a
     limit they would have more."""
@@ -338,7 +368,8 @@ def test_a_plan_meets_the_conditions_of_optimality(cube):
     motion = fflin.plan(robot, (goal, None), 6.0, knots=21)
     shooting = Shooting(robot, motion.t, True)
     shooting.steps = 16
-    A, B, *_ = shooting.jacobians(motion.q, motion.v, motion.u)
+    motions = shooting.motions(motion.q, motion.v, motion.u)
+    A, B, *_ = shooting.jacobians(motions, motion.u)
     size, reach, maps = np.repeat([1e-3, 1.0], 3), np.eye(A.shape[1]), []
     for k in range(19, -1, -1):
         maps.append((reach @ B[k] * size).T)

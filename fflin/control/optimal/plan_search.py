@@ -27,13 +27,11 @@ _MEETS = 1e-10
 # One motion that misses the end by more is not corrected.
 _NEARLY = 1e-3
 
-# Accuracy of the ends of intervals during the search, and at its end.
+# Accuracy of the ends of intervals during the search, and at its end, with the fewest steps there.
 _SEEKS, _FLIES, _STEPS = 1e-4, 1e-8, 8
 
 # Iterations go on until one would save less than this fraction of the effort, or so often.
-_SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
-
-_STIFF = 1.0
+_SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 70, 20, 10
 
 # What a step of wheels costs beside others, as they may take any.
 _OF_WHEELS = 1e-6
@@ -91,11 +89,11 @@ class Search(NamedTuple):
         wheels = [*shooting.wheels, *(shooting.state.nx // 2 + i for i in shooting.wheels)]
         near = np.where(np.isin(range(shooting.state.nx), wheels), _OF_WHEELS, 1.0) / len(q)
         first, trial = near, self._trial(q, v, u)
-        limited, price, stiffness = self._exceeding(trial), 0.0 * trial.missed, 0.0
+        limited = self._exceeding(trial)
 
-        def merit(u: Array, missed: Array, outside: float) -> float:
-            # The augmented Lagrangian, with the multipliers of the last step.
-            lost = (price * missed + 0.5 * stiffness * missed**2).sum() + _PRICE * outside
+        def merit(y: Array, u: Array, missed: Array, outside: float) -> float:
+            # Augmented Lagrangian, with the multipliers y of the gaps.
+            lost = (y * missed + 0.5 * np.abs(y).max() * missed**2).sum() + _PRICE * outside
             return float((cost * u * u).sum() / 2.0 + lost)
 
         for iteration in range(_MOST):
@@ -104,22 +102,22 @@ class Search(NamedTuple):
             if step is None:
                 return self._acting(self._flown(trial.u))
             z, du, y, outside = step
-            price, stiffness = y, _STIFF * np.abs(y).max()
-            was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
-            saved = was - merit(trial.u + du, 0.0 * trial.missed, outside)
+            was, fraction = merit(y, trial.u, trial.missed, trial.outside(limited)), 1.0
+            saved = was - merit(y, trial.u + du, 0.0 * trial.missed, outside)
             for _ in range(_MOST_HALVINGS):
                 new = np.clip(trial.u + fraction * du, *self.limits)
                 there = self._trial(*shooting.moved(trial.q, trial.v, fraction * z), new)
-                after = merit(new, there.missed, there.outside(limited))
+                after = merit(y, new, there.missed, there.outside(limited))
                 if was - after >= 1e-4 * fraction * saved:
                     trial = there
                     break
                 fraction *= 0.5
             if shooting.refine(*trial[:3], _SEEKS):
                 trial = self._trial(*trial[:3])
-            near = near * (0.2 if fraction == 1.0 and was - after >= 0.5 * saved else 1.0 if fraction > 0.25 else 3.0)
+            whole = fraction == 1.0 and was - after >= 0.5 * saved
+            near = near * (0.2 if whole else 1.0 if fraction > 0.25 else 3.0)
             known, limited = limited, limited | self._exceeding(trial)
-            if saved <= _SAVED * was and (limited == known).all():
+            if saved <= _SAVED * abs(was) and (limited == known).all():
                 break
         return self._acting(self._closed(trial, limited, first))
 

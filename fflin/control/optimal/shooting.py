@@ -15,9 +15,9 @@ from fflin.linear.flow import cubic
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
 
-_FEWEST_STEPS, _MOST_STEPS, _PER = 4, 128, 2
+_FEWEST_STEPS, _MOST_STEPS = 4, 128
 
-# Jacobians are integrated by a quarter of these steps, but by no more than this number.
+# Jacobians are integrated by half of these steps, but by no more than this number.
 _MOST_OF_JACOBIANS = 16
 
 Point = tuple[Array, Array]
@@ -147,7 +147,7 @@ class Shooting:
         """
         # By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
         (N, rows, _), (nx, nu) = motions.q.shape, (len(self._size), u.shape[1])
-        steps = max(1, min((rows - 1) // _PER, _MOST_OF_JACOBIANS))
+        steps = max(1, min((rows - 1) // 2, _MOST_OF_JACOBIANS))
         late = np.arange(2 * steps + 1) / (2.0 * steps)
         late = np.zeros_like(late) if self.held else late
         q, v = (each[:, :: (rows - 1) // (2 * steps)] for each in motions[:2])
