@@ -130,7 +130,7 @@ def test_what_is_planned_is_flown(servicer, tmp_path):
     def policy(t, q, v):
         return motion.u[min(int(t / dt + 1e-9), 39)]
 
-    run = fflin.simulate(robot, policy, v0=v, duration=20.0, dt=dt / 40, sample=dt, frame="local")
+    run = fflin.simulate(robot, policy, v0=v, duration=20.0, dt=dt / 20, sample=dt, frame="local")
     assert missed(robot, motion, run.q[-1], run.v[-1]) < 1e-5
     motion.save(tmp_path / "plan.csv")
     header, first, *_ = (tmp_path / "plan.csv").read_text().splitlines()
@@ -305,7 +305,7 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     shooting = Shooting(robot, t[:4], held)
     shooting.steps = 64
     q, v = shooting.flown((q[0], v[0]), u)
-    A, B, D, inside = shooting.jacobians(shooting.motions(q, v, u), u, 4)
+    A, B, D, inside = shooting.jacobians(q, v, u, 4)
     h, nx = 1e-5, A.shape[1]
 
     def ends(z, du):
@@ -356,7 +356,7 @@ def test_rows_of_motions_are_those_of_single_motions(servicer):
     assert np.abs(shooting.missed(q, v, shooting.motions(q, v, u))).max() < 1e-13
     motion = fflin.Trajectory(robot, shooting.t, q, v, u)
     for k in range(4):
-        end = motion.flow.end(k, shooting.steps, q[k], v[k])
+        end = motion.flow.end(k, 16, q[k], v[k])
         assert np.abs(shooting.between((q[k + 1], v[k + 1]), end)).max() < 1e-13
 
 
@@ -368,8 +368,7 @@ def test_a_plan_meets_the_conditions_of_optimality(cube):
     motion = fflin.plan(robot, (goal, None), 6.0, knots=21)
     shooting = Shooting(robot, motion.t, True)
     shooting.steps = 16
-    motions = shooting.motions(motion.q, motion.v, motion.u)
-    A, B, *_ = shooting.jacobians(motions, motion.u)
+    A, B, *_ = shooting.jacobians(motion.q, motion.v, motion.u)
     size, reach, maps = np.repeat([1e-3, 1.0], 3), np.eye(A.shape[1]), []
     for k in range(19, -1, -1):
         maps.append((reach @ B[k] * size).T)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.control.optimal.shooting import Motions, Point, Shooting
+from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.optimal.stage_qp import StageQP, StageRows
 
 # The goal and the limits are sought to this accuracy in rad, m and s.
@@ -27,11 +27,11 @@ _MEETS = 1e-10
 # One motion that misses the end by more is not corrected.
 _NEARLY = 1e-3
 
-# Accuracy of the ends of intervals during the search, and at its end, with the fewest steps there.
-_SEEKS, _FLIES, _STEPS = 1e-4, 1e-8, 8
+# Accuracy of the ends of intervals during the search, and at its end.
+_SEEKS, _FLIES = 1e-6, 1e-8
 
 # Iterations go on until one would save less than this fraction of the effort, or so often.
-_SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 70, 20, 10
+_SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 
 # What a step of wheels costs beside others, as they may take any.
 _OF_WHEELS = 1e-6
@@ -48,7 +48,6 @@ class Trial(NamedTuple):
     q: Array  # (N + 1, nq)
     v: Array  # (N + 1, nv)
     u: Array  # (N + 1, nu)
-    motions: Motions
     missed: Array  # (N, nx)
     knots: Array  # how far the knots may move down and up (2, N + 1, nx)
     inside: Array  # and the points within the intervals (2, N, parts - 1, nx)
@@ -89,11 +88,10 @@ class Search(NamedTuple):
         wheels = [*shooting.wheels, *(shooting.state.nx // 2 + i for i in shooting.wheels)]
         near = np.where(np.isin(range(shooting.state.nx), wheels), _OF_WHEELS, 1.0) / len(q)
         first, trial = near, self._trial(q, v, u)
-        limited = self._exceeding(trial)
+        limited, price = self._exceeding(trial), 0.0 * trial.missed
 
-        def merit(y: Array, u: Array, missed: Array, outside: float) -> float:
-            # Augmented Lagrangian, with the multipliers y of the gaps.
-            lost = (y * missed + 0.5 * np.abs(y).max() * missed**2).sum() + _PRICE * outside
+        def merit(u: Array, missed: Array, outside: float) -> float:
+            lost = (price * np.abs(missed)).sum() + _PRICE * outside
             return float((cost * u * u).sum() / 2.0 + lost)
 
         for iteration in range(_MOST):
@@ -102,22 +100,21 @@ class Search(NamedTuple):
             if step is None:
                 return self._acting(self._flown(trial.u))
             z, du, y, outside = step
-            was, fraction = merit(y, trial.u, trial.missed, trial.outside(limited)), 1.0
-            saved = was - merit(y, trial.u + du, 0.0 * trial.missed, outside)
+            # What the multipliers say that it costs to miss (Powell).
+            price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
+            was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
+            saved = was - merit(trial.u + du, 0.0 * trial.missed, outside)
             for _ in range(_MOST_HALVINGS):
                 new = np.clip(trial.u + fraction * du, *self.limits)
                 there = self._trial(*shooting.moved(trial.q, trial.v, fraction * z), new)
-                after = merit(y, new, there.missed, there.outside(limited))
+                after = merit(new, there.missed, there.outside(limited))
                 if was - after >= 1e-4 * fraction * saved:
                     trial = there
                     break
                 fraction *= 0.5
-            if shooting.refine(*trial[:3], _SEEKS):
-                trial = self._trial(*trial[:3])
-            whole = fraction == 1.0 and was - after >= 0.5 * saved
-            near = near * (0.2 if whole else 1.0 if fraction > 0.25 else 3.0)
+            near = near * (0.2 if fraction == 1.0 else 1.0 if fraction > 0.25 else 3.0)
             known, limited = limited, limited | self._exceeding(trial)
-            if saved <= _SAVED * abs(was) and (limited == known).all():
+            if saved <= _SAVED * was and (limited == known).all():
                 break
         return self._acting(self._closed(trial, limited, first))
 
@@ -142,7 +139,7 @@ class Search(NamedTuple):
         knots[:, -1, self.asked] = np.clip(way, *knots[:, -1])[self.asked]
         tighter = self.bounds + _TIGHTER * np.array((self._size, -self._size))
         inside = tighter[:, None, None] - shooting.inside(motions, self.parts)
-        return Trial(q, v, u, motions, shooting.missed(q, v, motions), knots, inside)
+        return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
 
     def _exceeding(self, trial: Trial) -> Flags:
         """Return whether points (N, parts - 1, nx) or their neighbours exceed a limit."""
@@ -160,7 +157,7 @@ class Search(NamedTuple):
         if not max(trial.outside(limited), trial.gap) < np.inf:
             return None
         try:
-            A, B, D, inside = self.shooting.jacobians(trial.motions, u, self.parts)
+            A, B, D, inside = self.shooting.jacobians(trial.q, trial.v, u, self.parts)
         except InputError:  # it has diverged
             return None
         k, part, state = np.nonzero(limited)
@@ -182,8 +179,7 @@ class Search(NamedTuple):
     def _closed(self, trial: Trial, limited: Flags, near: Array) -> Trial:
         """Return a trial without gaps between intervals, by least changes, if possible."""
         shooting, last = self.shooting, _NEARLY
-        shooting.steps = max(shooting.steps, _STEPS)
-        shooting.refine(*trial[:3], _FLIES)
+        shooting.refine(trial.q, trial.v, trial.u, _FLIES)
         trial = self._trial(*trial[:3])
         for _ in range(_MOST_CLOSING):
             limited = limited | self._exceeding(trial)

@@ -17,7 +17,10 @@ from fflin.robot.robot import Robot
 
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
 
-# Jacobians are integrated by half of these steps, but by no more than this number.
+# The motions of trials have at least so many, as they are limited between the ends of steps too.
+_STEPS = 16
+
+# Jacobians are integrated by a quarter of these steps, but by no more than this number.
 _MOST_OF_JACOBIANS = 16
 
 Point = tuple[Array, Array]
@@ -63,9 +66,9 @@ class Shooting:
     def motions(self, q: Array, v: Array, u: Array, steps: int = 0) -> Motions:
         """Return the motions of the intervals from knots q, v under inputs u (N + 1, ..).
 
-        The number of steps in each interval is that of `refine` by default.
+        The number of steps in each interval is by default that of `refine`, or larger.
         """
-        return self._fly(q[:-1], v[:-1], u[:-1], u[1:], steps or self.steps)
+        return self._fly(q[:-1], v[:-1], u[:-1], u[1:], steps or max(self.steps, _STEPS))
 
     def _fly(self, q: Array, v: Array, first: Array, last: Array, steps: int) -> Motions:
         """Return the motions of some intervals whose inputs begin and end with these rows."""
@@ -94,7 +97,7 @@ class Shooting:
         """Return the knots of the motion from a point under inputs."""
         rows = [(start[0][None], start[1][None])]
         for k in range(len(u) - 1):
-            found = self._fly(*rows[-1], u[k : k + 1], u[k + 1 : k + 2], self.steps)
+            found = self._fly(*rows[-1], u[k : k + 1], u[k + 1 : k + 2], max(self.steps, _STEPS))
             rows.append((found.q[:, -1], found.v[:, -1]))
         q, v = zip(*rows, strict=True)
         return np.concatenate(q), np.concatenate(v)
@@ -123,22 +126,18 @@ class Shooting:
         values[..., values.shape[-1] - n :] = first + s * (rate + s * (late + s * bend))
         return values
 
-    def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> bool:
-        """Take more steps until the ends of the intervals are this accurate in rad, m and s.
-
-        Return whether there are more steps than before.
-        """
-        before = self.steps
-        coarse = self.missed(q, v, self.motions(q, v, u, before // 2))
-        while self.steps <= _MOST_STEPS:
-            fine = self.missed(q, v, self.motions(q, v, u))
-            if np.abs(fine - coarse).max() <= accuracy or self.steps == _MOST_STEPS:
+    def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
+        """Take so many steps that the ends of the intervals are this accurate in rad, m and s."""
+        self.steps = _FEWEST_STEPS
+        missed = self.missed(q, v, self.motions(q, v, u, self.steps))
+        while self.steps < _MOST_STEPS:
+            self.steps *= 2
+            before, missed = missed, self.missed(q, v, self.motions(q, v, u, self.steps))
+            if np.abs(missed - before).max() <= accuracy:
                 break
-            self.steps, coarse = 2 * self.steps, fine
-        return self.steps > before
 
     def jacobians(
-        self, motions: Motions, u: Array, parts: int = 1
+        self, q: Array, v: Array, u: Array, parts: int = 1
     ) -> tuple[Array, Array, Array, Array]:
         """Return Jacobians of the intervals' ends over z, the input there and the next one.
 
@@ -146,11 +145,12 @@ class Shooting:
         between equal parts of the intervals.
         """
         # By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
-        (N, rows, _), (nx, nu) = motions.q.shape, (len(self._size), u.shape[1])
-        steps = max(1, min((rows - 1) // 2, _MOST_OF_JACOBIANS))
+        N, nx, nu = len(self.h), len(self._size), u.shape[1]
+        steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
+        motions = self.motions(q, v, u, 4 * steps)
         late = np.arange(2 * steps + 1) / (2.0 * steps)
         late = np.zeros_like(late) if self.held else late
-        q, v = (each[:, :: (rows - 1) // (2 * steps)] for each in motions[:2])
+        q, v = (each[:, ::2] for each in motions[:2])
         inputs = u[:-1, None] + late[:, None] * np.diff(u, axis=0)[:, None]
         points = (each.reshape(-1, each.shape[-1]) for each in (q, v, inputs))
         models = self._linearizer.along(*points)
