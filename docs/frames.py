@@ -34,7 +34,7 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
         for frame in FRAMES:
             there = replace(loop, lin=replace(lin, frame=frame))
             runs_of = partial(settling_runs, there, False, None, 0.0)
-            arrays = settle(runs_of, lambda _, x=x: x, np.arange(1), "python")
+            arrays = settle(runs_of, lambda _, x=x: x, 1, "python")
             counts[frame] += OUTCOMES[int(arrays["outcome"][0])] == "settled"
     return "/".join(map(str, counts.values()))
 

@@ -5,9 +5,9 @@ from typing import Any
 
 from fflin.base import __version__
 
-# The public names by task, with their modules. A name is imported when it is first used (PEP 562),
-# so that a command without dynamics does not load Pinocchio. Type checkers read the stub beside
-# this file, which has the same names and modules.
+# Public names by task, with their modules. A name is imported when it is first used (PEP 562), so
+# that a command without dynamics does not load Pinocchio. Type checkers read `__init__.pyi`, which
+# lists the same names and modules.
 _PUBLIC = {
     "Robots": {
         "robot.loading": ["load", "from_model"],
@@ -156,8 +156,8 @@ def __getattr__(name: str) -> Any:
     return value
 
 
-def _untyped(function: Any) -> None:
-    """Let help show a signature without types, which its docstring gives in words and shapes."""
+def _untyped(function: object) -> None:
+    """Remove the types from the signature that help shows; the docstring describes them."""
     from inspect import Parameter, signature
 
     shown = signature(function)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# Built in, so that no module of the working folder takes its place.
+# `_signal` is built in, so that a signal.py in the working folder is not imported instead.
 import _signal as signal  # type: ignore[import-not-found]
 import gc
 import os
@@ -19,27 +19,27 @@ if TYPE_CHECKING:
 
 def main() -> int:
     """Run the command line on the arguments of this process, and return its exit code."""
-    # With `python -m fflin` the working folder comes first on the path; leave it out before more
-    # is imported, unless fflin itself is imported from there.
+    # `python -m fflin` puts the working folder first on the import path. It is removed before
+    # further imports, unless fflin itself is imported from there.
     if not same_folder(os.path.join(os.path.dirname(__file__), os.pardir), ""):
         sys.path[:] = import_path_without("")
     listen()
-    gc.set_threshold(50_000)  # most of what a command makes, it keeps to its end
+    gc.set_threshold(50_000)  # a command keeps most of its objects until it ends
     try:
         from fflin.commands import cli
 
         code = cli.main()
     except KeyboardInterrupt as reason:
         leave(reason)
-    # All is done and said.
+    # The command is finished: Ctrl-C must no longer change its exit code.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    gc.freeze()  # what ends with the process need not be searched for circles
+    gc.freeze()  # no search for reference cycles, since the process ends
     return code
 
 
 def listen() -> None:
-    """End at Ctrl-C also in an import or a callback, where `KeyboardInterrupt` would be lost."""
-    # If SIGINT is ignored, as under nohup, it remains ignored.
+    """Make Ctrl-C end the process even in a callback, where `KeyboardInterrupt` would be lost."""
+    # If the parent process ignores SIGINT, as nohup does, it remains ignored.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
         sys.unraisablehook = _unraisable
@@ -49,11 +49,11 @@ def leave(reason: BaseException) -> NoReturn:
     """Report the stop in one line, and exit without waiting for threads."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        # One write, which output of other processes cannot split.
+        # A single write, so that the output of other processes cannot split the line.
         sys.stderr.write(f"fflin: {reason}\n" if reason.args else "fflin: stopped\n")
         if sys.stdout is not None:
             sys.stdout.flush()
-    except OSError:  # nobody reads it
+    except OSError:  # the reader of the output has gone
         pass
     finally:
         os._exit(INTERRUPTED)

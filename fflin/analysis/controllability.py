@@ -29,45 +29,47 @@ from fflin.base.validation import Array, FrozenArrays, Values
 from fflin.linear.model import LinearModel
 
 _LOOPS = (
-    "a periodic joint motion can still rotate the base of the nonlinear robot, by O(e^2) for an "
-    "amplitude e; a linear model does not show this"
+    "a periodic joint motion can still rotate the base of the nonlinear robot, by O(e^2) for a "
+    "joint amplitude e, although the linear model does not show it"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Controllability(FrozenArrays):
-    """Controllability of a linear model; prints in words.
+    """Controllability of a linear model; ``print`` shows a summary.
 
     Attributes
     ----------
     dimension : int
         Dimension of the controllable subspace.
     controllable : tuple of str
-        Names of ``dimension`` states that the inputs can set independently. In the controllable
-        subspace, their values determine all other states through `basis`.
+        Names of states that the inputs can set independently; there are `dimension` of them. Within
+        the controllable subspace, their values determine the whole state, ``x = basis @ values``.
     uncontrollable : tuple of str
         Names of the uncontrollable combinations of states.
     rows : ndarray (nx - dimension, nx)
-        Coefficients of the uncontrollable combinations. The controllable subspace is the set of all
-        x with ``rows @ x = 0``.
+        Coefficients of the uncontrollable combinations, one row for each. The controllable subspace
+        is the set of all x with ``rows @ x = 0``.
     basis : ndarray (nx, dimension)
-        Basis of the controllable subspace. Column i changes ``controllable[i]`` by 1, and no other
-        state in `controllable`.
+        Basis of the controllable subspace. Column i is the state in which ``controllable[i]`` is 1
+        and the other states named in `controllable` are 0.
     fixed_poles : ndarray (nx - dimension,)
         Poles that no feedback can move: [1/s] for a continuous model, discrete-time poles z for a
         sampled one.
     stabilizable : bool
         Whether all fixed poles are stable.
     reach : dict
-        {"base attitude", "base position", "joints": number of independent directions}. The inputs
-        can bring the state to any value along each of these directions, with the final values of
-        all other states left free.
+        Numbers of independent directions that the inputs can control, with the keys
+        ``"base attitude"``, ``"base position"`` and ``"joints"``. The inputs can bring the position
+        states to any value along these directions, if the final values of all other states are left
+        free.
     method : str
         Method that determined the dimension: "closed form", "modes" or "eigenvalues".
     margin : Margin
-        Certainty of the rank decisions: the smallest singular value counted as nonzero and the
-        largest counted as zero, each divided by its tolerance. The decision is clear if the first
-        ratio is far above 1 and the second ratio far below 1.
+        Certainty of the rank decisions, as two ratios: the smallest singular value counted as
+        nonzero, divided by its tolerance, and the largest singular value counted as zero, divided
+        by its tolerance. The decisions are certain if the first ratio is far above 1 and the second
+        ratio is far below 1.
     notes : tuple of str
         Remarks on the result, such as ranks that rounding error leaves undecided.
 
@@ -110,24 +112,32 @@ class Controllability(FrozenArrays):
 def controllability(lin: LinearModel) -> Controllability:
     r"""Determine the controllable subspace from the structure of the model.
 
-    - At rest, the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved. The conserved
-      momenta and the coordinates :math:`W M N^{-1} x_1` driven by these momenta are separated
-      exactly. Without springs and dampers, all other states are controllable, and the dimension
-      is 2 rank(B).
-    - With symmetric springs and dampers, the remaining part is tested in second-order form,
-      :math:`M a + D v + K s = S u`, by the rank of :math:`[p^2 M + p D + K, S]` at each pole p.
-      Entries within rounding error are set to zero, and each row is scaled by its entries.
+    Let :math:`x_1` be the positions and :math:`\nu` the velocities, with :math:`\dot x_1 = N \nu`,
+    and let :math:`A_{ij}` and :math:`B_i` be the corresponding blocks of A and B. The method
+    depends on the model:
+
+    - At rest, the momenta :math:`W M \nu` with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved;
+      each row of W defines one momentum. These momenta, and the coordinates :math:`W M N^{-1} x_1`
+      whose rates are these momenta, are uncontrollable and are separated exactly from the other
+      states. Without springs and dampers, all other states are controllable, so the dimension is 2
+      rank(B).
+    - At rest with symmetric springs and dampers, the other states are tested in second-order form,
+      :math:`M a + D v + K s = S u` with positions s, damping D and stiffness K, by the rank of
+      :math:`[p^2 M + p D + K, S]` at each pole p. In this matrix, entries that are zero to within
+      rounding error are set to zero, and rows longer than 1 are scaled to length 1.
     - At nonzero velocity, or if springs or dampers are not symmetric, the Popov-Belevitch-Hautus
-      test is applied: the rank of :math:`[A - p E, B]` is found from its singular values, with
-      states scaled to units of energy.
+      test is applied: the rank of :math:`[A - p I, B]` at each pole p is found from its singular
+      values, with the states scaled to units of energy.
 
-    A sampled model has the structure of its continuous model, with one exception: sampling may
-    map two poles to one. For example, a vibration is uncontrollable if the sample time is a
-    multiple of half its period. For a sampled model from a file, only the sampled matrices are
-    analysed.
+    A sampled model has the controllable subspace of its continuous model, with one exception:
+    sampling may map two poles to one, and the inputs may then control only one of the two modes.
+    For example, a vibration is uncontrollable if the sample time is a multiple of half its period.
+    A sampled model that was loaded from a file lacks the continuous model, so only the sampled
+    matrices are analysed.
 
-    Every tolerance is a small multiple of the rounding error. `margin` compares the decisions with
-    their tolerances, and `notes` lists decisions within rounding error.
+    The tolerance of every rank decision is a small multiple of the rounding error. In the result,
+    `margin` compares the singular values with their tolerances, and `notes` lists ranks that
+    rounding error leaves undecided.
 
     Parameters
     ----------
@@ -138,19 +148,20 @@ def controllability(lin: LinearModel) -> Controllability:
     Returns
     -------
     Controllability
-        Dimension, basis, and named controllable and uncontrollable states.
+        Dimension and basis of the controllable subspace, and names of controllable and
+        uncontrollable states.
 
     Raises
     ------
     InputError
-        If `lin` is not a linear model of positions and their rates.
+        If `lin` is not a `LinearModel`, or its states are not positions followed by their rates.
 
     Notes
     -----
     All inputs, including thrusters, are assumed to act in both directions. At a nonzero angular
-    velocity, the result applies to the model with A and B frozen at the point. Controllability of
-    the frozen model does not prove that the motion is controllable. At nonzero velocity, poles
-    with a modulus below about 1e-8 times the largest modulus are treated as zero.
+    velocity, the result applies to the model with A and B frozen at the operating point. The motion
+    itself may be uncontrollable even if this frozen model is controllable. At nonzero velocity,
+    poles with a modulus below about 1e-8 times the largest modulus are treated as zero.
 
     References
     ----------
@@ -176,7 +187,7 @@ def controllability(lin: LinearModel) -> Controllability:
         names = tuple(combination(row, states, 1.0 / size[z]) for row in rows)
     others: Array = np.zeros((len(rows), len(lin.A)))
     others[:, z] = rows
-    # States are named after the coordinates that an input pushes on directly, where possible.
+    # Prefer coordinates on which an input acts directly when the controllable states are named.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
     basis, pivots = echelon(conserved.T @ part.controllable, size, np.tile(driven, 2))
     zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
@@ -209,11 +220,11 @@ def controllability(lin: LinearModel) -> Controllability:
 
 
 class _Part(NamedTuple):
-    """Split of the model without its conserved momenta, in reduced coordinates."""
+    """Controllable and uncontrollable parts of a model after its conserved momenta are removed."""
 
     controllable: Array  # (2 r, d), a basis
-    rows: Array  # (2 r - d, 2 r) with rows @ z what no input acts on
-    names: tuple[str, ...] | None  # of the rows; None if they are named after their states
+    rows: Array  # (2 r - d, 2 r); no input acts on rows @ z
+    names: tuple[str, ...] | None  # of the rows; None: named after their states
     method: str
     fixed: FixedPoles
 
@@ -232,16 +243,18 @@ def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | N
     system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
     idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
     if not system.acting or (not idle.shape[1] and not lin.dt):
-        # Inputs reach every momentum that is not conserved, and so the coordinates.
+        # The inputs act on every momentum that is not conserved, so all remaining states are
+        # controllable.
         everything, fixed = np.eye(2 * r), FixedPoles(margin=margin.transformed(R / system.size))
         return _Part(everything, everything[:0], (), "closed form", fixed)
     found = unobservable(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
     if found is None:
         return None
-    # By symmetry a motion (s, v) that S^T s does not show is a row that no input moves.
+    # The system is symmetric. Each motion (s, v) that is unobservable from the output S^T s
+    # therefore gives a row on which no input acts.
     s, v = np.split(found.motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
-    # The controllable subspace is orthogonal to those rows.
+    # The controllable subspace is orthogonal to these rows.
     size = np.tile(system.size, 2)
     normal = rows / size
     normal = np.linalg.qr((normal / np.linalg.norm(normal, axis=1, keepdims=True)).T, "complete")[0]
@@ -254,11 +267,12 @@ def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | N
     if system.D.values.any():
         rows = np.hstack((rows[:, :r] @ to_s, rows[:, r:]))
         return _Part(controllable, rows, None, "eigenvalues", fixed)
-    # Without damping, the rows read the positions and rates of vibrations that no input drives.
+    # Without damping, each row measures the position or the rate of a vibration that no input
+    # drives.
     members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
     read, names = [np.zeros((0, 2 * r))], list[str]()
     for pole, shapes in found.shapes:
-        if pole.real < 0.0:  # the positive one of the pair has the same shapes
+        if pole.real < 0.0:  # the pole with positive real part has the same shapes
             continue
         momenta = shapes.real.T @ system.M
         zero = np.zeros_like(momenta)
@@ -279,9 +293,10 @@ def _notes(
     if rotates and any(lin.state_names[i].startswith("q_m.") for i in conserved.kept):
         notes.append(_LOOPS)
     if momenta:
-        notes.append("fflin.momentum_reduction removes the conserved momenta")
+        notes.append("fflin.momentum_reduction removes the conserved momenta from the model")
     if not lin.is_equilibrium():
         notes.append(
-            "the operating point is not an equilibrium; the result is valid for the frozen A and B"
+            "the operating point is not an equilibrium, so the result is valid only for A and B "
+            "frozen at this point"
         )
     return tuple(notes)

@@ -1,4 +1,4 @@
-"""Effective masses of the vibrations of a robot whose base is clamped."""
+"""Effective masses of the vibration modes of a robot with its base clamped."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 
-# Modes whose frequencies differ by less, relative to them, share one frequency.
+# Modes have the same frequency if their frequencies differ by less than this fraction.
 _EQUAL = 1e-9
 
-# Effective masses below this part of the total are rounding, as are singular values below its root.
+# Effective masses below this fraction of the total are rounding error. For singular values, the
+# limit is the square root of this fraction.
 _ROUNDING = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
 class EffectiveMasses(FrozenArrays):
-    """Effective masses of the vibration modes with the base clamped; prints as a table.
+    """Effective masses of the vibration modes with the base clamped; ``print`` shows a table.
 
     All quantities refer to the origin of the base frame and are expressed in its axes. Entries for
     translation come before entries for rotation.
@@ -37,11 +38,13 @@ class EffectiveMasses(FrozenArrays):
         Modal participation factors L for unit modal mass; rows 0 to 2 [kg^1/2], rows 3 to 5
         [kg^1/2 m].
     free : ndarray (6, 6)
-        Part of the inertia that joints without a spring do not transmit to the base.
+        Part of the rigid robot's inertia that the base does not feel, because joints without a
+        spring do not transmit it.
     residual : ndarray (6, 6)
         Apparent inertia of the base if all joints are free to move.
     total : ndarray (6, 6)
-        Inertia of the rigid robot, the sum of all parts.
+        Inertia of the rigid robot: the sum of `free`, `residual` and the contributions of all
+        modes.
     robot : str
         Name of the robot.
 
@@ -72,10 +75,10 @@ class EffectiveMasses(FrozenArrays):
         return self.participation[3:].T ** 2
 
     def __str__(self) -> str:
-        """Show a table of masses and one of inertias, with their percentages of the total."""
+        """Show a table of effective masses and a table of moments of inertia, with percentages."""
         head = (
-            f"{self.robot}, base clamped: {counted(len(self.frequencies), 'mode')}, effective "
-            "masses about the base frame's origin in the base's axes"
+            f"{self.robot}, base clamped: {counted(len(self.frequencies), 'mode')}; effective "
+            "masses and moments of inertia about the origin of the base frame, in base axes"
         )
         parts = [textwrap.fill(head, width())]
         for values, unit, at in ((self.masses, "kg", 0), (self.inertias, "kg m^2", 3)):
@@ -95,32 +98,34 @@ class EffectiveMasses(FrozenArrays):
 def effective_masses(lin: LinearModel) -> EffectiveMasses:
     r"""Return the effective masses of a robot's vibration modes with its base clamped.
 
-    K is the stiffness of the joint springs. M is the mass matrix in base axes, with the base
-    before the joints. Joints without a spring are condensed out of M, which gives :math:`\tilde
-    M`. With the base at rest the modes are
+    Let K be the stiffness of the joint springs, and M the mass matrix in base axes with the
+    subscripts b for the base and m for the joints. Joints without a spring are condensed out of M,
+    which gives :math:`\tilde M`. With the base at rest, the frequencies, shapes and participation
+    factors of the modes follow from
 
     .. math::
         K \phi_i = \omega_i^2 \tilde M_{mm} \phi_i, \qquad \phi_i^T \tilde M_{mm} \phi_i = 1,
         \qquad L_i = \tilde M_{bm} \phi_i.
 
-    If the base is accelerated along axis d, mode i exerts the same force on it as a mass
-    :math:`L_{di}^2` [kg] on a spring, the effective mass. For rotation about d, :math:`L_{di}^2` is
-    the effective moment of inertia [kg m^2]. The contributions of all modes, of the joints without
-    springs (free) and of the residual add up to the inertia of the rigid robot,
+    If the base is accelerated along axis d, mode i exerts the same force on the base as a single
+    mass :math:`L_{di}^2` [kg] on a spring. This mass is the effective mass of mode i. For rotation
+    about d, :math:`L_{di}^2` is the effective moment of inertia [kg m^2]. The contributions of all
+    modes, the joints without springs (free) and the residual add up to the inertia of the rigid
+    robot:
 
     .. math::
         \textstyle\sum_i L_i L_i^T + M_{free} + M_{res} = M_{bb}, \qquad
         M_{res} = M_{bb} - M_{bm} M_{mm}^{-1} M_{mb}.
 
-    With a free base, the natural frequencies are higher, as listed by `modes`. If several modes
-    have the same frequency, only the sum of their masses is unique. The first of these modes is
-    then given the largest possible mass.
+    The natural frequencies with the base clamped are lower than with a free base, for which `modes`
+    computes them. If several modes have the same frequency, only the sum of their effective masses
+    is unique, so the first of these modes is given the largest possible mass.
 
     Parameters
     ----------
     lin : LinearModel
-        Full model about any operating point; only its configuration matters. K excludes gravity,
-        dampers and inputs.
+        Full model about any operating point. Only the springs and the configuration affect the
+        result: velocity, gravity, dampers and inputs are ignored.
 
     Returns
     -------
@@ -130,10 +135,9 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     Raises
     ------
     InputError
-        If the model is reduced or was loaded from a file, and therefore lacks the robot's
-        springs.
+        If the model lacks the robot's springs because it is reduced or was loaded from a file.
     ModelError
-        If the robot's model was changed after the linear model was made.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     References
     ----------
@@ -152,8 +156,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     robot = lin._robot
     if robot is None or len(lin.M) != 6 + robot.n:
         raise InputError(
-            "the model is reduced or from a file, and lacks the robot's springs, which effective "
-            "masses need; give the model that fflin.linearize returns"
+            "effective masses need the springs of the robot, which a reduced model and a model "
+            "from a file do not contain; give the model that fflin.linearize returns"
         )
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     chart = state.chart(lin.q)
@@ -165,7 +169,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     kept = np.r_[:6, springs]
     floating = floating_inertia(M, kept, others)
     base, joints = np.arange(6), np.arange(6, len(kept))
-    # In coordinates scaled by the springs K is the identity, and soft modes keep their digits.
+    # Coordinates are scaled by the springs so that K is the identity. The low frequencies are then
+    # as accurate as the high ones.
     soft = 1.0 / np.sqrt(stiffness[springs - 6])
     M_mm = floating[6:, 6:] * np.outer(soft, soft)
     squares, vectors = np.linalg.eigh((M_mm + M_mm.T) / 2.0)
@@ -182,13 +187,13 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
 
 
 def _separated(frequencies: Array, L: Array) -> Array:
-    """Return L (6, k) with modes of one frequency combined, the first with the most mass."""
+    """Combine modes of equal frequency so that the first has the most mass; return L (6, k)."""
     L, first = L.copy(), 0
     while first < len(frequencies):
         near = frequencies <= (1.0 + _EQUAL) * frequencies[first]
         last = int(np.count_nonzero(near))
         group = L[:, first:last]
-        # Those without mass are combined by their inertia.
+        # Modes are combined by their mass, and then modes without mass by their moment of inertia.
         for rows in (slice(0, 3), slice(3, 6)):
             _, sizes, turned = np.linalg.svd(group[rows])
             group[:] = group @ turned.T
@@ -199,7 +204,7 @@ def _separated(frequencies: Array, L: Array) -> Array:
 
 
 def _cells(values: Array, total: Array) -> list[str]:
-    """Return each of three values with its percentage of the total; rounding shows as a dot."""
+    """Return each value with its percentage of the total; a dot stands for rounding error."""
     cells = []
     for value, whole in zip(values.tolist(), total.tolist(), strict=True):
         seen = abs(value) > 1e2 * _ROUNDING * whole

@@ -41,7 +41,7 @@ class Mode(FrozenArrays):
         Real part of the pole as a multiple of its rounding error; infinite if that error is zero.
     strain : mapping of str to float
         Fraction of the mode's elastic energy in the spring of each joint, the largest first. The
-        mapping is empty without springs, or if the model was loaded from a file.
+        mapping is empty if the robot has no springs or the model was loaded from a file.
     energy : mapping of str to float
         Fraction of the mode's kinetic energy in each body, the largest first. The fractions are
         nonnegative and sum to 1. A body is named after the joint that carries it; the root body is
@@ -49,15 +49,16 @@ class Mode(FrozenArrays):
 
     Notes
     -----
-    With the complex twist :math:`V_i` of body i in the mode and its spatial inertia
-    :math:`I_i`, the fraction of the energy, averaged over a period, is
+    Let :math:`V_i` be the complex twist of body i in the mode, and :math:`I_i` its spatial inertia.
+    The kinetic energy of body i as a fraction of the total, averaged over a period, is
 
     .. math::
         e_i = \frac{V_i^H I_i V_i}{\sum_k V_k^H I_k V_k}.
 
-    The twists are relative to the reference frame. If the robot floats freely from rest, a mode has
-    no momentum, and the fractions do not depend on which link is the base. The fraction :math:`e_i`
-    is never negative, unlike the product :math:`\phi_i (M \phi)_i` for one coordinate.
+    The twists are relative to the reference frame. If the robot floats freely at rest, its modes
+    have zero momentum, so the fractions do not depend on which link is the base. The fraction
+    :math:`e_i` of a body is never negative, whereas the product :math:`\phi_i (M \phi)_i` of a
+    single coordinate can be negative.
 
     Examples
     --------
@@ -89,18 +90,18 @@ class Mode(FrozenArrays):
 
     @property
     def damping_ratio(self) -> float:
-        """Damping ratio -Re(p)/abs(p): 0 undamped, 1 for a real stable pole, negative unstable."""
+        """Damping ratio -Re(p)/abs(p): 0 if undamped, 1 if real and stable, < 0 if unstable."""
         return 0.0 if self.pole.real == 0.0 else -self.pole.real / abs(self.pole)
 
     @property
     def time_constant(self) -> float:
-        """Time constant [s] of decay by a factor e, or of growth for an unstable mode."""
+        """Time [s] in which the mode decays, or grows if it is unstable, by a factor e."""
         return float("inf") if self.pole.real == 0.0 else 1.0 / abs(self.pole.real)
 
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """Natural modes of a linear model; prints as a table.
+    """Natural modes of a linear model; ``print`` shows a table.
 
     Attributes
     ----------
@@ -109,15 +110,16 @@ class Modes:
     rigid_body : int
         Number of rigid-body modes: independent displacements without a restoring force.
     zero_eigenvalues : int
-        Number of zero eigenvalues; a rigid-body mode without friction has two.
+        Number of zero eigenvalues; each rigid-body mode without friction contributes two.
     residual : float
-        Largest ``|A x - pole x|`` relative to ``|A| |x|``. The states are scaled to unit inertias
-        and to the time of the fastest motion.
+        Largest residual of a mode, ``|A x - pole x| / (|A| |x|)`` with the eigenvector x. The
+        states are scaled to unit inertias and to the time of the fastest motion.
     equilibrium : bool
         Whether the operating point is an equilibrium or a relative equilibrium. If False, the
-        eigenvalues describe the model frozen at this point and do not decide its stability.
+        eigenvalues describe the model frozen at this point and do not determine the stability of
+        the motion.
     state_names, state_units : tuple of str
-        Names and units of the entries of the shapes.
+        Names and units of the states, which are the entries of each mode's `shape`.
     robot : str
         Name of the robot.
     lin : LinearModel
@@ -164,27 +166,31 @@ class Modes:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on missing data, and on modes whose stability is undecided due to rounding."""
+        """Remarks on missing data, and on modes whose stability rounding error leaves undecided."""
         undecided = tuple(
-            f"undecided: whether the mode at {mode.frequency:.4g} rad/s grows or decays; its real "
-            f"part is {mode.margin:.1g} times its rounding error"
+            f"undecided: the mode at {mode.frequency:.4g} rad/s may grow or decay, because the "
+            f"real part of its pole is only {mode.margin:.1g} times the rounding error"
             for mode in self.modes
             if 0.1 < abs(mode.margin) < 10.0
         )
         if not self.modes or self.modes[0].energy:
             return undecided
-        return (*undecided, "a model from a file lacks the kinetic energies of the bodies")
+        return (
+            *undecided,
+            "the kinetic energies of the bodies are unknown, because the model was loaded from a "
+            "file",
+        )
 
     @property
     def poles(self) -> Complex:
-        """All nx eigenvalues of A [rad/s], including zeros and conjugates."""
+        """All nx eigenvalues of A [rad/s], including zero and conjugate eigenvalues."""
         listed = [0j] * self.zero_eigenvalues
         for mode in self.modes:
             listed += [mode.pole, mode.pole.conjugate()] if mode.oscillates else [mode.pole]
         return np.array(listed)
 
     def __str__(self) -> str:
-        """Show how many are rigid, and a table of the others with the bodies that move most."""
+        """Show the number of rigid-body modes, and a table of the other modes."""
         vibrations, others = len(self.vibrations), len(self.modes) - len(self.vibrations)
         head = (
             f"{self.robot}: {counted(self.rigid_body, 'rigid-body mode')} "
@@ -197,10 +203,10 @@ class Modes:
         said = [head]
         if self.unstable:
             poles = ", ".join(f"{mode.pole:.5g}" for mode in self.unstable)
-            said.append(f"unstable: poles with a positive real part {poles}")
+            said.append(f"unstable poles (positive real part): {poles}")
         said += [f"note: {note}" for note in self.notes]
         parts = [textwrap.fill(each, width()) for each in said]
-        rows = [["rad/s", "damping", "time [s]", "", "kinetic energy"]]
+        rows = [["rad/s", "damping", "decay [s]", "", "kinetic energy"]]
         rows += [
             [
                 f"{mode.frequency:.6g}" if mode.oscillates else ".",
@@ -219,7 +225,7 @@ class Modes:
         return "\n\n".join((*parts, *self._of_appendages()))
 
     def _of_appendages(self) -> list[str]:
-        """Return the modes of appendages, free and clamped, and their effective masses."""
+        """Return tables of the appendage modes, free and clamped, and of their effective masses."""
         robot = self.lin._robot
         if robot is None or not robot.modes:
             return []
@@ -239,11 +245,12 @@ class Modes:
             cells = [f"{100.0 * part:.1f}" if part > 1e-12 else "." for part in parts]
             of_masses.append([name, f"{clamped[name]:.6g}" if name in clamped else ".", *cells])
         title = (
-            "effective masses and moments of inertia in % of the body that carries the appendage, "
-            "or of its file's inertia, about the appendage's frame"
+            "effective masses and moments of inertia about the frame of the appendage, in % of "
+            "the inertia of the body that carries it, or of the inertia in its file"
         )
         return [
-            f"modes of appendages, with the link free and clamped\n{grid(rows, 'rrll')}",
+            "modes of the appendages, with the link that carries them free and "
+            f"clamped\n{grid(rows, 'rrll')}",
             f"{textwrap.fill(title, width())}\n{grid(of_masses, 'lrrrrrrr')}",
         ]
 
@@ -251,16 +258,17 @@ class Modes:
 def modes(lin: LinearModel) -> Modes:
     r"""Compute the natural modes of a linear model.
 
-    At rest, with a symmetric stiffness as the only force, the result contains the modes of the
-    free-floating structure:
+    If the operating point is at rest and the only force is a symmetric stiffness, the modes are the
+    vibration modes of the free-floating structure:
 
     .. math::
         K \phi = \omega^2 M^* \phi, \qquad M^* = ((M^{-1})_{EE})^{-1}.
 
-    E are the coordinates on which the stiffness K acts. M* is a Schur complement of M: the
-    effective inertia of the coordinates E if all other coordinates are free to move. With other
-    forces or motion, the modes are the eigenvectors of A. The zero eigenvalues form Jordan blocks
-    of size two or more, and are separated exactly from the other eigenvalues.
+    The index E selects the coordinates on which the stiffness K acts. M* is a Schur complement of
+    M: the effective inertia of these coordinates if all other coordinates are free to move. If
+    other forces act, or the operating point is in motion, the modes are the eigenvectors of A. Zero
+    eigenvalues form Jordan blocks of size two or more, which are sensitive to rounding, so these
+    eigenvalues are first separated exactly from all others.
 
     Parameters
     ----------
@@ -277,7 +285,7 @@ def modes(lin: LinearModel) -> Modes:
     InputError
         If the model is sampled, or its states are not positions followed by their velocities.
     ModelError
-        If the robot's model was changed after the linear model was made.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     References
     ----------
@@ -304,7 +312,7 @@ def modes(lin: LinearModel) -> Modes:
     shapes = []
     for pair in pairs:
         positions = np.abs(pair.shape[:nv])
-        # Of several that move equally, such as symmetric panels, the first.
+        # If several coordinates move equally, such as symmetric panels, the first is scaled to 1.
         largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
         shapes.append(np.asarray(pair.shape / pair.shape[largest], dtype=complex))
     energies = energy_by_body(lin._robot, lin, shapes)
@@ -327,7 +335,7 @@ def modes(lin: LinearModel) -> Modes:
 
 
 def _percents(energy: Mapping[str, float], room: int) -> str:
-    """Name the bodies with 1 % of the energy or more, and sum up all other bodies."""
+    """Name the bodies with at least 1 % of the energy, and sum up all other bodies."""
     words = [f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01]
     text = ""
     for count in range(len(words), 0, -1):
@@ -354,7 +362,7 @@ def energy_by_body(
     inertias = robot.model.inertias.tolist()[ROOT:]
     found: list[Mapping[str, float]] = []
     for shape in shapes:
-        # All velocities of a mode are its pole times the displacements.
+        # In a mode, all velocities are the displacements times the pole.
         moved = displacement(lin, chart, shape)
         energies = np.zeros(len(names))
         for part in (moved.real, moved.imag):

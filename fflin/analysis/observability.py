@@ -14,18 +14,18 @@ from fflin.base.validation import Array, FrozenArrays, Values, instance, positiv
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.model import LinearModel
 
-# A pole that decays less, relative to the fastest, may be one at zero that rounding moved.
+# A slower decay, relative to the fastest pole, may be a pole at zero that rounding has moved.
 _DECAY = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class Observability(FrozenArrays):
-    """Observability of a linear model; prints in words.
+    """Observability of a linear model; ``print`` shows a summary.
 
     Attributes
     ----------
     dimension : int
-        nx minus the dimension of the unobservable subspace.
+        Number of states nx minus the dimension of the unobservable subspace.
     unobservable : tuple of str
         Names of the unobservable motions; each is a state or a combination of states.
     basis : ndarray (nx, nx - dimension)
@@ -77,12 +77,13 @@ class Observability(FrozenArrays):
 def observability(lin: LinearModel) -> Observability:
     r"""Determine the observable subspace from C and the structure of A.
 
-    At rest, observability is tested in second-order form, :math:`M a + D v + K s = 0`, by the null
-    space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. All poles p = 0 are tested
-    together. At nonzero velocity, observability is tested as the controllability of the dual pair
-    :math:`(A^T, C^T)`, with states scaled to units of energy, as in `controllability`. The
-    unobservable subspace is the orthogonal complement of the controllable subspace of the dual
-    pair.
+    At rest, observability is tested in second-order form, :math:`M a + D v + K s = 0` with damping
+    D and stiffness K, by the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p.
+    Here :math:`C_s` and :math:`C_v` are the columns of C for the positions s and the velocities v.
+    All poles at p = 0 are tested together. At nonzero velocity, observability is tested as the
+    controllability of the dual pair :math:`(A^T, C^T)`, with states scaled to units of energy, as
+    in `controllability`. The unobservable subspace is the orthogonal complement of the controllable
+    subspace of the dual pair.
 
     Parameters
     ----------
@@ -93,12 +94,12 @@ def observability(lin: LinearModel) -> Observability:
     Returns
     -------
     Observability
-        Dimension, basis, and named unobservable motions.
+        Dimension of the observable part, and basis and names of the unobservable motions.
 
     Raises
     ------
     InputError
-        If `lin` is not a linear model of positions and their rates.
+        If `lin` is not a `LinearModel`, or its states are not positions followed by their rates.
 
     Examples
     --------
@@ -131,7 +132,7 @@ def observability(lin: LinearModel) -> Observability:
 
 
 def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
-    """Return the motions (nx, k) that the outputs miss, their poles, and the method."""
+    """Return the unobservable motions (nx, k), their poles, and the method."""
     source, nv = mechanics.at_rest(lin), len(lin.M)
     if source is not None:
         system = mechanics.second_order(source)
@@ -146,7 +147,7 @@ def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
         if found is not None:
             motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
             return motions, found.fixed, "eigenvalues" if system.acting else "closed form"
-    # The uncontrollable subspace of the dual pair (A^T, C^T).
+    # The unobservable subspace belongs to the uncontrollable part of the dual pair (A^T, C^T).
     part = split_by_poles(mechanics.rate_matrix(lin), lin.C.T, lin.M, lin.dt, dual=True)
     return part.outside, part.fixed, "eigenvalues"
 
@@ -158,9 +159,10 @@ class Gramians(FrozenArrays):
     Attributes
     ----------
     controllability : ndarray (nx, nx)
-        Gramian W_c; the least input energy that reaches x is ``x^T W_c^-1 x``.
+        Gramian W_c. The least input energy that moves the state from 0 to x is ``x^T W_c^-1 x``.
     observability : ndarray (nx, nx)
-        Gramian W_o; the output energy of the free response from x is ``x^T W_o x``.
+        Gramian W_o. The output energy of the free response from the initial state x is
+        ``x^T W_o x``.
     duration : float
         Horizon [s]; infinite if `duration` was omitted.
 
@@ -184,20 +186,20 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
         W_c = \int_0^T e^{A t} B B^T e^{A^T t}\,dt, \quad
         W_o = \int_0^T e^{A^T t} C^T C e^{A t}\,dt.
 
-    The Gramians of a sampled model are sums over its samples. For an infinite horizon, the
-    Gramians solve Lyapunov equations. For a finite horizon T, the Gramians are polynomials in T
-    if :math:`A^2 = 0`, as at rest without springs. In all other cases, the Gramians are computed
-    for a short horizon, which is then doubled repeatedly, :math:`W(2 t) = W(t) + e^{A t} W(t)
-    e^{A^T t}`.
+    For a sampled model, sums over the samples replace the integrals. For an infinite horizon, the
+    Gramians are the solutions of Lyapunov equations. For a finite horizon T, the Gramians are
+    polynomials in T if :math:`A^2 = 0`, for example at rest without springs. In all other cases,
+    the Gramians are computed for a short horizon, and this horizon is doubled until it equals T, by
+    :math:`W_c(2 t) = W_c(t) + e^{A t} W_c(t) e^{A^T t}`.
 
     Parameters
     ----------
     lin : LinearModel
         Continuous or sampled model.
     duration : float, optional
-        Horizon T [s]; a multiple of dt for a sampled model. By default the horizon is infinite, and
-        the model must be asymptotically stable. A model with a free base is never asymptotically
-        stable.
+        Horizon T [s]; a multiple of dt for a sampled model. By default the horizon is infinite,
+        which requires an asymptotically stable model. A model with a free base is never
+        asymptotically stable, so it requires a finite horizon.
 
     Returns
     -------
@@ -207,8 +209,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     Raises
     ------
     InputError
-        If `duration` is not positive or not a multiple of dt, or if the model is not
-        asymptotically stable and `duration` is missing.
+        If `duration` is not positive or not a multiple of dt, or if `duration` is omitted for a
+        model that is not asymptotically stable.
 
     References
     ----------
@@ -231,7 +233,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
         found = [_gramian(A, B @ B.T, lin.dt, duration) for A, B in pairs]
     if not all(np.isfinite(W).all() for W in found):
         raise InputError(
-            f"duration is {duration:g} s, over which the state transition overflows; shorten it"
+            f"duration is {duration:g} s, over which the state transition matrix overflows; give "
+            "a shorter duration"
         )
     reach, show = (0.5 * (W + W.T) for W in found)
     return Gramians(reach, show, np.inf if duration is None else duration)
@@ -244,8 +247,8 @@ def _require_decay(lin: LinearModel) -> None:
     if growth >= -_DECAY * (1.0 if lin.dt else size):
         slow = f"a pole of modulus {1.0 + growth:.6g}" if lin.dt else f"a pole at {growth:.3g} 1/s"
         raise InputError(
-            f"the model is not asymptotically stable ({slow}), so its Gramians are not finite; "
-            "give duration="
+            f"the model is not asymptotically stable ({slow}), so its infinite-time Gramians are "
+            "not finite; give duration= for finite-time Gramians"
         )
 
 
@@ -259,7 +262,7 @@ def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
     steps = round(duration / dt)
     if not steps or abs(steps * dt - duration) > 1e-9 * duration:
         raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
-    # The sum of A^k Q A^kT over k < steps, by the binary digits of their number.
+    # Sum A^k Q A^kT over k < steps by repeated doubling.
     total, power = np.zeros_like(Q), np.eye(len(A))
     while steps:
         if steps & 1:

@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Of the two routes to a block, one is drawn above its line and one below.
+# Vertical offsets of the tests, so that the points of two independent computations do not overlap.
 _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
 
 def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
-    """Draw the magnitudes of all entries of A and B that exceed rounding error, by state groups.
+    """Draw the magnitudes of the entries of A and B; entries within rounding error stay blank.
 
     Parameters
     ----------
     lin : LinearModel
         Model to draw.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -90,7 +90,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     modes : Modes
         Result of `fflin.modes`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -131,7 +131,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
 
 
 def _draw_shape(axes: Axes, line: int, shape: Values, colors: Sequence[str]) -> None:
-    """Draw a shape as bars about its line: filled the part in phase, outlined the modulus."""
+    """Draw a shape as bars on its line: the real part filled, the modulus outlined."""
     x, height = np.arange(len(shape)), -0.45  # the axis points down
     axes.axhline(line, color="#888888", lw=0.5)
     axes.bar(x, height * shape.real, 0.7, line, color=colors)
@@ -158,7 +158,7 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     check : Check
         Result of `fflin.check`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -185,9 +185,9 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
         axes.set_xlabel("relative error (dot) and tolerance (bar)")
         verdict = f"OK: {len(check.rows)} errors within tolerance"
         if bad:
-            verdict = f"FAILED: {len(bad)} of {len(check.rows)} exceed their tolerance"
+            verdict = f"FAILED: {len(bad)} of {len(check.rows)} errors exceed their tolerance"
         exact = len(check.rows) - len(rows)
-        axes.set_title(f"{check.title}\n{verdict}; {exact} are zero, not drawn", loc="left")
+        axes.set_title(f"{check.title}\n{verdict}; {exact} are zero (not drawn)", loc="left")
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)
     return figure
 

@@ -28,10 +28,10 @@ Indices: TypeAlias = NDArray[np.intp]
 Make: TypeAlias = Callable[[LinearModel], LinearModel]
 Part = TypeVar("Part", bound=LinearModel)
 
-# What is smaller, relative to the rest, is rounding.
+# Smaller values, relative to the largest, are rounding errors.
 _ROUNDING = 1e-9
 
-# Largest part of f0, relative to it, that the reduced state may leave out.
+# Largest part of f0, relative to its largest entry, that the reduced state may leave out.
 _DRIFT = 1e-9
 
 
@@ -39,22 +39,21 @@ _DRIFT = 1e-9
 class ReducedModel(LinearModel):
     """Linear model reduced to the coordinates on which inputs, springs and dampers act.
 
-    Let z be the reduced state and x the full state; then ``z = S x`` for all motions. For motions
-    with zero conserved momenta, ``x - x0 = T (z - z0)``. A saved file contains the model, but not
-    the maps T and S.
+    Let x be the full state, z the reduced state, and x0 and z0 their values at the operating point.
+    Then ``z = S x`` for all motions, and ``x - x0 = T (z - z0)`` for motions whose conserved
+    momenta are zero. `save` writes the reduced model, but not the maps T and S.
 
     Attributes
     ----------
     T : ndarray (nx, nz)
         Map from the reduced state to the full state.
     S : ndarray (nz, nx)
-        Map from the full state to the reduced state, which selects the states with the same
-        names.
+        Map from the full state to the reduced state: selects the states of x that z also contains.
     momenta : ndarray (k, nx)
-        Rows L1 of the conserved momenta, which are zero in the reduced model.
+        Matrix L1 of the conserved momenta ``L1 (x - x0)``, which are zero in the reduced model.
     coordinates : ndarray (k, nx)
-        Rows L2 of the coordinates whose rates are the momenta. These coordinates are zero in the
-        reduced model.
+        Matrix L2 of the coordinates ``L2 (x - x0)`` whose rates are the conserved momenta. These
+        coordinates are also zero in the reduced model.
     margin : Margin
         Certainty of the rank decision on the conserved momenta, as in `Controllability`.
     notes : tuple of str
@@ -82,10 +81,10 @@ class ReducedModel(LinearModel):
 def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) -> ReducedModel:
     r"""Remove the conserved momenta from a model, exactly.
 
-    A conserved momentum :math:`W M \nu`, which no input, spring or damper changes, stays zero if
-    its initial value is zero. The reduction removes each conserved momentum and the coordinate
-    driven by this momentum. For an unactuated base, all six momenta are removed. With :math:`G =
-    -M_{bb}^{-1} M_{bm}`, the reduced model is
+    A momentum :math:`W M \nu` is conserved if no input, spring or damper changes it. If its initial
+    value is zero, it stays zero. The reduction therefore removes each conserved momentum and the
+    coordinate whose rate is this momentum. If the base is unactuated, all six momenta are removed.
+    With :math:`G = -M_{bb}^{-1} M_{bm}`, the reduced model is then
 
     .. math::
         \nu_b = G \dot q_m, \quad M^* \ddot q_m = \tau_m - K q_m - D \dot q_m, \quad
@@ -93,13 +92,13 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
     See equations (9.2) and (9.3) of docs/derivation.md.
 
-    The base attitude is kept if inputs act on the attitude, and the base position if inputs act
-    on the position. Without springs, the reduced model is minimal. With springs, the reduced
-    model may contain vibrations that no input drives. The reduced and the full model have the
-    same transfer function from inputs to joint states.
+    If inputs act on the base attitude, the reduced model keeps the attitude. If inputs act on the
+    base position, the reduced model keeps the position. Without springs, the reduced model is
+    minimal. With springs, the reduced model may still contain vibrations that no input drives. The
+    reduced model and the full model have the same transfer function from inputs to joint states.
 
-    Reaction wheels are also removed, even if they store momentum (9.4), but the attitude
-    controlled by wheels is kept. Three kinds of wheels are kept with their angles:
+    Reaction wheels are also removed, even if they store momentum (9.4), but the attitude that they
+    control is kept. The speeds and angles of three kinds of wheels are kept:
 
     - wheels whose speeds are to be controlled (9.5);
     - wheels on a carrier that rotates at the operating point;
@@ -108,25 +107,26 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     Parameters
     ----------
     lin : LinearModel
-        Model about rest, continuous or sampled.
+        Model about an operating point at rest, continuous or sampled.
     wheel_speeds : bool, optional
-        Whether to keep wheels whose speeds the inputs can control. By default, such wheels are
-        kept if other inputs can rotate the base.
+        Whether to keep wheels whose speeds the inputs can control. By default, such wheels are kept
+        if inputs other than the wheels can rotate the base.
 
     Returns
     -------
     ReducedModel
         `LinearModel` with the maps ``T`` and ``S``. The model has 2 r states, where r is nv minus
         the number of conserved momenta. ``M`` is the inertia of the kept coordinates, with the
-        removed coordinates free to move. The outputs are the outputs of `lin`, except that
-        outputs of removed wheels are zero, as in ``T``.
+        removed coordinates free to move. The outputs are the outputs of `lin`. An output that
+        measures a removed wheel is zero, because ``T`` sets the states of removed wheels to zero.
 
     Raises
     ------
     InputError
-        If f0 is nonzero in a removed direction, or `lin` is not a linear model.
+        If the state derivative f0 at the operating point is nonzero in a direction that the
+        reduction removes, or `lin` is not a linear model.
     ModelError
-        If the robot's model was changed after the linear model was made.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     References
     ----------
@@ -166,11 +166,12 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
 
 
 def generalized_inertia(lin: LinearModel) -> Array:
-    r"""Return the generalized inertia: the joints' inertia while the base is free (9.3).
+    r"""Return the generalized inertia matrix: the inertia of the joints with the base free.
 
     .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
 
-    The definition is by Umetani and Yoshida, see `momentum_reduction`.
+    Umetani and Yoshida defined this matrix, see (9.3) of docs/derivation.md and the reference in
+    `momentum_reduction`.
 
     Parameters
     ----------
@@ -202,13 +203,14 @@ def generalized_inertia(lin: LinearModel) -> Array:
 
 
 def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") -> Array:
-    r"""Return the generalized Jacobian from joint rates to a frame's velocity (9.3).
+    r"""Return the generalized Jacobian from joint rates to a frame's velocity.
 
-    The base is free, and the momentum of the robot is zero.
+    This Jacobian is valid if the base is free and the momentum of the robot is zero.
 
     .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
 
-    The definition is by Umetani and Yoshida, see `momentum_reduction`.
+    Umetani and Yoshida defined this matrix, see (9.3) of docs/derivation.md and the reference in
+    `momentum_reduction`.
 
     Parameters
     ----------
@@ -221,8 +223,8 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     Returns
     -------
     ndarray (6, n)
-        Jacobian from joint rates to angular velocity [rad/s], then velocity of the frame's origin
-        [m/s], both in Pinocchio's world axes.
+        Jacobian from the joint rates to the angular velocity of the frame [rad/s] (rows 0 to 2) and
+        the velocity of its origin [m/s] (rows 3 to 5), both in Pinocchio's world axes.
 
     Raises
     ------
@@ -254,8 +256,9 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 
 
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
-    """Return the wheels (k,) on whose angle nothing depends, and those whose speed is so too."""
-    # A speed matters where the carrier turns at the point, and where the wheel has friction.
+    """Return the wheels whose angle has no effect, and those whose speed has no effect either."""
+    # A wheel speed has an effect if the carrier rotates at the operating point or the wheel has
+    # friction.
     nv, wanted = len(lin.M), {f"q_m.{name}" for name in wheel_inputs(lin)}
     at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
     if not len(at):
@@ -266,9 +269,10 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
-    """Return the wheels (k,) that a design does not regulate (9.5)."""
-    # Inputs that turn nothing at rest may still spin wheels: as many as they do so independently
-    # can be momenta. By default these stay where something else turns the base.
+    """Return the indices (k,) of the wheels that a design does not regulate (9.5)."""
+    # Combinations of inputs that exert no net force at rest may still change wheel speeds. As many
+    # wheels are kept as there are independent combinations. By default, wheels are kept only if
+    # inputs other than the wheels can rotate the base.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
         raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
     _, free = ignorable_wheels(lin)
@@ -286,9 +290,10 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
 
 
 def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
-    """Return the model of the states that are regulated; `lin` itself where it has no wheels."""
-    # It lacks the `removed_wheels`, and the angles of other wheels on which nothing depends: there
-    # may be fewer positions than rates. It lacks the base's position if no input pushes it.
+    """Return the model of the regulated states, or `lin` itself if it has no wheels."""
+    # The model lacks the `removed_wheels`, and the angles of all wheels whose angle has no effect.
+    # It may therefore have fewer positions than rates. It lacks the base position if no input acts
+    # on it.
     if not wheel_inputs(lin):
         return lin
     source, nv = lin.generator or lin, len(lin.M)
@@ -296,14 +301,15 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     base = [i for i in range(nv) if idle[i] and lin.state_names[i].startswith("r_b.")]
     columns = [*base, *(i + nv for i in base)]
     if np.abs(np.delete(source.A[:, columns], columns, axis=0)).max(initial=0.0) > _ROUNDING:
-        base = []  # in axes that turn one direction is part of the others
+        base = []  # in rotating axes, each direction affects the others
     removed = np.union1d(base, removed_wheels(lin, wheel_speeds)).astype(np.intp)
     part = without(lin, removed)
     angles = {lin.state_names[i] for i in ignorable_wheels(lin)[0]}
     rest = [name for name in part.state_names if name not in angles]
     if len(rest) == len(part.M):
         raise StabilizabilityError(
-            "the model contains wheel speeds alone; remove the damping of the wheels"
+            "wheel speeds would be the only states of the reduced model; remove the damping of "
+            "the wheels"
         )
     return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
 
@@ -316,7 +322,7 @@ def rigid_forces(body: LinearModel) -> Noisy:
 
 
 def without(lin: LinearModel, removed: Indices) -> LinearModel:
-    """Return a model without coordinates (k,) and their rates, exact whatever these do (9.4)."""
+    """Remove coordinates (k,) and their rates from a model; exact for any motion of them (9.4)."""
     kept = np.setdiff1d(np.arange(len(lin.M)), removed)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
     rest = floating_inertia(lin.M, kept, removed)
@@ -324,7 +330,7 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
 
 
 def _balanced(lin: LinearModel) -> LinearModel:
-    """Return a model without the forces that are rounding of a spin, which its parts lack."""
+    """Return the model without stiffness and damping that are only rounding errors of a spin."""
     nv, A, system = len(lin.M), lin.A.copy(), second_order(lin)
     if not lin.dt and not system.K.values.any():
         A[nv:, :nv] = 0.0
@@ -334,7 +340,7 @@ def _balanced(lin: LinearModel) -> LinearModel:
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
-    """Return the model of some states, with the inertia M and the outputs of these states."""
+    """Return the model of the named states, with the inertia M and the outputs of these states."""
     S = selection(names, lin.state_names)
     seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
     values |= {"C": seen @ values["C"], "D": seen @ lin.D, "y0": seen @ lin.y0}
@@ -349,13 +355,13 @@ def selection(names: Sequence[str], of: Sequence[str]) -> Array:
 
 
 def outputs_of(lin: LinearModel, S: Array) -> Array:
-    """Return the matrix (k, ny) that selects the outputs of the states S x alone."""
+    """Return the matrix (k, ny) that selects the outputs that depend only on the states S x."""
     others = np.abs(lin.C - lin.C @ S.T @ S).max(axis=1, initial=0.0)
     return np.eye(len(lin.C))[others <= 1e-12 * np.abs(lin.C).max(axis=1, initial=0.0)]
 
 
 def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
-    """Return the fields of a model of the states z = S x of the inertia M, the others T z."""
+    """Return the fields of the model with the states z = S x, where x = T z, and the inertia M."""
     names = tuple(lin.state_names[i] for i in S.argmax(axis=1))
     whole = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
     return whole | {
@@ -373,7 +379,7 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
 
 
 def certified(part: Part, lin: LinearModel, make: Make) -> Part:
-    """Return a part with the certificate of the whole, and with what made it of its source."""
+    """Add the certificate of a whole model to its part, and a source to a sampled part."""
     fingerprint, source = part.fingerprint, lin.generator
     certify = partial(same_certificate, lin, fingerprint)
     of = (fingerprint, make(source)) if lin.dt and source is not None else None

@@ -20,7 +20,8 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
 
-# Of the principal moments, relative to the largest: what eigenvalues and sums over bodies lose.
+# Rounding error of the principal moments relative to the largest, from eigenvalues and sums over
+# bodies.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
@@ -31,18 +32,21 @@ class RelativeEquilibrium(FrozenArrays):
     Attributes
     ----------
     q : ndarray (nq,)
-        Configuration with the centre of mass on the orbit. ``equilibrium(robot, q).u`` returns
-        the inputs that hold the joints at q.
+        Configuration in which the centre of mass is on the orbit. ``equilibrium(robot, q).u``
+        returns the inputs that hold the joints at q.
     moments : ndarray (3,)
-        Principal moments of inertia [kg m^2] about the centre of mass: radial axis, along-track
-        axis, orbit normal.
+        Principal moments of inertia [kg m^2] about three axes through the centre of mass: the
+        radial axis, the along-track axis and the orbit normal.
     poles : ndarray (6,)
-        Poles [rad/s] of the attitude with fixed joints: pitch, then roll and yaw.
+        Poles [rad/s] of the attitude motion with fixed joints: two of pitch, then four of roll and
+        yaw.
     stable : bool or None
-        Whether no pole has a positive real part; None if rounding error leaves this undecided.
+        True if no pole has a positive real part, False if a pole has one, None if rounding error
+        leaves the sign undecided.
     margin : float
-        Value of the smallest stability condition, divided by its rounding error. The equilibrium
-        is unstable if `margin` is below -1, and stable if `margin` is above 1.
+        Smallest of the quantities that must be positive for stability, divided by its rounding
+        error. The equilibrium is stable if `margin` is above 1, and unstable if `margin` is below
+        -1.
 
     Examples
     --------
@@ -60,7 +64,7 @@ class RelativeEquilibrium(FrozenArrays):
 
 
 class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
-    """Tuple of the 24 relative equilibria, most stable first; prints as a table, four per row.
+    """Tuple of the 24 relative equilibria, most stable first; ``print`` shows a table.
 
     Examples
     --------
@@ -73,14 +77,16 @@ class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
     __slots__ = ()
 
     def __str__(self) -> str:
-        """Show one of the four attitudes of each kind."""
+        """Show one row for each four equivalent attitudes."""
         rows = [["radial", "along", "normal [kg m^2]", "", "growth [1/s]"]]
         for one in self[::4]:
             said = {True: "stable", False: "unstable", None: "undecided"}[one.stable]
             growth = float(one.poles.real.max()) if one.stable is False else 0.0
             sizes = [f"{moment:.5g}" for moment in one.moments]
             rows.append([*sizes, said, f"{growth:.4g}" if growth else "."])
-        return f"principal moments of inertia, 4 attitudes per row\n{grid(rows, 'rrrlr')}"
+        return (
+            f"principal moments of inertia; each row stands for 4 attitudes\n{grid(rows, 'rrrlr')}"
+        )
 
 
 def relative_equilibria(
@@ -89,25 +95,26 @@ def relative_equilibria(
     r"""List the attitudes in which a robot with fixed joints stays at rest in its orbital frame.
 
     In each of the 24 attitudes, the principal axes of inertia are parallel to the axes of the
-    orbital frame. Let :math:`I_r, I_a, I_n` be the moments of inertia about the radial axis, the
-    along-track axis and the orbit normal. By (14.8) of docs/derivation.md, the poles
-    :math:`\lambda` of pitch, and of roll and yaw, are the roots of
+    orbital frame. Let n be the orbital rate, and :math:`I_r, I_a, I_n` the moments of inertia about
+    the radial axis, the along-track axis and the orbit normal. The poles :math:`\lambda` are the
+    roots of two equations, the first for pitch and the second for roll and yaw, see (14.8) of
+    docs/derivation.md:
 
     .. math::
         \lambda^2 = -3 n^2 (I_a - I_r)/I_n, \qquad
         \lambda^4 + (1 + 3 k_a + k_a k_r)\,n^2 \lambda^2 + 4 k_a k_r\,n^4 = 0, \qquad
         k_a = (I_n - I_r)/I_a, \quad k_r = (I_n - I_a)/I_r.
 
-    If all poles are imaginary and simple, the body librates.
+    If all poles are imaginary and simple, the body librates about the equilibrium.
 
     Parameters
     ----------
     robot : Robot
         Robot in orbit.
     q : array_like (nq,), optional
-        Configuration whose joint positions are used; neutral by default.
+        Configuration that provides the joint positions; neutral by default.
     frame : {"lvlh", "hill"}, optional
-        Orbital frame of `q` in the result; "lvlh" by default.
+        Orbital frame in which `q` of each result is expressed; "lvlh" by default.
 
     Returns
     -------
@@ -137,8 +144,8 @@ def relative_equilibria(
     field = field_of(robot, frame_of(robot, frame))
     if field is None:
         raise InputError(
-            f"'{robot.name}' is not in orbit; give it an orbit: "
-            "robot.replace(orbit=fflin.CircularOrbit(altitude=...)), --orbit on the command line"
+            f"'{robot.name}' is not in orbit; give it an orbit by "
+            "robot.replace(orbit=fflin.CircularOrbit(altitude=...)) or --orbit"
         )
     if robot.stored_momentum:
         raise InputError(
@@ -171,12 +178,12 @@ def relative_equilibria(
 
 
 def _libration(moments: Array, n: float) -> tuple[Complex, float]:
-    """Return the poles (6,) of a body's attitude, and the smallest stability condition."""
+    """Return the poles (6,) of the attitude motion, and the smallest margin of stability."""
     radial, along, normal = moments.tolist()
     pitch = 3.0 * (along - radial) / normal
     k_a, k_r = (normal - radial) / along, (normal - along) / radial
     b, c = 1.0 + 3.0 * k_a + k_a * k_r, 4.0 * k_a * k_r
-    # Of mu^2 + b mu + c = 0, mu = lambda^2 / n^2, without cancellation.
+    # Solve mu^2 + b mu + c = 0 for mu = lambda^2 / n^2 without cancellation.
     root = np.sqrt(complex(b * b - 4.0 * c))
     larger = -0.5 * (b + (root if b >= 0.0 else -root))
     squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)

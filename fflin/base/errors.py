@@ -1,19 +1,19 @@
-"""Errors that fflin raises; each message says what was given, what was expected, what to do."""
+"""Errors that fflin raises; each message gives the value, what is expected, and what to do."""
 
 import re
 from collections.abc import Collection, Iterable
 from typing import Any
 
-# Characters that end a line or command the terminal, names that are too long to be read, and how
-# long a message may be. A part of a path is such a name, the path is not.
+# Patterns of control characters, which could break a line or control the terminal, and of names
+# too long to read. Each part of a path counts as a name. _LONGEST is the longest message.
 _CONTROL, _LONG_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]"), re.compile(r"[^\s/\\]{100,}")
 _LONGEST = 1000
-# The line break of a message of another package that goes on with an indented line.
+# Line break before an indented line, found in messages of other packages.
 _INDENTED = re.compile(r"[ \t]*\r?\n[ \t]+")
 
 
 def one_line(text: str) -> str:
-    """Return a message in one line: control characters are escaped, long text is cut."""
+    """Return a message as one line: escape control characters and cut long text."""
     text = _INDENTED.sub(" ", text)
     text = _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
     text = _LONG_NAME.sub(lambda found: _cut(found[0], 60), text)
@@ -21,12 +21,12 @@ def one_line(text: str) -> str:
 
 
 def _cut(text: str, size: int) -> str:
-    """Return both ends of a text, about `size` characters."""
+    """Return both ends of a text, about `size` characters in all."""
     return f"{text[: 2 * size // 3]}...{text[-size // 3 :]}"
 
 
 class FflinError(Exception):
-    """Base class of every error that fflin raises deliberately. Each message is one line.
+    """Base class of all errors that fflin defines. Each message is one line.
 
     Examples
     --------
@@ -54,7 +54,7 @@ class InputError(FflinError, ValueError):
 
 
 class UnknownNameError(FflinError, LookupError):
-    """Error for the name of a robot, joint, frame or other item that does not exist.
+    """Error for an unknown name, for example of a robot, joint or frame.
 
     Examples
     --------
@@ -92,7 +92,10 @@ class UrdfError(FflinError, ValueError):
 
 
 class ModelError(FflinError, ValueError):
-    """Error for a model that is not one free-flying tree of one-degree-of-freedom joints.
+    """Error for a Pinocchio model that fflin cannot use.
+
+    The model must be a single tree of one-degree-of-freedom joints on a free-flyer root joint. It
+    must not be modified after the robot was created.
 
     Examples
     --------
@@ -133,7 +136,7 @@ class ChartError(FflinError, ValueError):
 
 
 class EquilibriumError(FflinError, ValueError):
-    """Error for an operating point that is not an equilibrium, or that no inputs can hold.
+    """Error for an operating point that is not an equilibrium, or where no inputs hold the robot.
 
     Examples
     --------
@@ -146,12 +149,12 @@ class EquilibriumError(FflinError, ValueError):
 
 
 class StabilizabilityError(FflinError, ValueError):
-    """Error for modes that do not decay by themselves and that the inputs do not control.
+    """Error for modes that neither decay by themselves nor can be controlled by the inputs.
 
     Attributes
     ----------
     margin : Margin or None
-        Certainty of the rank decisions that led to the error; None if no rank was decided.
+        Certainty of the rank decisions that led to the error; None if no rank decision was needed.
 
     Examples
     --------
@@ -166,12 +169,12 @@ class StabilizabilityError(FflinError, ValueError):
 
 
 class DetectabilityError(FflinError, ValueError):
-    """Error for modes that do not decay by themselves and that the outputs do not observe.
+    """Error for modes that neither decay by themselves nor can be observed from the outputs.
 
     Attributes
     ----------
     margin : Margin or None
-        Certainty of the rank decisions that led to the error; None if no rank was decided.
+        Certainty of the rank decisions that led to the error; None if no rank decision was needed.
 
     Examples
     --------
@@ -202,7 +205,8 @@ class SweepError(FflinError, RuntimeError):
     Attributes
     ----------
     failed : tuple
-        (start, stop, reason) of each failed chunk; its points are start to stop - 1.
+        Tuple (start, stop, reason) for each failed chunk. The chunk contains the points start to
+        stop - 1.
     batch : LinearBatch or None
         Results of the other chunks, in order; None if the sweep was written to a file.
 
@@ -219,7 +223,7 @@ class SweepError(FflinError, RuntimeError):
     """
 
     def __init__(
-        self, message: str, failed: tuple[tuple[int, int, str], ...] = (), batch: Any = None
+        self, message: str, failed: tuple[tuple[int, int, str], ...] = (), batch: object = None
     ) -> None:
         super().__init__(message)
         self.failed, self.batch = failed, batch
@@ -241,13 +245,13 @@ class FflinWarning(UserWarning):
 
 
 def listed(names: Iterable[str]) -> str:
-    """Show names in a sentence: the first six, each once, and how many more there are."""
+    """Join names for a sentence: the first six different names and the number of the others."""
     names = list(dict.fromkeys(names))
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """Build the error for a name that does not exist, with the names that are near."""
+    """Build the error for an unknown name, with similar names as a hint."""
     import difflib
 
     names = list(known)
@@ -263,7 +267,7 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
 
 
 def require_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:
-    """Raise `UnknownNameError` for the first of the names that is not known."""
+    """Raise `UnknownNameError` for the first unknown name, if any."""
     for name in names:
         if name not in known:
             raise unknown(kind, name, known)

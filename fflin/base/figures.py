@@ -1,4 +1,4 @@
-"""Figures: their style, their colours, and the file that each is saved to."""
+"""Style, colours and output files of figures."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def cycle(count: int) -> list[str]:
-    """Return that many colours, all different."""
+    """Return `count` different colours."""
     if count <= len(COLORS):
         return list(COLORS[:count])
     from matplotlib import colormaps
@@ -49,13 +49,13 @@ def cycle(count: int) -> list[str]:
     return [to_hex(colormaps["turbo"](i / (count - 1))) for i in range(count)]
 
 
-def letters_of(count: float, room: float) -> float:
-    """Font size [pt] at which a number of lines fit into a height [pt]."""
-    return min(8.0, 0.75 * room / max(1, count))
+def letters_of(count: float, height: float) -> float:
+    """Return the font size [pt] at which `count` lines fit into a height [pt]."""
+    return min(8.0, 0.75 * height / max(1, count))
 
 
 def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float) -> None:
-    """Scale an axis so that values of very different sizes are distinguishable."""
+    """Make an axis symmetric logarithmic if the sizes of its values span a decade."""
     sizes = [abs(value) for value in values.tolist() if abs(value) > 1e-9 * unit]
     if not sizes or max(sizes) < 10.0 * min(sizes):
         return
@@ -68,7 +68,7 @@ def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float)
 
 @contextmanager
 def drawing(path: str | Path | None, width: float, height: float, **options: Any) -> Iterator[Any]:
-    """Yield a figure of a size [in] in the style, without a window; save it if a path is given."""
+    """Yield a figure of a size [in] in fflin's style; save the figure if a path is given."""
     target = None if path is None else as_path(path)
     if target is not None:
         check_ending(target, FORMATS)

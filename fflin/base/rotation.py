@@ -21,13 +21,13 @@ def skew(a: Array) -> Array:
 
 
 def product(a: Array, b: Array) -> Array:
-    """Return a b of matrices (..., i, j) and (..., j, k)."""
+    """Return the matrix product a b for shapes (..., i, j) and (..., j, k)."""
     # `dot` takes half the time of `@` for two small matrices.
     return a.dot(b) if a.ndim == b.ndim == 2 else a @ b
 
 
 def quaternion_product(a: Array, b: Array) -> Array:
-    """Return the Hamilton product a b, (4,) in x, y, z, w, scaled to unit length."""
+    """Return the Hamilton product a b (4,) of quaternions x, y, z, w, scaled to unit length."""
     ax, ay, az, aw = a.tolist()
     bx, by, bz, bw = b.tolist()
     x = aw * bx + ax * bw + ay * bz - az * by

@@ -1,4 +1,4 @@
-"""Checks of arguments, made once at the beginning of a public call, and read-only arrays."""
+"""Checks of arguments, made once when a public function begins, and read-only arrays."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ if TYPE_CHECKING:
 else:
     Array = Complex = Values = np.ndarray  # numpy.typing takes a tenth of the command line's start
 
-# A quaternion or a (cos, sin) pair whose squared length misses 1 by up to this has only been
-# rounded and is renormalised; one that misses it by more is taken for a mistake.
+# A quaternion or a (cos, sin) pair is renormalised if its squared length differs from 1 by at most
+# this, because the difference is rounding error. A larger difference is an error in the input.
 NORM_TOLERANCE = 1e-6
 
-# Native double precision. NumPy has one such object, so that `is` does instead of a comparison.
+# Native double precision. NumPy has only one such object, so `is` can replace a comparison.
 DOUBLE = np.dtype(np.float64)
 
 
 def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
-    """Return a vector (size,) of finite native floats; the same array if it is valid already."""
+    """Return a vector (size,) of finite native floats; a valid array is returned itself."""
     if type(value) is np.ndarray and value.dtype is DOUBLE:
         array: Array = value
     else:
         array = as_double(name, value)
     if array.shape != (size,):
         raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
-    # Python's sum is quicker than NumPy's here, and overflows without a warning.
+    # For short vectors, Python's sum is faster than NumPy's. It overflows without a warning.
     if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
         index = int(np.flatnonzero(~np.isfinite(array))[0])
         raise InputError(f"{name}[{index}] is {array[index]}; every entry must be finite")
@@ -69,7 +69,7 @@ def number(name: str, value: Any) -> float:
     return result
 
 
-def positive(name: str, value: Any, unit: str = "", hint: str = "") -> float:
+def positive(name: str, value: object, unit: str = "", hint: str = "") -> float:
     """Return a number above 0, or raise `InputError`."""
     found = number(name, value)
     if found <= 0.0:
@@ -78,17 +78,17 @@ def positive(name: str, value: Any, unit: str = "", hint: str = "") -> float:
     return found
 
 
-def share(name: str, value: Any) -> float:
-    """Return a number between 0 and 1, or raise `InputError`."""
+def share(name: str, value: object) -> float:
+    """Return a fraction between 0 and 1, or raise `InputError`."""
     found = number(name, value)
     if not 0.0 < found < 1.0:
         raise InputError(f"{name} is {found:g}, expected a fraction between 0 and 1")
     return found
 
 
-def refuse_masked(name: str, value: Any) -> None:
+def refuse_masked(name: str, value: object) -> None:
     """Raise `InputError` if an entry is masked, because NumPy may ignore the mask."""
-    ma: Any = sys.modules.get("numpy.ma")  # what is masked has loaded it
+    ma: Any = sys.modules.get("numpy.ma")  # a masked array exists only if this is loaded
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
 
@@ -100,12 +100,12 @@ def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
     return value
 
 
-def truth(name: str, value: Any) -> bool:
+def truth(name: str, value: object) -> bool:
     """Return whether a switch is on, or raise `InputError` if it is not True or False."""
     return bool(instance(name, value, bool | np.bool_ | int, "True or False"))
 
 
-def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
+def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int:
     """Return a whole number within limits, or raise `InputError` with the given value."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise InputError(f"{name} is {value!r}, expected a whole number of at least {least}")
@@ -115,14 +115,14 @@ def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
     return int(value)
 
 
-def by_name(name: str, value: Any, of_what: str) -> Mapping[str, Any]:
+def by_name(name: str, value: object, of_what: str) -> Mapping[str, Any]:
     """Return a mapping whose keys are names, or raise `InputError`."""
     mapping: Mapping[str, Any] = instance(name, value, Mapping, f"{{{of_what}: value}}")
     return mapping
 
 
-def untied(key: str, value: Any) -> tuple[Any, bool]:
-    """Return a range, and whether one value in it is meant for all that its key names."""
+def untied(key: str, value: object) -> tuple[Any, bool]:
+    """Return a range, and whether all names that its key matches get the same random value."""
     if not isinstance(value, Mapping):
         return value, False
     if value.keys() != {"range", "tied"}:
@@ -130,19 +130,19 @@ def untied(key: str, value: Any) -> tuple[Any, bool]:
     return value["range"], truth(f"tied of '{key}'", value["tied"])
 
 
-def numbers(name: str, value: Any, of_what: str, each: str) -> dict[str, float]:
-    """Return {name: finite float} of a mapping by names; an error calls one of them `each`."""
+def numbers(name: str, value: object, of_what: str, each: str) -> dict[str, float]:
+    """Return {name: finite float} from a mapping; a message calls an entry `each`."""
     values = by_name(name, value, of_what)
     return {key: number(f"{each} '{key}'", entry) for key, entry in values.items()}
 
 
-def dimension(name: str, value: Any) -> int:
+def dimension(name: str, value: object) -> int:
     """Return the number of dimensions of an array, or raise `InputError`."""
     return _as_array(name, value).ndim
 
 
 def placement(name: str, value: Any) -> pin.SE3:
-    """Return a copy of a placement, its rotation normalised if it is valid within 1e-6."""
+    """Return a copy of a placement; its rotation is normalised if it is valid within 1e-6."""
     import pinocchio as pin
 
     instance(name, value, pin.SE3, "a pin.SE3 (placement)")
@@ -154,7 +154,7 @@ def placement(name: str, value: Any) -> pin.SE3:
 
 
 def is_rotation(R: Array) -> bool:
-    """Whether R (3, 3) is a rotation within 1e-6."""
+    """Return whether R (3, 3) is a rotation matrix within 1e-6."""
     skewed = float(np.abs(R.T @ R - np.eye(3)).max())
     return skewed <= NORM_TOLERANCE and float(np.linalg.det(R)) > 0.0
 
@@ -168,7 +168,7 @@ def as_double(name: str, value: ArrayLike) -> Array:
     return array.astype(np.float64)
 
 
-def _as_array(name: str, value: Any) -> Any:
+def _as_array(name: str, value: object) -> Any:
     try:
         return np.asarray(value)
     except ValueError:
@@ -176,7 +176,7 @@ def _as_array(name: str, value: Any) -> Any:
 
 
 class FrozenArrays:
-    """Mixin of frozen dataclasses: makes their arrays read-only, and copies writable ones."""
+    """Mixin for frozen dataclasses: makes arrays read-only, and copies writeable arrays first."""
 
     def __post_init__(self) -> None:
         this: Any = self
@@ -185,8 +185,8 @@ class FrozenArrays:
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 object.__setattr__(self, item.name, frozen(value.copy()))
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        # NumPy makes arrays anew, and writeable, for deepcopy and most of pickle's protocols.
+    def __setstate__(self, state: dict[str, object]) -> None:
+        # deepcopy and most pickle protocols create new writeable arrays, so they are frozen again.
         for value in state.values():
             if isinstance(value, np.ndarray):
                 frozen(value)
@@ -194,6 +194,6 @@ class FrozenArrays:
 
 
 def frozen(array: Array) -> Array:
-    """Return the array itself, read-only."""
+    """Make an array read-only and return it."""
     array.setflags(write=False)
     return array

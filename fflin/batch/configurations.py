@@ -1,4 +1,4 @@
-"""Sets of configurations: given, on a grid, or random, generated on demand."""
+"""Sets of configurations: a given array, a grid, or random rows generated on demand."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# Random rows are drawn in blocks of this size, each with a seed of its own, so that a row does not
-# depend on the chunk that it is read in.
+# Random rows are drawn in blocks of this size, each with its own seed. A row therefore does not
+# depend on the chunk in which it is read.
 _DRAWN = 4096
 
-# Range of a joint that turns without limits [rad].
+# Range of a revolute joint without limits [rad].
 _TURN = (-math.pi, math.pi)
 
 
@@ -40,10 +40,10 @@ class Grid:
     ----------
     robot : Robot
     axes : mapping
-        {joint: values (k,) [rad|m]}.
+        Values of each varied joint, {joint: values (k,) [rad|m]}.
     start : ndarray (nq,)
-        Configuration with the base pose, and with the values of the joints that the grid does not
-        vary.
+        Configuration that contains the base pose and the positions of the joints that the grid does
+        not vary.
 
     Examples
     --------
@@ -59,7 +59,7 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of values of each joint."""
+        """Number of values of each joint in `axes`."""
         return tuple(len(values) for values in self.axes.values())
 
     def __len__(self) -> int:
@@ -84,9 +84,9 @@ class RandomConfigurations:
     count, seed : int
         Number of configurations, and seed of the draws.
     ranges : mapping
-        {joint: (low, high) [rad|m]}.
+        Range of each joint, {joint: (low, high) [rad|m]}.
     start : ndarray (nq,)
-        Configuration with the base pose.
+        Configuration that contains the base pose; random values replace its joint positions.
 
     Examples
     --------
@@ -120,7 +120,7 @@ class RandomConfigurations:
 
 @dataclass(frozen=True, eq=False)
 class GivenConfigurations:
-    """An array of valid configurations (N, nq)."""
+    """Array (N, nq) of valid configurations."""
 
     q: Array
 
@@ -132,7 +132,7 @@ class GivenConfigurations:
         return self.q[start:stop]
 
 
-# What `sweep` takes in place of an array: rows that are made when they are asked for.
+# Configurations that `sweep` accepts instead of an array; their rows are generated on demand.
 Configurations: TypeAlias = Grid | RandomConfigurations | GivenConfigurations
 
 
@@ -149,7 +149,8 @@ def grid(
     ----------
     robot : Robot
     axes : mapping
-        {joint: increasing values (k,) [rad|m]}. The last joint varies fastest.
+        Values of each varied joint in increasing order, {joint: values (k,) [rad|m]}. The last
+        joint varies fastest.
     joints, base : optional
         Values of the other joints and pose of the base, as in `configuration`.
 
@@ -173,7 +174,7 @@ def grid(
     """
     start = configuration(robot, joints, base)
     if not isinstance(axes, Mapping) or not axes:
-        raise InputError(f"the axes of the grid are {axes!r}, expected {{joint: values}}")
+        raise InputError(f"the axes of the grid are {axes!r}, expected a mapping {{joint: values}}")
     checked: dict[str, Array] = {}
     for name, values in axes.items():
         robot.joint(name)
@@ -214,10 +215,10 @@ def random_configurations(
     count : int
         Number of configurations.
     seed : int
-        The same seed gives the same configurations.
+        Random seed. The same seed gives the same configurations.
     ranges : mapping, optional
-        {joint or pattern: (low, high) [rad|m]} instead of the joint limits. Revolute joints
-        without limits are drawn from one full turn.
+        Ranges {joint or pattern: (low, high) [rad|m]} that replace the joint limits. The angle of a
+        revolute joint with neither limits nor a range is drawn from one full turn.
     base : pin.SE3, optional
         Pose of the base; the identity by default.
 
@@ -230,8 +231,8 @@ def random_configurations(
     UnknownNameError
         If a joint does not exist.
     InputError
-        If the count or seed is not a whole number, a range is empty, or a prismatic joint has no
-        limits and no range is given.
+        If the count or seed is not a whole number, a range is empty, or a prismatic joint has
+        neither limits nor a range.
 
     Examples
     --------
@@ -243,7 +244,7 @@ def random_configurations(
     count, seed = whole("count", count, 1), whole("seed", seed, 0)
     start = configuration(robot, base=base)
     if not (ranges is None or isinstance(ranges, Mapping)):
-        raise InputError(f"ranges is {ranges!r}, expected {{joint: (low, high)}}")
+        raise InputError(f"ranges is {ranges!r}, expected a mapping {{joint: (low, high)}}")
     names = robot.joint_names
     given = joints_by_name("joint", ranges or {}, names, lambda name: robot.joint(name).name)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
@@ -252,13 +253,13 @@ def random_configurations(
 
 
 def as_configurations(robot: Robot, q: ArrayLike | Configurations) -> Configurations:
-    """Return the points that `sweep` is given as rows of this robot."""
+    """Return the points of a sweep as configurations of this robot."""
     instance("robot", robot, Robot, "a fflin.Robot")
     if isinstance(q, GivenConfigurations):  # checked already
         return q
     if not isinstance(q, Grid | RandomConfigurations):
         return GivenConfigurations(checked_configurations(robot, q))
-    # The same robot with other inputs or outputs will do.
+    # The robot may have other inputs or outputs, but its joints must be the same.
     if q.robot.joints != robot.joints:
         raise InputError(
             f"q was made for '{q.robot.name}', whose joints differ from the joints of "
@@ -268,7 +269,7 @@ def as_configurations(robot: Robot, q: ArrayLike | Configurations) -> Configurat
 
 
 def content(configurations: Configurations) -> dict[str, Any]:
-    """Return what all rows are made of, by names in their order."""
+    """Return all values that determine the rows, by name and in order."""
     values = {item.name: getattr(configurations, item.name) for item in fields(configurations)}
     of_joints = values.pop("axes", None) or values.pop("ranges", {})
     values.pop("robot", None)
@@ -287,7 +288,9 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
         if not low <= high:
             raise InputError(f"{what} is {low:g} to {high:g}, expected low <= high")
         if math.isinf(high - low):
-            raise InputError(f"{what} is {low:g} to {high:g}, its width overflows; narrow it")
+            raise InputError(
+                f"{what} is {low:g} to {high:g}, and its width overflows; give a narrower range"
+            )
         return low, high
     if joint.unbounded:
         return _TURN
@@ -304,7 +307,7 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
 
 
 def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Any]) -> Array:
-    """Return rows (count, nq) that differ from `start` in the joints that are named."""
+    """Return copies (count, nq) of `start` with other values of the named joints."""
     q = np.tile(start, (count, 1))
     for name, column in values.items():
         robot.joint(name).place(q.T, column)

@@ -15,7 +15,8 @@ from fflin.base.validation import Array, instance, vector
 from fflin.batch.files import is_constant
 from fflin.batch.linear_batch import LinearBatch
 from fflin.batch.rows import column, positions
-from fflin.control.lqr import lqr
+from fflin.control.lqr import lqr, near_boundary
+from fflin.control.optimal.riccati import half_size
 from fflin.control.policies import Feedback
 from fflin.control.weights import weight
 from fflin.linear.fit import line_up
@@ -24,18 +25,6 @@ from fflin.linear.model import LinearModel
 if TYPE_CHECKING:
     from fflin.control.weights import Weight
     from fflin.robot.robot import Robot
-
-# Models whose gains are computed at once, which bounds the memory of their eigenproblems.
-_BLOCK = 256
-
-# Largest relative residual of a Riccati equation; a gain beyond it is computed by `lqr` instead.
-_SOUND = 1e-11
-
-# Newton steps that refine P, in the coordinates of the closed loop's motions.
-_REFINEMENTS = 2
-
-# Relative size of the odd coefficients, up to which they are rounding errors of zero.
-_ODD = 1e-12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -88,7 +77,7 @@ class GainBatch(Design):
 
     @property
     def grid(self) -> dict[str, Array]:
-        """Axes of the grid: {joint: values [rad|m]}, for the joints that vary.
+        """Axes of the grid as {joint: values [rad|m]}; only joints that vary are included.
 
         Raises
         ------
@@ -105,8 +94,8 @@ class GainBatch(Design):
         Raises
         ------
         InputError
-            If the positions are not n finite numbers, or the points are not on a grid or are all
-            the same.
+            If `joints` does not contain n finite numbers, or if the points of the batch are all the
+            same or not on a grid.
         """
         return self._between(vector("joints", joints, len(self.joint_names), "the joint positions"))
 
@@ -124,13 +113,15 @@ class GainBatch(Design):
         axes = {name: np.unique(column) for name, column in columns.items() if np.ptp(column) > 0.0}
         if not axes:
             raise InputError(
-                "all points of the batch are the same, expected a grid; make one with fflin.grid"
+                "all points of the batch are the same, expected a grid; make the points with "
+                "fflin.grid"
             )
         points = np.unique(self.joint_positions, axis=0)
         if not len(points) == len(self) == np.prod([len(values) for values in axes.values()]):
             raise InputError(
-                f"the {len(self)} points are not on a grid over {', '.join(axes)}, which "
-                "interpolation needs; make the points with fflin.grid"
+                f"interpolation needs all points of a grid over {', '.join(axes)}, but the "
+                f"{len(self)} points of the batch are not a full grid; make the points with "
+                "fflin.grid"
             )
         return axes
 
@@ -138,7 +129,7 @@ class GainBatch(Design):
     def _interpolator(self) -> Any:
         from scipy.interpolate import RegularGridInterpolator
 
-        # On a whole grid, points in the order of their joint positions have the last vary fastest.
+        # If the rows of a full grid are sorted by joint positions, the last joint varies fastest.
         order = np.lexsort(self.joint_positions.T[::-1])
         shape = [len(values) for values in self._axes.values()]
         K = self.K[order].reshape(*shape, *self.K.shape[1:])
@@ -148,15 +139,9 @@ class GainBatch(Design):
 def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     r"""Return the linear quadratic regulator about every point of a batch.
 
-    For fully actuated models at rest, many gains are computed together:
-
-    1. With L the lower half of B, factorise :math:`L R^{-1} L^T = L_s L_s^T`. The factor defines
-       coordinates :math:`(p, \dot p)` in which the weight on :math:`\ddot p` is the identity.
-    2. Solve an eigenproblem of half the Hamiltonian's size (see `lqr`) for the poles and modes of
-       the closed loop. Inputs u and states x of the modes give :math:`K = -u\,x^{-1}`.
-    3. Refine each solution by Newton's method, and compute the residual of its Riccati equation.
-
-    `lqr` computes the gains of all other models, and recomputes gains whose residual is too large.
+    Each gain is computed by the method of `lqr`. For fully actuated models at rest, the computation
+    takes half the time of a call of `lqr` per point, because no model and no `Gain` are created for
+    the point.
 
     Parameters
     ----------
@@ -190,18 +175,17 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     R = weight("R", R, input_keys(batch), definite=True)
     nv, nu = batch.B_lower.shape[1:]
     K: Array = np.empty((len(batch), nu, 2 * nv))
-    residual, margin = np.full((2, len(batch)), np.inf)
+    residual, margin = np.empty((2, len(batch)))
+    # At rest, every state is regulated and the point is an equilibrium.
     at_rest = is_constant(batch.A) and is_constant(batch.f0) and not batch.f0[0].any()
-    if at_rest and nu >= nv:
-        rates = batch.A[0][:nv, nv:].diagonal()
-        for start in range(0, len(batch), _BLOCK):
-            rows = slice(start, start + _BLOCK)
-            with np.errstate(all="ignore"):
-                K[rows], residual[rows], margin[rows] = _gains_at_rest(
-                    rates, batch.B_lower[rows], Q, R
-                )
-    # NaN compares false, so that it is among them.
-    for index in np.flatnonzero(~(residual <= _SOUND)).tolist():
+    direct = at_rest and nu >= nv
+    for index, L in enumerate(batch.B_lower):
+        B = np.concatenate((np.zeros_like(L), L))
+        found = half_size(batch.A[0], B, Q, R) if direct else None
+        if found is not None and not near_boundary(found.poles, 0.0):
+            K[index], residual[index] = found.K, found.residual
+            margin[index] = -found.poles.real.max()
+            continue
         try:
             gain = lqr(batch[index], Q, R)
         except FflinError as error:
@@ -221,71 +205,6 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     )
 
 
-def _gains_at_rest(rates: Array, L: Array, Q: Array, R: Array) -> tuple[Array, Array, Array]:
-    """Return K, residuals and margins of a block; what it cannot do has a NaN residual."""
-    count, m, nu = L.shape
-    nothing = np.full((count, nu, 2 * m), np.nan), *np.full((2, count), np.nan)
-    factor = np.linalg.cholesky(R)
-    white = np.linalg.solve(factor, np.swapaxes(L, 1, 2))
-    # L R^-1 L' = Ls Ls', without squaring its condition; R^-1 L' Ls^-T takes p'' to u.
-    unit, upper = np.linalg.qr(white)
-    Ls = np.swapaxes(upper, 1, 2)
-    drive = np.linalg.solve(factor.T, unit)
-    T = np.zeros((count, 2 * m, 2 * m))
-    T[:, :m, :m], T[:, m:, m:] = rates[:, None] * Ls, Ls
-    cost = np.swapaxes(T, 1, 2) @ Q @ T
-    S, D, mixed = cost[:, :m, :m], cost[:, m:, m:], cost[:, :m, m:]
-    odd = np.abs(mixed - np.swapaxes(mixed, 1, 2)).max(axis=(1, 2))
-    try:
-        G = np.linalg.cholesky(S)
-        C = np.zeros((count, 2 * m, 2 * m))
-        C[:, :m, m:], C[:, m:, :m], C[:, m:, m:] = np.swapaxes(G, 1, 2), -G, D
-        squares, motions = np.linalg.eig(C)
-        poles = -np.sqrt(squares.astype(complex))
-        a = motions[:, m:] * np.ones(1, dtype=complex)
-        motions = T @ np.concatenate((a / squares[:, None], a / poles[:, None]), axis=1)
-        inverse = np.linalg.inv(motions)
-    except np.linalg.LinAlgError:
-        return nothing
-    # K x = -u of the motions.
-    P = _cost_to_go(rates, L, Q, R, -(drive @ (a @ inverse).real))
-    for _ in range(_REFINEMENTS):
-        left, _ = _riccati(rates, L, Q, R, P)
-        turned = np.swapaxes(motions, 1, 2) @ left @ motions
-        turned /= -(poles[:, :, None] + poles[:, None])
-        P = P + (np.swapaxes(inverse, 1, 2) @ turned @ inverse).real
-    left, scale = _riccati(rates, L, Q, R, P)
-    residual = np.linalg.norm(left, axis=(1, 2)) / scale
-    residual[odd > _ODD * np.abs(cost).max(axis=(1, 2))] = np.nan
-    K = np.linalg.solve(R, np.swapaxes(L, 1, 2) @ P[:, m:])
-    # The squares of the poles that K was made from lose the digits of slow ones beside fast ones.
-    moved = np.concatenate((rates[:, None] * motions[:, m:], -L @ (K @ motions)), axis=1)
-    poles = np.einsum("nij,nji->ni", inverse, moved)
-    return K, residual, -poles.real.max(axis=1)
-
-
-def _cost_to_go(rates: Array, L: Array, Q: Array, R: Array, K: Array) -> Array:
-    """Return the P (count, nx, nx) of optimal gains."""
-    m = len(rates)
-    lower = np.linalg.pinv(np.swapaxes(L, 1, 2)) @ (R @ K)
-    spent = np.swapaxes(K, 1, 2) @ R @ K
-    upper = (spent[:, :m, m:] - Q[:m, m:]) / rates
-    across = np.swapaxes(lower[:, :, :m], 1, 2)
-    P: Array = np.concatenate((np.concatenate((upper, across), axis=2), lower), axis=1)
-    return 0.5 * (P + np.swapaxes(P, 1, 2))
-
-
-def _riccati(rates: Array, L: Array, Q: Array, R: Array, P: Array) -> tuple[Array, Array]:
-    """Return ``Q + A'P + P A - P B R^-1 B'P`` and the sum of the norms of its terms."""
-    m = len(rates)
-    PA = np.zeros_like(P)
-    PA[:, :, m:] = P[:, :, :m] * rates
-    BP = np.swapaxes(L, 1, 2) @ P[:, m:]
-    spent = np.swapaxes(BP, 1, 2) @ np.linalg.solve(R, BP)
-    scale = np.linalg.norm(Q) + sum(np.linalg.norm(term, axis=(1, 2)) for term in (PA, PA, spent))
-    return Q + PA + np.swapaxes(PA, 1, 2) - spent, scale
-
-
 @dataclass(eq=False)
 class ScheduledFeedback(Feedback):
     """Gain-scheduled feedback ``u = u0 - K(q_m) (x - x0)``, interpolated over a grid.
@@ -293,15 +212,17 @@ class ScheduledFeedback(Feedback):
     Parameters
     ----------
     lin : LinearModel
-        Model about the target.
+        Linear model about the target state.
     gains : GainBatch
         Gains of the same robot, on a grid of its joint positions. If the robot has captured or
-        released an object since the gains were designed, `line_up` matches states and inputs.
+        released an object since the gains were designed, `line_up` matches the states and inputs of
+        `gains` with those of `lin`.
 
     Raises
     ------
     InputError
-        If states and inputs cannot be matched, or the gains are not on a grid.
+        If the states and inputs of `gains` and `lin` cannot be matched, or the gains are not on a
+        grid.
 
     Examples
     --------

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
 
-# Position and quaternion of a free-flyer joint that stands at the robot's root.
+# Position and quaternion of a free-flyer joint at the robot's root frame.
 AT_ROOT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
-# Two joint values are the same where they differ by no more than this [rad|m].
+# Joint values that differ by at most this count as equal [rad|m].
 _SAME = 1e-9
 
 
@@ -37,9 +37,10 @@ class LinearBatch(FrozenArrays):
     r"""Batch of linear models ``dx/dt = f0 + A (x - x0) + B (u - u0)``, made by `sweep`.
 
     ``batch[i]`` is the `LinearModel` about point i. ``batch[2:9]`` and ``batch[mask]`` are smaller
-    batches. Every array has N rows. An array that is the same at all points, such as A at rest, is
-    stored once (its stride over the points is zero). The upper half of B is zero and is not
-    stored. Arrays are read-only. Arrays of a batch in an HDF5 file are read on demand.
+    batches. All arrays have N rows and are read-only. If an array is the same at all points, such
+    as A at rest, it is stored once, and its stride over the points is zero. The upper half of B is
+    always zero, so it is not stored. If the batch is in an HDF5 file, its arrays are read on
+    demand.
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class LinearBatch(FrozenArrays):
     u0 : ndarray (N, nu)
     q : ndarray (N, nq)
     v : ndarray (N, nv)
-        The points in Pinocchio's order.
+        Configurations q and velocities v of the points, in Pinocchio's order.
     state_names, input_names, output_names : tuple of str
     state_units, input_units, output_units : tuple of str
     frame : str
@@ -65,9 +66,9 @@ class LinearBatch(FrozenArrays):
     locked : tuple of str
         Names of the locked joints.
     columns : tuple of (int, int, float)
-        Indices of each joint's entries in q: (index, -1) for one angle or length, or the indices
-        of cos and sin for a continuous joint. The third number is the entry of q per unit of q_m;
-        it differs from 1 only for modal amplitudes.
+        Two indices into q and a factor for each joint. The indices are (index, -1) for a joint with
+        one angle or length, and the indices of cos and sin for a continuous joint. The factor is
+        the entry of q divided by the entry of q_m; it differs from 1 only for modal amplitudes.
     verified : bool
         Whether the data are known to be unchanged. The value is False for a file without a
         checksum, or if the checksum was not verified.
@@ -104,14 +105,14 @@ class LinearBatch(FrozenArrays):
     fflin_version: str
     pinocchio_version: str
     columns: tuple[Column, ...]
-    # None where x0 follows from q, at rest, and where y0 is x0, since the outputs are the state.
+    # None if x0 follows from q (at rest), or if y0 is x0 (the outputs are the state).
     _x0: Array | None
     _y0: Array | None
-    # None where it is the base's own placement, which q gives in the frame that _root places.
+    # None if the reference is the base's own placement, which follows from q and _root.
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Fields of the models that the robot computes, by name.
+    # Model fields that need the robot to be computed, by name.
     _asked: Mapping[str, Any]
     verified: bool = True
 
@@ -133,7 +134,7 @@ class LinearBatch(FrozenArrays):
     @overload
     def __getitem__(self, index: slice | Sequence[int] | Array) -> LinearBatch: ...
 
-    def __getitem__(self, index: Any) -> LinearModel | LinearBatch:
+    def __getitem__(self, index: object) -> LinearModel | LinearBatch:
         if isinstance(index, int | np.integer):
             if not -len(self) <= index < len(self):
                 raise IndexError(f"index is {index}, but the batch has {len(self)} points")
@@ -189,7 +190,7 @@ class LinearBatch(FrozenArrays):
     def nearest(self, joints: Mapping[str, float]) -> LinearModel:
         """Return the model nearest to the given joint values [rad|m].
 
-        Joints that are not named are ignored.
+        The distance ignores joints that are not named.
 
         Raises
         ------
@@ -237,7 +238,7 @@ class LinearBatch(FrozenArrays):
         Parameters
         ----------
         path : str or Path
-            File ending in .npz or .h5. An HDF5 file can later be read even if it does not fit in
+            Path that ends in .npz or .h5. An HDF5 file can later be read even if it does not fit in
             memory.
 
         Raises
@@ -262,8 +263,8 @@ class LinearBatch(FrozenArrays):
             The robot of the batch. Without `robot`, the models have no inertia M and no
             certificate.
         verify : bool
-            Whether to verify the SHA-256 checksums, which reads all rows. If False, an HDF5 file
-            opens at once, and the batch is not `verified`.
+            Whether to verify the SHA-256 checksums, for which all rows must be read. If False, an
+            HDF5 file opens immediately, but `verified` is False in the result.
 
         Raises
         ------
@@ -296,7 +297,7 @@ class LinearBatch(FrozenArrays):
         if own != (found["urdf_sha256"], found["locked"], _joints(found["state_names"]), n):
             raise InputError(
                 f"robot '{robot.name}' differs from the robot '{found['robot']}' of the batch in "
-                "its URDF, joints or orbit; give the robot that the batch was made of"
+                "its URDF, joints or orbit; give the robot for which the batch was made"
             )
         from fflin.linear.linearization import prepare
 
@@ -304,12 +305,12 @@ class LinearBatch(FrozenArrays):
         return LinearBatch(**found, _asked=fields_of_model(common), verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
-        """Return the arrays that vary or may vary between the points, by name."""
+        """Return all arrays with one row per point, by name."""
         held = {key: getattr(self, key) for key in (*_ARRAYS, *_OPTIONAL_ARRAYS)}
         return {key: value for key, value in held.items() if value is not None}
 
     def header(self, count: int) -> dict[str, str]:
-        """Return the header of a file with a given number of points, as one JSON document."""
+        """Return the header for a file with `count` points, as one JSON document."""
         first = self[0]
         header = {key: getattr(self, key) for key in _TEXTS}
         header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}
@@ -318,7 +319,7 @@ class LinearBatch(FrozenArrays):
     def _model(self, index: int) -> LinearModel:
         common: dict[str, Any] = dict.fromkeys(_MODEL)  # None unless it is set below
         common |= {key: getattr(self, key) for key in (*_TEXTS, "verified")}
-        # A row of a file is read here, so that no model keeps the file open.
+        # The row is read from the file here, so that no model keeps the file open.
         rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
         lower, root = rows.pop("B_lower"), rows.pop("_root")
         rows["B"] = frozen(np.concatenate((np.zeros_like(lower), lower)))
@@ -336,15 +337,15 @@ class LinearBatch(FrozenArrays):
         x0[:, 6 : 6 + q_m.shape[1]] = q_m
         return frozen(x0)
 
-    def _named(self, joints: Mapping[str, Any]) -> dict[int, Any]:
+    def _named(self, joints: Mapping[str, object]) -> dict[int, Any]:
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
         require_known("joint", joints, self.joint_names)
         return {self.joint_names.index(name): value for name, value in joints.items()}
 
 
-# The fields of a batch by kind, in their order: texts are the same at all points and stand in the
-# header of a file, arrays have one row per point.
+# Names of a batch's fields by kind, in order. _TEXTS are the same at all points and are stored in
+# the header of a file. Arrays have one row per point.
 _KINDS = {item.name: str(item.type) for item in fields(LinearBatch)}
 _MODEL = {item.name for item in fields(LinearModel)} - {"verified"}
 _ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array"]
@@ -352,8 +353,8 @@ _OPTIONAL_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array | None
 _TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
 
 
-def fields_of_model(common: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields that are the same for all models and that a batch does not have."""
+def fields_of_model(common: Mapping[str, object]) -> dict[str, Any]:
+    """Return the fields that are the same for all models and are not fields of a batch."""
     return {key: value for key, value in common.items() if key not in _KINDS}
 
 
@@ -380,7 +381,7 @@ def _checked_fields(
     shapes = {"A": (nx, nx), "B_lower": (nx // 2, nu), "C": (ny, nx), "D": (ny, nu), "f0": (nx,)}
     for key, shape in shapes.items():
         if found[key].shape[1:] != shape:
-            raise ValueError(f"{key} has shape {found[key].shape[1:]} a point, expected {shape}")
+            raise ValueError(f"{key} has shape {found[key].shape[1:]} per point, expected {shape}")
     return found
 
 
@@ -390,13 +391,13 @@ def _joints(state_names: Sequence[str]) -> tuple[str, ...]:
 
 def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:
     raise InputError(
-        f"the {what} is not in the file and is computed from the robot; load the batch with "
-        f"LinearBatch.load(path, robot), with the unchanged robot '{name}'"
+        f"the {what} is computed from the robot, which the file does not contain; load the batch "
+        f"with LinearBatch.load(path, robot), where robot is the unchanged '{name}'"
     )
 
 
 def _in_world(root: Array, base: Array) -> Array:
-    """Return the placement (7,) in the world of a base that is placed (7,) in the root's frame."""
+    """Return the world placement (7,) of a base from its placement (7,) in the root's frame."""
     import pinocchio as pin
 
     if (root == AT_ROOT).all():

@@ -81,31 +81,37 @@ def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> lis
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Campaign(FrozenArrays):
-    """Result of a Monte Carlo campaign with N runs, as `monte_carlo` returns it.
+    """Result of a Monte Carlo campaign of N runs, which `monte_carlo` returns.
 
-    Statistics and conditions refer to the figures of a run by these names:
+    A figure is a number that describes one run. Statistics and conditions use figures by these
+    names:
 
     - ``attitude`` [deg], ``position`` [m], ``joints``, ``omega_b``, ``v_b`` and ``joint rates``:
-      final error in these states. The names before the colon are the
-      kinds of error.
-    - The name of a state or input: final value of this signal, with sign.
-    - ``worst NAME``: largest value over the whole run, or largest error if NAME is a state.
+      final error in the states of this kind. These six names are the kinds of error, each called
+      KIND below.
+    - The name of a state or input: final value of this signal, including its sign.
+    - ``worst NAME``: largest magnitude during the run: of the error if NAME is a kind or a state,
+      of the command if NAME is an input.
     - ``settle KIND`` [s]: settling time, after which the error of this kind stays within 2 % of its
-      largest value. ``settle`` [s]: the longest of these settling times.
+      largest value. ``settle`` [s]: the longest settling time of the kinds that the policy
+      controls.
     - ``end`` [s]: end of the run.
     - ``drawn NAME``: value drawn for the dispersed parameter NAME.
 
-    The error of a kind is the largest deviation of its states from the target. Without a target,
-    the error is the largest deviation from the initial state. A run that was stopped early
-    violates every bound: its errors, worst values and settling times are infinite, and all
-    conditions are false.
+    The error in ``attitude`` is the angle of the rotation from the target attitude. The error of
+    any other kind is the largest deviation of its states from the target. If there is no target,
+    the initial state replaces the target. A run that was stopped early counts as a violation of
+    every bound: its errors, worst values and settling times are infinite, and it meets no
+    condition.
 
     Attributes
     ----------
     drawn : ndarray (N, k)
-        Dispersed values, with the names `names` (k,).
+        Values drawn for the k dispersed parameters; `names` (k,) contains the names of the
+        parameters.
     q, v, x, u : ndarray (N, ..)
-        Final values; for a run that diverged, the last finite values.
+        Final configuration, velocity, state and inputs; for a run that diverged, the last finite
+        values.
     largest_x, largest_u : ndarray (N, nx), (N, nu)
         Largest magnitudes of the state errors and the inputs, up to the end of each run.
     errors, largest, settle : ndarray (N, 6)
@@ -114,15 +120,15 @@ class Campaign(FrozenArrays):
     times : tuple of float
         Times [s] of the histories; empty unless `monte_carlo` was called with `histories`.
     error_history, input_history : ndarray (N, M, 6), (N, M, nu)
-        Errors of each kind, and commands, at the `times`. After a run is stopped, its errors are
-        infinite and its commands are zero.
+        Errors of each kind, and commanded inputs, at the `times`. After a run is stopped, its
+        errors are infinite and its commands are zero.
     stop, end : ndarray (N,)
         Outcome (0 completed, 1 diverged, 2 left the chart, 3 stopped for another reason) and end
         time [s] of each run.
     asked : int
         Requested number of runs. N is smaller if the condition `until` ended the campaign early.
     goals : tuple of str
-        Conditions whose success rates appear in the report and the figure.
+        Conditions whose success rates appear in the printed report and in `plot_campaign`.
 
     Examples
     --------
@@ -188,8 +194,8 @@ class Campaign(FrozenArrays):
     def about(self) -> str:
         """Default figure of `worst` and `sensitivity`.
 
-        The default is the figure in the first comparison ``<`` or ``<=`` of the goals. If no goal
-        contains such a comparison, the default is ``worst KIND``. KIND is the first of
+        The default is the figure that the goals first compare by ``<`` or ``<=``. If no goal
+        contains such a comparison, the default is ``worst KIND``, where KIND is the first of
         ``attitude``, ``position``, ``joints``, ... that the policy controls.
         """
         bounded = [each.name for each in self.bounds if each.sign[0] == "<"]
@@ -197,7 +203,7 @@ class Campaign(FrozenArrays):
 
     @property
     def bounds(self) -> list[Bound]:
-        """Comparisons in the goals, each of a figure with a number."""
+        """All comparisons of a figure with a number in the goals."""
         return [each for goal in self.goals for each in bounds_of(goal, self.figure)]
 
     def values(self, name: str) -> Array:
@@ -237,15 +243,15 @@ class Campaign(FrozenArrays):
     def _beyond(self, sizes: Array) -> Array:
         return np.where(self.stopped[:, None], np.inf, sizes)
 
-    def met(self, condition: Any) -> Any:
+    def met(self, condition: object) -> Any:
         """Return a mask (N,) of the runs that meet a condition.
 
         Parameters
         ----------
         condition : str or array_like of bool (N,)
-            Text ``NAME < NUMBER UNIT`` with <, <=, > or >=; ``and`` joins several comparisons. If
-            UNIT is omitted, NUMBER is in the unit of the figure. A run that was stopped early never
-            meets a condition given as text.
+            Text such as ``NAME < NUMBER UNIT``; the other operators are <=, > and >=, and ``and``
+            joins several comparisons. If UNIT is omitted, NUMBER is in the unit of the figure. A
+            run that was stopped early never meets a condition given as text.
         """
         if not isinstance(condition, str):
             found = np.asarray(condition if isinstance(condition, np.ndarray | list) else None)
@@ -260,7 +266,7 @@ class Campaign(FrozenArrays):
             met = met & bound.met
         return met
 
-    def fraction(self, condition: Any, *, confidence: float = 0.95) -> Estimate:
+    def fraction(self, condition: object, *, confidence: float = 0.95) -> Estimate:
         """Return the fraction of runs that meet a condition, with its Clopper-Pearson interval."""
         met, sure = int(self.met(condition).sum()), share("confidence", confidence)
         return intervals.clopper_pearson(met, len(self), sure)
@@ -268,8 +274,8 @@ class Campaign(FrozenArrays):
     def quantile(self, name: str, p: float, *, confidence: float = 0.95) -> Estimate:
         """Return the p-quantile of a figure over the runs, with its confidence interval.
 
-        The interval is computed from order statistics and is valid for any distribution. Quantiles
-        of final states and inputs, which have a sign, include only the completed runs.
+        The interval is computed from order statistics and is valid for any distribution. For final
+        states and inputs, which can have either sign, only the completed runs are included.
         """
         values = self.values(name)
         if name in (*self.state_names, *self.input_names):
@@ -282,7 +288,8 @@ class Campaign(FrozenArrays):
         Raises
         ------
         InputError
-            If the figure is infinite in a completed run, as a settling time can be.
+            If the figure is infinite in a completed run. For example, the settling time is infinite
+            if the error has not settled.
         """
         values = self.values(name)[~self.stopped]
         if endless := int(np.isinf(values).sum()):
@@ -293,10 +300,10 @@ class Campaign(FrozenArrays):
         return intervals.mean(values, share("confidence", confidence))
 
     def worst(self, k: int = 5, name: str | None = None) -> list[int]:
-        """Return the indices of the k runs with the largest values of a figure.
+        """Return the indices of the k runs in which a figure, such as ``attitude``, is largest.
 
-        The default figure is `about`. Runs that were stopped early come first, sorted by their
-        end times.
+        The default figure is `about`. Runs that were stopped early come first, the earliest stop
+        before the others.
         """
         order = np.lexsort(
             (-self.values(name or self.about), np.where(self.stopped, self.end, np.inf))
@@ -306,10 +313,11 @@ class Campaign(FrozenArrays):
     def sensitivity(self, name: str | None = None) -> dict[str, float]:
         """Return Spearman's rank correlations {name: value} between dispersed values and a figure.
 
-        The correlation with the largest magnitude comes first. The name ``|NAME|`` means the
-        correlation with the distance of the value from its median. This correlation is returned
-        if its magnitude is larger, as for a figure that grows with an initial error of either
-        sign. The default figure is `about`.
+        The correlation with the largest magnitude comes first. For each dispersed parameter, the
+        figure is correlated with the drawn value, and with the distance of the drawn value from its
+        median. The correlation with the larger magnitude is returned: under the key ``NAME`` for
+        the value, or ``|NAME|`` for the distance. For example, the distance is more informative for
+        a figure that grows with an initial error of either sign. The default figure is `about`.
         """
         figure = self.values(name or self.about)
         apart = np.abs(self.drawn - np.median(self.drawn, axis=0))
@@ -324,8 +332,9 @@ class Campaign(FrozenArrays):
     def replay(self, run: int) -> Motion:
         """Simulate a run of the campaign again, and return its motion.
 
-        q, v and u equal the original run bit for bit. x is computed from q and v by other code,
-        and agrees to machine precision, except for full turns of continuous joints.
+        In the returned motion, q, v and u equal the original run bit for bit. The state x is
+        computed from q and v by different code. It therefore agrees only to machine precision, and
+        the angles of continuous joints may differ by full turns.
 
         Raises
         ------
@@ -347,9 +356,9 @@ class Campaign(FrozenArrays):
         """Save the campaign to a .npz, .h5, .csv or .mat file, atomically.
 
         A .csv or .mat file is a table of figures for other programs, with one row for each run;
-        `load` cannot read this table. The columns have the names of the figures with units, such
-        as ``worst tau_b.x [N m]``. A .mat file contains `columns`, the names, and `runs`, the
-        values.
+        `load` cannot read this table. The columns have the names of the figures with units, such as
+        ``worst tau_b.x [N m]``. In a .mat file, the variable `columns` contains the names, and the
+        variable `runs` contains the values.
         """
         target = as_path(path)
         if target.suffix in (".csv", ".mat"):
@@ -401,7 +410,7 @@ class Campaign(FrozenArrays):
 
     @classmethod
     def of(cls, arrays: Mapping[str, Array], header: Any, job: Any = None) -> Campaign:
-        """Return a campaign from its header and arrays, without rows of missing runs."""
+        """Return a campaign from its header and arrays; rows of missing runs are left out."""
         run = np.asarray(arrays["stop"]) != NOT_RUN
         values: dict[str, Any] = {
             key: arrays[key] if run.all() else arrays[key][run] for key in _ARRAYS

@@ -27,12 +27,11 @@ from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, loads_of
 from fflin.robot.equipment.appendage_bodies import first_impossible
 from fflin.robot.joints import ROOT
-from fflin.robot.mass_properties import Piece, varied, with_changed
+from fflin.robot.mass_properties import Piece, bodies_named, varied, with_changed
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
-from fflin.uncertainty.parameters import bodies_named
 
 _BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
@@ -52,14 +51,13 @@ class Column(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """Drawn values (N, k) of some runs, and the numbers of these runs (N,)."""
+    """Drawn values (N, k) of some runs."""
 
     drawn: Array
-    run: Array
 
     def part(self, start: int, stop: int) -> Draws:
         """Return the runs from `start` up to `stop`."""
-        return Draws(self.drawn[start:stop], self.run[start:stop])
+        return Draws(self.drawn[start:stop])
 
 
 class Bound(NamedTuple):
@@ -73,7 +71,7 @@ class Dispersions:
     """Dispersions of `monte_carlo`: draws, and the robots and initial states that they give."""
 
     def __init__(
-        self, given: Any, plant: Plant, policy: Any, x0: Array, seed: int, times: Times
+        self, given: object, plant: Plant, policy: object, x0: Array, seed: int, times: Times
     ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
@@ -107,8 +105,9 @@ class Dispersions:
             own, tied = untied(str(key), spread)
             if kind == "fails" and isinstance(own, int | float):
                 raise InputError(
-                    f"'{key}' is {own:g}, a standard deviation, which does not describe a time of "
-                    "failure; give (least, largest) in s, a list of times in s or a distribution"
+                    f"'{key}' is {own:g}, a standard deviation, but a time of failure needs "
+                    "another description; give (least, largest) in s, a list of times in s or a "
+                    "distribution"
                 )
             inverse = deviation_of if kind == "noise" else inverse_of
             spreads = by_kind.setdefault(kind, {})
@@ -134,7 +133,7 @@ class Dispersions:
             one, two = pieces[at], pieces[of]
             if at == of or (one.joint == two.joint and (one.whole or two.whole)):
                 names = f"'{self.names[column]}' and '{self.names[other]}'"
-                raise InputError(f"{names} disperse the same mass; disperse only one of the two")
+                raise InputError(f"{names} disperse the same mass; disperse only one of them")
 
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:
@@ -145,8 +144,8 @@ class Dispersions:
             )
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
-                f"{kind} is dispersed, but this policy is continuous, and only a sampled policy "
-                f"has a {kind}; give sample=, a multiple of dt (--sample on the command line)"
+                f"{kind} is dispersed, but the policy is continuous, and {kind} applies only to "
+                "a sampled policy; give sample=, a multiple of dt (--sample on the command line)"
             )
         label = dict(zip(names, names, strict=True))
         try:
@@ -178,7 +177,7 @@ class Dispersions:
                 self.columns.append(Column(name, kind, where, inverse))
 
     def _by_piece(
-        self, kind: str, spreads: Mapping[str, Any]
+        self, kind: str, spreads: Mapping[str, object]
     ) -> tuple[dict[str, Any], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: name} where it is named alone."""
         robot, found, named = self._plant.robot, dict[str, Any](), dict[str, str]()
@@ -187,7 +186,7 @@ class Dispersions:
             for name in bodies_named(robot, f"{kind} to disperse", key):
                 if name in named:
                     raise InputError(
-                        f"'{named[name]}' and '{key}' are one link; give its {kind} only once"
+                        f"'{named[name]}' and '{key}' are the same link; give its {kind} only once"
                     )
                 found[name] = spreads[key]
                 named |= {name: key} if key in alone else {}
@@ -213,7 +212,7 @@ class Dispersions:
                 low, high = max(start, first), min(stop, first + _BLOCK)
                 values = self._drawn(column, first // _BLOCK, high - first)
                 drawn[low - start : high - start, at] = values[low - first : high - first]
-        return Draws(drawn, np.arange(start, stop, dtype=float))
+        return Draws(drawn)
 
     def _uniform(self, column: Column, block: int) -> Array:
         key = (self._seed, zlib.crc32(column.name.encode()))
@@ -235,7 +234,8 @@ class Dispersions:
                 kept = np.asarray(column.inverse(uniform[:count]), dtype=float)
             except Exception as error:  # each distribution has its own
                 raise InputError(
-                    f"the distribution of '{column.name}' cannot be drawn: {reason(error)}"
+                    f"no values can be drawn from the distribution of '{column.name}': "
+                    f"{reason(error)}"
                 ) from None
             self._kept[column.name, block] = kept
         return kept
@@ -260,14 +260,18 @@ class Dispersions:
             except ChartError as error:
                 said = f"an invalid initial attitude is drawn in the runs from {start} on"
                 raise InputError(f"{said}: {error}; use a smaller dispersion") from None
-            appendages = self._plant.robot.appendages
-            refused = first_impossible(self._model, appendages, self.bodies(drawn))
-            if refused is not None:
-                try:
-                    self.one(drawn[refused])
-                except InputError as error:
-                    said = f"run {start + refused} draws an invalid mass or inertia"
-                    raise InputError(f"{said}: {error}; use a smaller dispersion") from None
+            if appendages := self._plant.robot.appendages:
+                self._require_realisable(appendages, drawn, start)
+
+    def _require_realisable(self, appendages: Any, drawn: Array, start: int) -> None:
+        """Raise `InputError` if a body cannot have the participation of its modes."""
+        refused = first_impossible(self._model, appendages, self.bodies(drawn))
+        if refused is not None:
+            try:
+                self.one(drawn[refused])
+            except InputError as error:
+                said = f"run {start + refused} draws an invalid mass or inertia"
+                raise InputError(f"{said}: {error}; use a smaller dispersion") from None
 
     def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
         """Return the draws (N, size, axes) of a kind; zero if not dispersed."""
@@ -318,7 +322,10 @@ class Dispersions:
             return _OF_SPRINGS
         return tuple(kind for kind in _OF_SPRINGS if kind in self._kinds)
 
-    def _faults(self, drawn: Array) -> ActuatorFaults:
+    def _faults(self, drawn: Array) -> ActuatorFaults | None:
+        """Return the faults of the inputs in each run (N,), or None if none is dispersed."""
+        if not self._kinds & {*_OF_INPUTS, "misalignment"}:
+            return None
         gain, bias, until = (
             self._of(kind, drawn, len(self._plant.faults.gain))[..., 0] for kind in _OF_INPUTS
         )
@@ -344,7 +351,9 @@ class Dispersions:
     def in_lanes(self, drawn: Array, tree: Tree) -> dict[str, Array]:
         """Return the arrays of the compiled loop that differ from run to run."""
         plant, (q, v) = self._plant, self.starts(drawn)
-        runs = {"q": q, "nu": plant.state.velocities(v), **self._faults(drawn)._asdict()}
+        runs = {"q": q, "nu": plant.state.velocities(v)}
+        if faults := self._faults(drawn):
+            runs |= faults._asdict()
         if self._kinds & {*_OF_BODIES}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (len(drawn), 1, 1))
             for at, body in self.bodies(drawn).items():
@@ -397,9 +406,9 @@ class Dispersions:
                 given = policy
                 policy = Bound(lambda _: bound(given, plant.robot))
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
-        faults = ActuatorFaults(*(x[0] for x in self._faults(rows)))
-        faulty = faults if self._kinds & {*_OF_INPUTS, "misalignment"} else None
-        return Plant(state, plant.disturbance, faulty), policy, q[0], v[0]
+        faults = self._faults(rows)
+        own = None if faults is None else ActuatorFaults(*(x[0] for x in faults))
+        return Plant(state, plant.disturbance, own), policy, q[0], v[0]
 
 
 def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: float) -> Any:

@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -32,10 +32,10 @@ from fflin.base.writing import as_path
 from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
-from fflin.campaign.statistics import KINDS, kind_named
+from fflin.campaign.statistics import EDGE, KINDS, kind_named
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
-from fflin.dynamics.coordinates import moved_by, moving_error, moving_errors, unwound
+from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.points import point_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.trajectory import Trajectory
@@ -47,9 +47,9 @@ _ROUNDING = 1e-12  # eigenvalues of P, relative to the largest, that count as ze
 
 # Number of starts tried at a level in the search for the largest one, and of its halvings.
 _PILOTS, _HALVINGS = 16, 40
-# Attitude error [deg] at which a run counts as stopped, and the largest attitude error [deg], joint
-# error [rad] and position or sliding joint error [m] of a start.
-_EDGE, _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 176.0, 170.0, np.pi, 1e3
+# The largest attitude error [deg], joint error [rad] and position or sliding joint error [m] of a
+# start.
+_LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
 
 
 def ellipsoid_axes(P: Array) -> Array:
@@ -69,36 +69,38 @@ def ellipsoid_axes(P: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Funnel(Design):
-    """Ellipsoids ``e' P(t) e <= rho`` of errors relative to a trajectory; prints as a table.
+    """Ellipsoids ``e' P(t) e <= rho`` of errors around a trajectory; ``print`` shows a table.
 
-    The definition of errors is in `linearize_trajectory`; P is the cost to go of the schedule.
-    Errors in the null space of P are not tested.
+    The error e relative to the trajectory is defined in `linearize_trajectory`. P(t) is the
+    cost-to-go matrix of the gain schedule, and ``e' P e`` is the level of an error. Errors in the
+    null space of P are not tested, because they do not change the level.
 
     Attributes
     ----------
     t : ndarray (m,)
         Times [s] of the knots.
     tried : ndarray (m,)
-        Largest level rho of the tested initial errors. The square roots of the levels of all tested
-        errors are evenly spread.
+        Largest level of the tested initial errors. The square roots of the tested levels are evenly
+        spaced.
     outcomes : ndarray (m, N)
-        Outcome of each run, sorted by ascending level: 0 goal reached, 1 stopped early, 2 bounds
-        `within` exceeded, 3 goal missed.
+        Outcome of each run, in ascending order of the level of the initial error: 0 if the goal was
+        reached, 1 if the run was stopped early, 2 if the bounds `within` were exceeded, 3 if the
+        goal was missed.
     rho : ndarray (m,)
-        Level up to which every run succeeded.
+        Level up to which every run reached the goal; the size of the ellipsoid at the knot.
     inside : ndarray (m,)
         Number of runs that start at or below the level `rho`.
     inside_rate : ndarray (m,)
         Lower bound, at confidence level `confidence`, on the success rate of runs that start at or
         below the level `rho`.
     rate : ndarray (m, 2)
-        Clopper-Pearson interval of the success rate of all runs. All runs start at or below the
-        level `tried`.
+        Clopper-Pearson interval of the success rate of all runs, which start at or below the level
+        `tried`.
     attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
         Half-axes of the ellipsoids in base attitude [deg], base position [m] and each joint
         [rad|m].
     goal, within : str
-        Bounds on the final errors of a run, and on its errors at any time.
+        Bounds on the final errors of a run (`goal`) and on its errors at any time (`within`).
     confidence : float
         Confidence level of the intervals.
     at, P : ndarray (M,), (M, nx, nx)
@@ -158,7 +160,7 @@ class Funnel(Design):
 
     @cached_property
     def rho(self) -> Array:
-        """Largest level (m,) up to which every run succeeded."""
+        """Largest level (m,) up to which every run reached the goal."""
         count = self.outcomes.shape[1]
         level: Array = self.tried * ((self.inside - 0.5).clip(min=0.0) / count) ** 2
         return level
@@ -206,7 +208,7 @@ class Funnel(Design):
         return P
 
     def root(self, t: float) -> Array:
-        """Return W (nx, nx): the ellipsoid at time t is the set of all W z with norm(z) <= 1."""
+        """Return W (nx, nx), which maps norm(z) <= 1 to the ellipsoid e = W z at time t."""
         size = np.sqrt(self.level(t))
         return size * ellipsoid_axes(self.cost(t))
 
@@ -236,13 +238,19 @@ class Funnel(Design):
 
     def __str__(self) -> str:
         count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
-        head = f"{self.robot.name}: errors from which every run ends with {self.goal}"
-        head += f", and on the way {self.within}" * bool(self.within) + f"; {count} runs per knot"
+        head = f"{self.robot.name}: initial errors from which every run ends with {self.goal}"
+        head += (
+            f", and with {self.within} at all times" * bool(self.within)
+            + f"; {count} runs per knot"
+        )
         tail = [
-            "base, joint: largest half-axes",
-            "runs: number of starts inside, all of which succeeded (+: all starts that were tried)",
-            f"inside: lower bound of the success rate of starts inside ({sure} confidence)",
-            "tried: interval of the success rate of starts up to the largest level that was tried",
+            "base, joint: largest half-axes of the ellipsoid of initial errors",
+            "runs: number of runs that start inside the ellipsoid, all of which succeeded (+: "
+            "all runs start inside)",
+            f"inside: lower bound of the success rate of runs that start inside ({sure} "
+            "confidence)",
+            "tried: confidence interval of the success rate of runs that start up to the largest "
+            "level tried",
         ]
         rows = [["t [s]", "rho", "base [deg]", "base [m]", "joint", "runs", "inside", "tried"]]
         wide = (self.attitude, self.position, self.joints)
@@ -255,7 +263,7 @@ class Funnel(Design):
 
     @classmethod
     def load(cls, path: str | Path, robot: Robot) -> Funnel:  # type: ignore[override]
-        """Read a funnel of a robot from a file that `save` wrote; raises as `Gain.load`."""
+        """Read a funnel of a robot from a file that `save` wrote; see `Gain.load` for errors."""
         return cls._read(as_path(path), robot=robot)
 
 
@@ -279,16 +287,16 @@ def funnel(
     threads: int | None = None,
     progress: Progress | None = None,
     engine: str | None = None,
-    **options: Any,
+    **options: object,
 ) -> Funnel:
     r"""Estimate the initial errors from which a trajectory tracking loop reaches a goal.
 
-    At each knot, errors are drawn from an ellipsoid :math:`e^T P(t)\,e \le \rho` of the schedule's
-    cost to go. The directions of the errors are uniformly distributed, and the square roots of
-    the levels are evenly spaced. The nonlinear robot is simulated from each error to the end of
-    the trajectory. The largest level tried is the level at which about one run in sixteen fails,
-    or at which the attitude error reaches 170 deg. The result is a statistical estimate, not a
-    proof.
+    At each knot, initial errors e are drawn from an ellipsoid :math:`e^T P(t)\,e \le \rho`, where P
+    is the cost-to-go matrix of the schedule. The directions of the errors are uniformly
+    distributed. The square roots of their levels :math:`e^T P e` are evenly spaced. The nonlinear
+    robot is simulated from each error to the end of the trajectory. The largest level tested is
+    either the level at which about one run in sixteen fails, or the level at which the attitude
+    error reaches 170 deg, whichever is smaller. The result is a statistical estimate, not a proof.
 
     Parameters
     ----------
@@ -296,13 +304,14 @@ def funnel(
     schedule : GainSchedule or TrajectoryFeedback
         Schedule designed by `tvlqr`, continuous or sampled.
     goal : mapping or float
-        {"attitude" [deg], "position" [m], "joints" [rad|m], "omega_b" [rad/s], "v_b" [m/s],
-        "joint rates" [rad/s|m/s]: largest final error}, with the kinds of error of `Campaign`.
-        A number is the largest final value of ``e' P e``.
+        Bounds on the final errors, {"attitude" [deg], "position" [m], "joints" [rad|m],
+        "omega_b" [rad/s], "v_b" [m/s], "joint rates" [rad/s|m/s]: largest final error}, with the
+        kinds of error of `Campaign`. If `goal` is a number, it bounds the final value of
+        ``e' P e``.
     within : mapping, optional
         Largest errors allowed at any time of a run, as a mapping with the same keys as `goal`.
     knots : int or sequence of float
-        Number of knots to test, or times [s]. The knot nearest to each time is tested.
+        Number of knots to test, or a list of times [s]. For each time, the nearest knot is tested.
     samples : int
         Number of runs from each knot.
     seed : int
@@ -325,11 +334,11 @@ def funnel(
     Raises
     ------
     InputError
-        If a size or value is wrong, or no time of the schedule is a knot of the trajectory.
+        If a size or value is wrong, or the schedule and the trajectory have no knot in common.
     UnknownNameError
         If a kind of error or an option is unknown.
     FflinError
-        If a worker process died.
+        If a worker process dies.
 
     References
     ----------
@@ -359,42 +368,26 @@ def funnel(
             raise unknown("option of funnel", name, list(_OPTIONS))
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)
-    if isinstance(goal, Mapping):
-        final = _bounds("goal", goal, KINDS)
-        goal_text = _shown(final)
-    else:
-        final = _bounds("goal", {"level": goal}, ["level"])
-        goal_text = f"e' P e up to {final['level']:g}"
+    by_level = not isinstance(goal, Mapping)
+    final = _bounds("goal", {"level": goal} if by_level else goal, ["level"] if by_level else KINDS)
     limits = _bounds("within", {} if within is None else within, KINDS)
     check_workers(executor, workers, threads, None, progress)
     motion, by = feedback.trajectory, feedback.schedule
-    indices = _indices(motion, by, knots)
-    jobs = [runs_from(robot, feedback, *pair, options) for pair in indices]
+    reached, indices = Goal(final, limits, by.P[-1]), _indices(motion, by, knots)
+    jobs = [runs_from(robot, feedback, *pair, options, reached) for pair in indices]
     for job in jobs:
         job.choose(engine)
     tried, outcomes = np.empty(len(jobs)), np.empty((len(jobs), samples))
     with executor_of(executor, workers) as others:
-        how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
-            P, axes = by.P[first], ellipsoid_axes(by.P[first])
+            starts = Starts(job.x0, by.P[first], ellipsoid_axes(by.P[first]), rng)
 
-            def simulate(
-                roots: Array,
-                job: CampaignJob = job,
-                P: Array = P,
-                axes: Array = axes,
-                rng: np.random.Generator = rng,
-            ) -> Array:
-                """Return the outcomes of runs from random errors at roots (N,) of the levels."""
-                e = rng.normal(size=(len(roots), len(P))) @ axes.T
-                # Directions in which P is zero do not count.
-                e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
-                x = moved_by("local", np.tile(job.x0, (len(e), 1)), e)
-                starts = Draws(x - job.x0, np.arange(len(e), dtype=float))
-                return _judged(job, completed(job, starts.part, len(e), **how), final, limits, by)
+            def simulate(roots: Array, job: CampaignJob = job, starts: Starts = starts) -> Array:
+                rows = Draws(starts.drawn(roots)).part
+                return completed(job, rows, len(roots), others, workers, threads)["outcome"]
 
-            root = _largest_root(simulate, _widest(axes, robot))
+            root = _largest_root(simulate, _widest(starts.axes, robot))
             tried[knot] = root**2
             outcomes[knot] = simulate(root * (np.arange(samples) + 0.5) / samples)
             if progress:
@@ -404,7 +397,7 @@ def funnel(
         t=np.array([motion.t[k] for k, _ in indices]),
         tried=tried,
         outcomes=outcomes,
-        goal=goal_text,
+        goal=f"e' P e up to {final['level']:g}" if by_level else _shown(final),
         within=_shown(limits),
         confidence=confidence,
         at=by.t - by.t[0] + motion.t[0],
@@ -414,23 +407,69 @@ def funnel(
     )
 
 
-def runs_from(
-    robot: Robot, feedback: TrajectoryFeedback, k: int, first: int, options: Mapping[str, Any]
-) -> CampaignJob:
-    """Return the runs from knot k of the trajectory, which is time `first` of the schedule.
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """Judge of the runs of a funnel: largest final errors or level, and largest errors before."""
 
-    The drawn values of a run are the deviation of its initial state from the knot's.
-    """
+    FIELDS: ClassVar[tuple[str, ...]] = ("outcome",)  # as `Funnel.outcomes` has it
+    over: ClassVar[None] = None
+
+    final: Mapping[str, float]
+    within: Mapping[str, float]
+    P: Array  # (nx, nx), of the final level
+
+    def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
+        """Return the outcomes of runs."""
+        e = runs["state_errors"][:, -1]
+        largest, final = (
+            dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors")
+        )
+        final["level"] = ((e @ self.P) * e).sum(axis=1)
+        stopped = (runs["stop"] != 0.0) | (largest["attitude"] > EDGE)
+        failures = [stopped, _beyond(largest, self.within), _beyond(final, self.final)]
+        return {"outcome": np.select(failures, [1.0, 2.0, 3.0])}
+
+
+def _beyond(sizes: Mapping[str, Array], bounds: Mapping[str, float]) -> Array:
+    """Return the mask (N,) of the runs that exceed a bound."""
+    beyond: Array = ~np.all([sizes[key] <= bound for key, bound in bounds.items()], axis=0)
+    return beyond
+
+
+class Starts(NamedTuple):
+    """Random errors about a state at a knot."""
+
+    center: Array  # (nx,)
+    P: Array  # (nx, nx), of the level
+    axes: Array  # W of `ellipsoid_axes`
+    rng: np.random.Generator
+
+    def drawn(self, roots: Array) -> Array:
+        """Return the deviations (N, nx) of random errors at roots (N,) of the levels."""
+        e = self.rng.normal(size=(len(roots), len(self.P))) @ self.axes.T
+        # Directions in which P is zero do not count.
+        e *= (roots / np.sqrt(((e @ self.P) * e).sum(axis=1)))[:, None]
+        return moved_by("local", np.tile(self.center, (len(e), 1)), e) - self.center
+
+
+def runs_from(
+    robot: Robot,
+    feedback: TrajectoryFeedback,
+    k: int,
+    first: int,
+    options: Mapping[str, Any],
+    judge: Goal | None = None,
+) -> CampaignJob:
+    """Return the runs from knot k of the trajectory, which is time `first` of the schedule."""
     motion, schedule = feedback.trajectory, feedback.schedule
     rest = {name: getattr(motion, name)[k:] for name in ("t", "q", "v", "u")}
     later = {name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")}
     policy = replace(
         feedback, trajectory=replace(motion, **rest), schedule=replace(schedule, **later)
     )
-    deviations = dict.fromkeys(StateMap(robot).names, 0.0)
-    # The chart is centred at the knot, whose attitude may be any.
-    options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), **options}
-    return CampaignJob(robot, policy, deviations, 0, "python", options)
+    # The chart is centred at the knot, whose attitude may be any; histories are of both ends.
+    options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), "histories": 2, **options}
+    return CampaignJob(robot, policy, None, 0, "python", options, judge)
 
 
 def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
@@ -444,29 +483,6 @@ def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
         root /= 2.0
     further = root < widest and not simulate(np.full(_PILOTS, 1.4 * root)).any()
     return min(root * (2.0 if further else 1.4), widest)
-
-
-def _judged(
-    job: CampaignJob,
-    ended: Mapping[str, Array],
-    goal: Mapping[str, float],
-    within: Mapping[str, float],
-    schedule: GainSchedule,
-) -> Array:
-    """Return the outcomes of runs, as `Funnel.outcomes` has them."""
-
-    def exceeded(sizes: Array, bounds: Mapping[str, float]) -> Any:
-        columns = [list(KINDS).index(kind) for kind in bounds]
-        return ~(sizes[:, columns] <= np.array([*bounds.values()])).all(axis=1)
-
-    if "level" in goal:
-        e = moving_errors("local", ended["x"], job.target[-1:])
-        unwound(job.plant.state, e)
-        missed = ~((e @ schedule.P[-1] * e).sum(axis=1) <= goal["level"])
-    else:
-        missed = exceeded(ended["errors"], goal)
-    stopped = (ended["stop"] != 0.0) | exceeded(ended["largest"], {"attitude": _EDGE})
-    return np.select([stopped, exceeded(ended["largest"], within), missed], [1.0, 2.0, 3.0])
 
 
 def _bounds(name: str, given: Any, kinds: Iterable[str]) -> dict[str, float]:
@@ -499,7 +515,8 @@ def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int
     both = both[both < len(t) - 1]
     if not len(both):
         raise InputError(
-            "no time of the schedule is a knot of the trajectory; design it on this trajectory"
+            "no time of the schedule is a knot of the trajectory; design the schedule on this "
+            "trajectory"
         )
     if dimension("knots", knots) == 0:
         chosen = both[np.linspace(0, len(both) - 1, whole("knots", knots, 1)).round().astype(int)]

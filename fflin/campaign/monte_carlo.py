@@ -49,7 +49,7 @@ _OPTIONS = {each.name for each in fields(SimulationOptions)} - {
 
 def monte_carlo(
     robot: Robot,
-    policy: Any,
+    policy: object,
     dispersions: Mapping[str, Any],
     *,
     runs: int,
@@ -68,13 +68,13 @@ def monte_carlo(
     out: str | Path | None = None,
     overwrite: bool = False,
     engine: str | None = None,
-    **options: Any,
+    **options: object,
 ) -> Campaign:
     r"""Run a Monte Carlo campaign: simulate a policy many times with dispersed parameters.
 
-    Each run is a call of `simulate`. With numba the compiled loop computes eight runs at a time.
-    A record of fixed size is kept for each run. `Campaign.replay` simulates any run again in
-    full.
+    Each run is equivalent to one call of `simulate`. If numba is installed, the compiled loop
+    computes eight runs at a time. To save memory, only a summary of fixed size is stored for each
+    run; `Campaign.replay` simulates a run again and returns its full motion.
 
     Parameters
     ----------
@@ -82,43 +82,48 @@ def monte_carlo(
     policy : policy, GainSchedule or None
         Policy as in `simulate`.
     dispersions : mapping
-        {name, group or pattern: spread}, or the dispersions that `load_dispersions` read. A spread
-        is one of
+        Mapping {name, group or pattern: spread}, or the result of `load_dispersions`. A spread is
+        one of
 
         - a number: the standard deviation of a normal distribution about 0;
         - a tuple (least, largest): a uniform distribution;
         - a list of values, all equally likely;
         - a frozen distribution of scipy.stats.
 
-        Each name in a pattern or group is drawn independently. With ``{"range": spread, "tied":
-        True}``, all names of a pattern or group have the same draw. A name is one of
+        A value is drawn independently for each name in a pattern or group. With
+        ``{"range": spread, "tied": True}``, all names of a pattern or group share one drawn value.
+        A name is one of
 
-        - a state, ``q_b``, ``r_b.x``, ``q_m.*``, ``omega_b``: the drawn value is added to the
-          initial state.
-        - ``LINK.mass``, ``LINK.density``: relative change d of a parameter of `sensitivity` and
-          `uncertain`. A draw of ``mass`` multiplies the mass by (1 + d) at constant inertia about
-          the centre of mass. A draw of ``density`` multiplies mass and inertia by (1 + d).
+        - a state, or a group or pattern of states, such as ``r_b.x``, ``q_b``, ``omega_b`` or
+          ``q_m.*``: the drawn value is added to the initial state.
+        - ``LINK.mass``, ``LINK.density``: relative change d of the mass or density of a link, as in
+          `sensitivity` and `uncertain`. A draw of ``mass`` multiplies the mass by (1 + d) at
+          constant inertia about the centre of mass. A draw of ``density`` multiplies mass and
+          inertia by (1 + d).
         - ``LINK.com`` [m]: shift of the centre of mass along each axis of the link. Mass and
           inertia about the centre of mass are unchanged, as for ``LINK.com.x`` in `sensitivity`
           and `uncertain`.
-        - ``LINK.inertia``: the second moments of the mass distribution along the axes of the link's
-          frame are multiplied by (1 + d), with an independent d for each axis, as in
-          `Robot.perturbed`. The mass is unchanged. The pseudo-inertia stays positive definite.
+        - ``LINK.inertia``: relative changes d of the second moments of the mass distribution along
+          the axes of the link's frame, drawn independently for each axis, as in `Robot.perturbed`.
+          The moments are multiplied by (1 + d) and the mass is unchanged, so the pseudo-inertia
+          stays positive definite.
 
-          LINK is the name of a link in the URDF. The name of a joint, or ``base``, means the
-          whole body that the joint carries, with all links fixed to it. A pattern selects links.
+          LINK is the name of a link in the URDF. The name of a joint, or ``base``, means the whole
+          body that the joint carries: its link and all links fixed to this link. A pattern selects
+          links only.
         - ``INPUT.gain`` (relative change d) and ``INPUT.bias`` (b, in N m or N): the actual input
-          is (1 + d) u + b for a command u. ``INPUT.fails`` [s]: time from which the input is
-          zero. The recorded
-          inputs are the commands, even after a failure.
-        - ``INPUT.misalignment`` [rad]: rotates the direction of a thruster, the axis of a wheel, or
-          an axis of tau_b or F_b about two perpendicular axes. Each angle is drawn independently.
-        - ``NAME.sensor``: offset of a state that a `StateFeedback` reads, or of an output that an
-          `OutputFeedback`, `LinearController` or `TrajectoryOutputFeedback` measures.
-          ``NAME.noise``: white noise added at each sample. A number is the standard deviation of
-          the noise. Any other spread draws the standard deviation of the noise of each run.
-        - ``delay`` [s]: change of the `delay` of `simulate`. The total delay is rounded to whole
-          steps; a negative total becomes 0.
+          is (1 + d) u + b for a command u. ``INPUT.fails`` [s]: time of a failure after which the
+          input is zero. The recorded inputs are the commands, even after a failure.
+        - ``INPUT.misalignment`` [rad]: two independently drawn angles. The direction of a thruster,
+          the axis of a wheel, or an axis of tau_b or F_b is rotated by these angles about two axes
+          perpendicular to it.
+        - ``NAME.sensor``: constant offset in the measurement of a state that a `StateFeedback`
+          reads, or of an output that an `OutputFeedback`, `LinearController` or
+          `TrajectoryOutputFeedback` measures. ``NAME.noise``: white noise added to this measurement
+          at each sample. If the spread is a number, it is the standard deviation of the noise in
+          all runs. From any other spread, a standard deviation is drawn for each run.
+        - ``delay`` [s]: change of the argument `delay` of `simulate`. The total delay is rounded to
+          whole steps; a negative total becomes 0.
         - ``JOINT.stiffness`` and ``JOINT.damping``: relative changes from the nominal values.
         - ``MODE.frequency`` and ``MODE.damping`` of flexible appendages and slosh: relative changes
           of the frequency and of the damping ratio.
@@ -127,20 +132,20 @@ def monte_carlo(
     duration : float, optional
         Simulated time [s]; by default the duration of the followed trajectory.
     seed : int
-        Random seed. The same seed gives the same draws, independent of the number of runs, workers
-        and chunks, and of other dispersions.
+        Random seed. The draws of a parameter depend only on the seed, not on the number of runs,
+        workers and chunks or on other dispersed parameters.
     goals : sequence of str, optional
-        Conditions such as ``"attitude < 1 deg"``, see `Campaign.fraction`. The report and the
-        figure show the success rate of each goal and its interval.
+        Conditions such as ``"attitude < 1 deg"``, see `Campaign.fraction`. The printed report and
+        `plot_campaign` show the success rate of each goal with its confidence interval.
     until : str, optional
-        Condition that stops the campaign early, when the confidence interval of its success rate
-        is at most `width` wide. The interval is checked after 256 runs, and whenever the number
-        of runs has grown by a quarter.
+        Condition for ending the campaign early. The campaign ends when the confidence interval of
+        the condition's success rate is at most `width` wide. The interval is checked after 256
+        runs, and again whenever the number of runs has grown by a quarter.
     width, confidence : float
         Width and confidence level of the interval for `until`. The report uses the same
         confidence level.
     executor, workers, threads, progress : optional
-        As in `sweep`. The workers of an executor must be able to import the policy's modules.
+        As in `sweep`. The workers of an executor must be able to import the modules of the policy.
     chunk : int, optional
         Number of runs per chunk: a multiple of 8, and a divisor of 256 if `until` is given.
     histories : int, optional
@@ -149,13 +154,14 @@ def monte_carlo(
     out : str or Path, optional
         File to write, .h5 or .npz. The unfinished results of a .h5 file are kept in NAME.part.
         After a crash, the same call resumes from the intact chunks in NAME.part. If the file
-        already contains all of these runs, the file is read, even if its goals differ.
+        already contains all of these runs, it is read and nothing is simulated, even if its goals
+        differ.
     overwrite : bool
-        Whether to replace the file `out` if a different call wrote the file. By default, such a
-        file is an error.
+        Whether to replace the file `out` if a call with different arguments wrote it. By default,
+        such a file is not replaced, and a `FileError` is raised.
     engine : {"python", "compiled"}, optional
-        Engine that runs the loop. The default is the compiled engine if it supports these runs,
-        see `simulate`.
+        Engine that simulates the runs. The default is the compiled engine if it supports these
+        runs, see `simulate`.
     **options
         Options of `simulate`: x0, q0, v0, dt, method, project, sample, delay, limits, disturbance,
         target, frame, reference.
@@ -163,19 +169,21 @@ def monte_carlo(
     Returns
     -------
     Campaign
-        Runs in their order. If `out` is given, arrays are read from the file on demand.
+        Results in the order of the runs. If `out` is given, arrays are read from the file on
+        demand.
 
     Raises
     ------
     InputError
-        If a size or value is wrong, or the robot of a draw is not valid; the message names the
-        draw.
+        If a size or value is wrong, or the drawn values lead to an invalid robot. The message names
+        the draw.
     UnknownNameError
         If a name is unknown.
     SweepError
         If a run fails or a worker dies; the message names the chunk.
     FileError
-        If the file cannot be written, or exists already and belongs to another call.
+        If the file cannot be written, or if a call with different arguments wrote it and
+        `overwrite` is False.
     MissingPackageError
         If a .h5 file is requested and h5py is not installed.
 
@@ -249,7 +257,7 @@ def monte_carlo(
     return replace(Campaign.load(store.path), _job=job)
 
 
-def _goals(given: Any, until: Any, shapes: Any, header: dict[str, Any]) -> list[str]:
+def _goals(given: object, until: object, shapes: Any, header: dict[str, Any]) -> list[str]:
     """Return the goals; an invalid goal is refused before any run."""
     goals = [given] if isinstance(given, str) else given
     if not isinstance(goals, list | tuple):
@@ -290,8 +298,8 @@ def _earlier(path: Path, request: str) -> Campaign | None:
         if read_rows(path, verify=False)[2].get("request") == request:
             return Campaign.load(path)
     raise FileError(
-        f"{path} exists, and this call did not make it; name another file, or replace it with "
-        "overwrite=True (--force)"
+        f"{path} exists and was not written by this call; name another file, or replace the file "
+        "with overwrite=True (--force)"
     )
 
 
@@ -311,7 +319,9 @@ def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
         return chunk_size(min(_STAGE, runs) if staged else runs, workers)
     size = -(-given // LANES) * LANES
     if staged and _STAGE % size:
-        raise InputError(f"chunk is {given}, expected a divisor of {_STAGE} with until, such as 32")
+        raise InputError(
+            f"chunk is {given}, but with until it must be a divisor of {_STAGE}, such as 32"
+        )
     return size
 
 

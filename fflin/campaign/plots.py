@@ -40,15 +40,16 @@ _DECADES, _BARS, _BINS = 6, 10, 48
 def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: int = 3) -> Figure:
     """Draw the error histories, final errors, inputs and rank correlations of a campaign.
 
-    The bands contain 100 %, 90 % and 50 % of the runs. The worst runs, ranked by `Campaign.about`,
-    are drawn over the bands. A run that was stopped early ranks as worse than all other runs from
-    its stop on. Dashed lines mark the bounds of the goals and the limits of the inputs. Without
-    histories, the figure shows only the histograms and the correlations.
+    The bands contain 100 %, 90 % and 50 % of the runs. The worst runs, ranked by the figure
+    `Campaign.about`, are drawn over the bands. Once a run has been stopped early, it ranks as worse
+    than all other runs. Dashed lines mark the bounds of the goals and the limits of the inputs. If
+    the campaign has no histories, the figure shows only the histograms and the correlations.
 
     Parameters
     ----------
     campaign : Campaign
-        Campaign to draw; its panels over time need ``histories`` in `monte_carlo`.
+        Campaign to draw. The panels over time are drawn only if `monte_carlo` was called with
+        `histories`.
     path : str or Path, optional
         File to save to: .png, .pdf or .svg.
     worst : int
@@ -99,14 +100,14 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
 
 
 def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
-    """Draw the prediction error of a linear model, and the numbers of runs that settled.
+    """Draw the prediction error of a linear model, and how many runs settled at each level.
 
     Parameters
     ----------
     validity : Validity
         Result of `fflin.validity`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -168,7 +169,7 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
     funnel : Funnel
         Result of `fflin.funnel`.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Examples
     --------
@@ -201,8 +202,8 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
         axes[-1].set(xlabel="t [s]", ylabel="success rate [%]", ylim=(0.0, 102.0))
         figure.legend(loc="outside lower center", ncols=2)
         figure.suptitle(
-            f"{funnel.robot.name}: errors from which every run ends with {funnel.goal}\n"
-            f"half-axes; {percent * funnel.confidence:g} % confidence",
+            f"{funnel.robot.name}: initial errors from which every run ends with "
+            f"{funnel.goal}\nhalf-axes; {percent * funnel.confidence:g} % confidence",
             fontsize=10,
         )
     return figure

@@ -20,7 +20,7 @@ from fflin.robot.robot import Robot
 _ALONG: dict[type[Any], str] = {Thruster: "direction", ReactionWheel: "axis"}
 
 
-def turned(direction: Any, angles: Array) -> Array:
+def turned(direction: object, angles: Array) -> Array:
     """Rotate a direction (3,) by angles (N, 2) [rad] about two perpendicular axes; (N, 3)."""
     first, second, along = turned_to(np.array(direction, dtype=float)).T
     size = np.linalg.norm(angles, axis=1)[:, None]
@@ -34,8 +34,9 @@ def require_direction(robot: Robot, at: int) -> None:
     for item, names, first in _indexed(robot):
         if first <= at < first + len(names) and isinstance(item, JointTorque):
             raise InputError(
-                f"'{names[0]}.misalignment' is dispersed, but a motor acts along its joint's axis; "
-                "only thrusters, wheels, tau_b and F_b can be misaligned"
+                f"'{names[0]}.misalignment' is dispersed, but the motor of a joint cannot be "
+                "misaligned with the joint; only thrusters, wheels, tau_b and F_b can be "
+                "misaligned"
             )
 
 

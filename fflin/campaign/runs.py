@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from copy import copy
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -20,21 +19,30 @@ from fflin.batch.files import MemoryStore
 from fflin.batch.run import ChunkResult, Progress, Rows, run_chunks, worker_count
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.spreads import placed
-from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, outcome_of
+from fflin.campaign.statistics import (
+    KINDS,
+    LOOK,
+    Judge,
+    Outcome,
+    Over,
+    RunStatistics,
+    errors_of,
+    outcome_of,
+)
 from fflin.control.channel import Saturation
 from fflin.dynamics.coordinates import states_of
 from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
-from fflin.simulation.lanes import LaneLoop, Runs, Statistics, engine_of, noises, recorded
+from fflin.simulation.lanes import LaneLoop, Runs, engine_of, noises, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.packing import SLOTS, noise_of, packed
-from fflin.simulation.plan import Plan, SimulationOptions, law_of, planned
+from fflin.simulation.plan import Event, Plan, SimulationOptions, law_of, planned
 from fflin.simulation.plant import Plant, conserved_by
-from fflin.simulation.run import Recording, go, stop_of
+from fflin.simulation.run import Recording, go
 from fflin.simulation.simulate import motion_of
 
-ARRAYS = Outcome._fields
+ARRAYS = Outcome._fields[:-1]  # of the record of a campaign
 _LARGEST_CHUNK = 256
 _FEW_STEPS, _SOME_STEPS = 4, 64  # that are measured to estimate the time of runs
 
@@ -42,7 +50,8 @@ _FEW_STEPS, _SOME_STEPS = 4, 64  # that are measured to estimate the time of run
 class CampaignJob:
     """Runs of one plan, each with its own drawn values; see `batch.run.Job`.
 
-    A `rule` ends each run, and its outcome replaces the statistics of a campaign.
+    Without dispersions the drawn values are the deviations of the initial state. The figures of a
+    `judge`, which may end the runs early, replace the record of a campaign.
     """
 
     def __init__(
@@ -53,11 +62,13 @@ class CampaignJob:
         seed: int,
         engine: str,
         options: Any,
-        rule: Statistics | None = None,
+        judge: Judge | None = None,
     ) -> None:
-        self._arguments: tuple[Any, ...] = (robot, policy, given, seed, engine, options, rule)
-        self.rule, options = rule, dict(options)
-        histories, unlimited = options.pop("histories", 0), options.pop("unlimited", False)
+        self._arguments: tuple[Any, ...] = (robot, policy, given, seed, engine, options, judge)
+        self.judge, options = judge, dict(options)
+        # A judge compares with the start.
+        histories = options.pop("histories", 0 if judge is None else 1)
+        unlimited = options.pop("unlimited", False)
         options = SimulationOptions(linear=False, progress=False, **options)
         self.plan, self.plant = planned(robot, policy, options)
         if unlimited:
@@ -72,6 +83,7 @@ class CampaignJob:
             q, v, _ = map(np.array, zip(*map(reference, t.tolist()), strict=True))
             nu = state.velocities(v)
             self.target, self._path = states_of(state, q, nu), [q.ravel(), nu.ravel()]
+        given = dict.fromkeys(state.names, 0.0) if given is None else given
         with placed(given):
             self.dispersions = Dispersions(
                 given, self.plant, self.plan.policy, self.x0, seed, times
@@ -83,19 +95,23 @@ class CampaignJob:
         # A worker repeats the construction, since functions bound to a robot cannot be sent.
         return _remade, (self._arguments, self.engine)
 
-    def choose(self, engine: Any) -> None:
+    def choose(self, engine: object) -> None:
         """Set the engine of the runs: the requested one, or the faster one that supports them."""
         self.engine = engine_of(engine, self.plan, self.plant, many=True)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of each array of a run's outcome."""
-        if self.rule:
-            return dict.fromkeys(self.rule.FIELDS, ())
+        """Shape of each array that is kept of a run."""
+        if self.judge:
+            return dict.fromkeys(self.judge.FIELDS, ())
+        return {key: self._shapes[key] for key in ARRAYS}
+
+    @property
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
         robot, nx, nu = self.plant.robot, self.plant.state.nx, len(self.plan.initial)
         sizes = [(size,) for size in (robot.nq, robot.nv, nx, nu, nx, nu, *[len(KINDS)] * 3)]
-        histories = [(len(self.steps), size) for size in (len(KINDS), nu)]
-        return dict(zip(ARRAYS, [*sizes, *histories, (), ()], strict=True))
+        *histories, states = [(len(self.steps), size) for size in (len(KINDS), nu, nx)]
+        return dict(zip(Outcome._fields, [*sizes, *histories, (), (), states], strict=True))
 
     def digest(self, first: Draws) -> str:
         """Return a hash of the robot, the policy, the options and the first run.
@@ -112,30 +128,32 @@ class CampaignJob:
 
     def run(self, rows: Draws, start: int, out: Mapping[str, Array] | None = None) -> ChunkResult:
         """Simulate the runs of some rows."""
-        drawn, out = np.asarray(rows.drawn), self._space(len(rows.drawn)) if out is None else out
+        drawn, shapes = np.asarray(rows.drawn), self._shapes if self.judge else self.shapes
+        found: dict[str, Array] = {
+            key: np.empty((len(drawn), *shape)) for key, shape in shapes.items()
+        }
         if self.engine == "compiled":
-            self._fly(drawn, out)
+            self._fly(drawn, found)
         else:
-            for row in range(len(drawn)):
-                for key, values in self._one(drawn[row]).items():
-                    out[key][row] = values[0]
-        return ChunkResult(dict(out), [])
-
-    def _space(self, count: int) -> dict[str, Array]:
-        return {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
+            for row, own in enumerate(drawn):
+                outcome = self._one(own)
+                for key, values in found.items():
+                    values[row] = outcome[key]
+        return ChunkResult(found if self.judge is None else self.judge.figures(found), [])
 
     def _fly(self, drawn: Array, out: Mapping[str, Array]) -> None:
         """Simulate runs (N, k) in compiled code, eight at a time."""
         runs = self._in_lanes(drawn)
         loop = LaneLoop(self.plan, self.plant, runs)
         state, path = self.plant.state, self._path
-        own = RunStatistics(self.plan, state, self.target, self.steps, path)
+        over = self.judge.over if self.judge else None
+        statistics = RunStatistics(self.plan, state, self.target, self.steps, path, over)
         for first in range(0, len(drawn), LANES):
             eight, their_out = (
                 {key: each[first : first + LANES] for key, each in arrays.items()}
                 for arrays in (runs, out)
             )
-            loop.fly(copy(self.rule) or own, their_out, eight)
+            loop.fly(statistics, their_out, eight)
 
     def _in_lanes(self, drawn: Array) -> Runs:
         tree = batch_tree(self.plant.robot)
@@ -152,19 +170,24 @@ class CampaignJob:
     @np.errstate(over="ignore", invalid="ignore")  # a run that diverges overflows
     def _one(self, drawn: Array) -> dict[str, Array]:
         plan, plant = self.plan_of(drawn)
-        if self.rule is None:
-            run = _recorded(plan, plant, every=1)
-            return outcome_of(plan, self.plant.state, self.target, self.steps, run)
-        rule, velocities = copy(self.rule), self.plant.state.velocities
-        rule.reset()
+        if over := self.judge and self.judge.over:
+            plan = replace(plan, events=(self._event(over, plan),))
+        run = _recorded(plan, plant, every=1)
+        return outcome_of(plan, self.plant.state, self.target, self.steps, run)
 
-        def goes_on(t: float, q: Array, v: Array) -> float:
-            rule.add(round(t / plan.times.dt), [each[None, None] for each in (q, velocities(v))])
-            return float(not rule.over[0])
+    def _event(self, over: Over, plan: Plan) -> Event:
+        """Return the event of a stop condition for a run in Python."""
 
-        goes_on(0.0, plan.q, plan.v)
-        run = _recorded(replace(plan, events=(goes_on,)), plant, every=1)
-        return rule.outcome(run.steps, np.array([float(stop_of(run.stopped))]))
+        def errors(q: Array, v: Array) -> Array:
+            return errors_of(self.plant.state, self.target, q[None], v[None])[1]
+
+        first = errors(plan.q, plan.v)
+
+        def stops(t: float, q: Array, v: Array) -> float:
+            looks = round(t / plan.times.dt) % LOOK == 0
+            return float(not (looks and over(first, errors(q, v))[0]))
+
+        return stops
 
     def seconds(self, first: Draws, count: int) -> float:
         """Return the estimated time [s] of runs on one core, from a few steps of the first runs."""
@@ -215,7 +238,7 @@ def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, Any]:
     samples = noises(plan, len(parts.law.y), 0, last)[1] if noise_of(plan) else np.zeros(0)
     found: dict[str, Any] = {"noise": samples}
 
-    def collect(name: str, value: Any) -> None:
+    def collect(name: str, value: object) -> None:
         if isinstance(value, tuple):
             for index, each in enumerate(value):
                 collect(f"{name}.{index}", each)

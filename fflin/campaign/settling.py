@@ -6,7 +6,7 @@ The norm belongs to the Lyapunov function of the linear loop that decays as the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -21,19 +21,17 @@ from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
+from fflin.campaign.statistics import EDGE, Over
 from fflin.control.policies import StateFeedback
-from fflin.dynamics.coordinates import states_of, unwound
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
+from fflin.simulation.run import STOPS
 
 # Ratio of a run's error to its initial error at which it has settled, and has diverged.
 SETTLED, DIVERGED = 1e-3, 1e3
-EDGE = (
-    1e-3  # value of 1 - |q_b|^2, 4 degrees from a rotation of 180, at which a run leaves the chart
-)
 # Duration of a comparison with the prediction in time constants of the slowest pole, and of a
 # random run in times that this pole needs to settle.
 _CONSTANTS, _PATIENCE = 3.0, 3.0
@@ -121,16 +119,9 @@ class Loop:
         x[self.watched] = moved[self.watched]
         return x
 
-    def errors(self, q: Array, nu: Array) -> tuple[Array, Array]:
-        """Return q0^2 (N,) of the base attitude and the deviations (N, nz) from the model's x0."""
-        x, center = states_of(self.state, q, nu), np.zeros(self.state.nx)
-        center[self.watched] = self.lin.x0
-        e = unwound(self.state, x - center)[:, self.watched]
-        return 1.0 - (x[:, :3] ** 2).sum(axis=1), e
-
 
 def settling_runs(
-    loop: Loop, predicts: bool, limits: Any, joint: float, fine: int = 0
+    loop: Loop, predicts: bool, limits: object, joint: float, fine: int = 0
 ) -> CampaignJob:
     """Return runs of a loop from displaced states, until they settle or up to a horizon.
 
@@ -152,18 +143,17 @@ def settling_runs(
             f"1/s: a run would take {horizon / dt:.3g} steps, expected at most "
             f"{_MOST_STEPS:,}; give a gain with poles of more similar speed, or add damping"
         )
-    if not lin.dt:
-        every = max(1, int(horizon / dt / _CHECKS)) if predicts else 4
+    if predicts and not lin.dt:
+        every = max(1, int(horizon / dt / _CHECKS))
     checks, finer = math.ceil(horizon / (dt * every) - 1e-9), _FINER**fine
     dt, every = dt / finer, every * finer
     options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
-    options |= {"limits": limits, "project": not predicts, "every": every}
+    options |= {"limits": limits, "project": not predicts}
     # Without limits no input saturates, and thrusters may pull.
     options |= {"unlimited": limits is None}
-    rule = Settling(loop, every, _transition(loop, dt, every) if predicts else None)
-    deviations = dict.fromkeys(loop.state.names, 0.0)
-    policy = StateFeedback(lin, loop.K)
-    return CampaignJob(loop.robot, policy, deviations, 0, "python", options, rule)
+    options |= {"histories": checks + 1} if predicts else {}
+    judge = Settling(loop, _transition(loop, dt, every) if predicts else None)
+    return CampaignJob(loop.robot, StateFeedback(lin, loop.K), None, 0, "python", options, judge)
 
 
 def _transition(loop: Loop, dt: float, every: int) -> Array:
@@ -179,89 +169,77 @@ def _transition(loop: Loop, dt: float, every: int) -> Array:
     return np.linalg.matrix_power(step, every)
 
 
+@dataclass(frozen=True, eq=False)
 class Settling:
-    """Rule by which runs have settled, and their differences from the linear loop.
+    """Judge of the runs of a loop: whether they settle, and how far they are from the linear loop.
 
-    It is applied every `every` steps. With the transition matrix `step` of the linear loop between
-    these checks, runs go on to their end and are compared with that loop.
+    With the transition matrix `step` of the linear loop from history to history, runs go on to
+    their end and are compared with that loop.
     """
 
     # Index into OUTCOMES, and largest relative prediction error.
     FIELDS: ClassVar[tuple[str, ...]] = ("outcome", "error")
-    every = 1
-    span = 128  # steps between checks of `over`
 
-    def __init__(self, loop: Loop, every: int, step: Array | None) -> None:
-        self._loop, self.checked_every, self._step = loop, every, step
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin with other runs."""
-        self._code, self._worst = np.zeros(1, dtype=int), np.zeros(1)
-        self._next = 0  # first step that has not been added
+    loop: Loop
+    step: Array | None
 
     @property
-    def over(self) -> NDArray[np.bool_]:
-        """Mask of the runs that may end early."""
-        return (self._code > 0) & (self._step is None)
+    def over(self) -> Over | None:
+        """Stop condition of the runs: settled or diverged; None if they are compared."""
+        return self._is_over if self.step is None else None
 
-    def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
-        """Add the rows (steps, count, ..) from step `first` on."""
-        begin, self._next = max(first, self._next), first + len(rows[0])
-        checked = slice(begin - first + -begin % self.checked_every, None, self.checked_every)
-        loop, (q, nu) = self._loop, (each[checked] for each in rows[:2])
-        if not (shape := q.shape[:2])[0]:
-            return
-        square, e = loop.errors(*(each.reshape(-1, each.shape[-1]) for each in (q, nu)))
-        e = e.reshape(*shape, -1)
-        size = loop.size(e)
-        if begin == 0:
-            self._first, self._predicted = size[0], e[0]
-        edge = square.reshape(shape) < EDGE
-        ends = [size <= SETTLED * self._first, edge, ~(size < DIVERGED * self._first)]
-        code = np.select(ends, [1, 2, 3], 0)
-        code = np.take_along_axis(code, (code > 0).argmax(axis=0)[None], axis=0)[0]
-        self._code = np.where(self._code > 0, self._code, code)
-        if self._step is not None:
-            for each in e:
-                self._worst = np.maximum(self._worst, loop.size(each - self._predicted))
-                self._predicted = self._predicted @ self._step.T
+    def _is_over(self, first: Array, e: Array) -> NDArray[np.bool_]:
+        first, size = (self.loop.size(each[:, self.loop.watched]) for each in (first, e))
+        over: NDArray[np.bool_] = (size <= SETTLED * first) | ~(size < DIVERGED * first)
+        return over
 
-    def outcome(self, _: int, stop: Array) -> dict[str, Array]:
-        """Return the outcomes of the runs; `stop` are indices into STOPS."""
-        code = np.where(self._code > 0, self._code, np.array([0, 3, 2, 0])[stop.astype(int)])
-        error = self._worst / np.maximum(self._first, 1e-300)
-        error = np.where((stop > 0.0) | (code > 1), np.nan, error)
-        return {"outcome": code.astype(float), "error": error}
+    def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
+        """Return the outcomes and errors of runs."""
+        loop, stop = self.loop, runs["stop"]
+        e = runs["state_errors"][:, :, loop.watched]
+        last, first = loop.size(runs["x"][:, loop.watched] - loop.lin.x0), loop.size(e[:, 0])
+        turned = (stop == STOPS.index("left the chart")) | (runs["largest"][:, 0] > EDGE)
+        diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
+        code = np.select([turned, diverged, last <= SETTLED * first], [2, 3, 1], 0)
+        apart = np.zeros(len(e)) if self.step is None else self._apart(e, self.step)
+        return {"outcome": code, "error": np.where(code > 1, np.nan, apart / first)}
+
+    def _apart(self, e: Array, step: Array) -> Array:
+        """Return the largest distances (N,) from the linear loop."""
+        worst, predicted = np.zeros(len(e)), e[:, 0]
+        for now in e.swapaxes(0, 1):
+            worst = np.maximum(worst, self.loop.size(now - predicted))
+            predicted = predicted @ step.T
+        return worst
 
 
 def settle(
     runs_of: Callable[[int], CampaignJob],
     starts: Callable[[NDArray[np.intp]], Array],
-    runs: NDArray[np.intp],
+    count: int,
     engine: str | None = None,
-    fine: int = 0,
     **how: Any,
 ) -> dict[str, Array]:
-    """Return the outcomes of runs; those that diverge are repeated in shorter steps.
+    """Return the figures of runs; those that diverge are repeated in shorter steps.
 
-    `runs_of` makes the runs in steps that have been shortened `fine` times, and `starts` returns
+    `runs_of` makes the runs in steps that have been shortened so many times, and `starts` returns
     the deviations (N, nx) from which runs (N,) start.
     """
+    arrays, left = dict[str, Array](), np.arange(count)
+    for fine in range(_FINEST + 1):
+        job = runs_of(fine)
+        job.choose(engine)
 
-    def rows(start: int, stop: int) -> Draws:
-        some = runs[start:stop]
-        return Draws(starts(some), some.astype(float))
+        def rows(start: int, stop: int, left: NDArray[np.intp] = left) -> Draws:
+            return Draws(starts(left[start:stop]))
 
-    job = runs_of(fine)
-    job.choose(engine)
-    arrays = completed(job, rows, len(runs), **how)
-    lost = np.flatnonzero(arrays["outcome"] == OUTCOMES.index("diverged"))
-    if len(lost) and fine < _FINEST:
+        found = completed(job, rows, len(left), **how)
+        for key, values in found.items():
+            arrays.setdefault(key, values)[left] = values
+        left = left[found["outcome"] == OUTCOMES.index("diverged")]
+        if not len(left):
+            break
         how["progress"] = None
-        again = settle(runs_of, starts, runs[lost], engine, fine + 1, **how)
-        for key, values in again.items():
-            arrays[key][lost] = values
     return arrays
 
 
@@ -281,7 +259,7 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
         raise InputError(f"the model of '{lin.robot}' has no states, so nothing can settle")
     if lin.moving or not lin.is_equilibrium() or lin.v.any():
         raise InputError(
-            "the operating point is not an equilibrium at rest, so its loop cannot settle there; "
+            "the operating point is not an equilibrium at rest, so the loop cannot settle there; "
             "linearise about an equilibrium"
         )
     if not loop.decay > 0.0:

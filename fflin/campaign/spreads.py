@@ -34,7 +34,7 @@ class DispersionFile(dict[str, Any]):
         self.document = document
 
 
-def placed(dispersions: Any) -> AbstractContextManager[None]:
+def placed(dispersions: object) -> AbstractContextManager[None]:
     """Put file and line of the spread that an error names in front of its message."""
     if isinstance(dispersions, DispersionFile):
         return dispersions.document.located(_TABLE)
@@ -44,7 +44,8 @@ def placed(dispersions: Any) -> AbstractContextManager[None]:
 def load_dispersions(path: str | Path) -> dict[str, Any]:
     """Read the dispersions of `monte_carlo` from a TOML file.
 
-    The file has one table ``[dispersions]`` of names, groups or patterns, each with its spread:
+    The file has one table ``[dispersions]``. Its keys are names, groups or patterns; each value is
+    a spread in one of these forms:
 
     ==========================================  ==================================================
     ``0.05`` or ``{normal = 0.05}``             normal about 0 with this standard deviation
@@ -64,8 +65,8 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        {name: spread}, the argument `dispersions` of `monte_carlo`. If a name or spread is
-        invalid, `monte_carlo` raises an error with the file and the line.
+        Mapping {name: spread} for the argument `dispersions` of `monte_carlo`. If a name or spread
+        is not valid for the robot, `monte_carlo` raises an error that names the file and the line.
 
     Raises
     ------
@@ -107,7 +108,7 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     return found
 
 
-def _names(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, Any]]:
     """Yield (name, spread); ``base.mass = 0.1`` is the name "base.mass"."""
     for key, value in table.items():
         if isinstance(value, dict) and value and not {*value} & {*_FORMS}:
@@ -116,7 +117,7 @@ def _names(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, An
             yield f"{before}{key}", value
 
 
-def _spread(value: Any) -> Any:
+def _spread(value: object) -> Any:
     table: dict[str, Any] = dict(value) if isinstance(value, dict) else {"normal": value}
     if "tied" in table:
         tied = table.pop("tied")
@@ -131,7 +132,7 @@ def _spread(value: Any) -> Any:
     raise InputError(f"{reprlib.repr(value)} is not a dispersion, expected {_EXPECTED}")
 
 
-def _distribution(distribution: str, **given: Any) -> Any:
+def _distribution(distribution: str, **given: object) -> Any:
     from scipy import stats
 
     kinds = stats.rv_continuous, stats.rv_discrete
@@ -155,7 +156,7 @@ def _distribution(distribution: str, **given: Any) -> Any:
     )
 
 
-def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
+def inverse_of(name: str, spread: object) -> Callable[[Array], Array]:
     """Return the inverse distribution function of a spread."""
     if hasattr(spread, "ppf"):
         try:

@@ -6,8 +6,8 @@ Their size does not depend on how long the run is.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,14 @@ KINDS = {
     "v_b": "m/s",
     "joint rates": "rad/s|m/s",
 }
+# Attitude error [deg] at which a run is close to the end of the chart.
+EDGE = 176.0
+# Steps between checks of a stop condition, and where there is none.
+LOOK, _LONG = 64, 2**20
+
+# Returns a mask (N,) of the runs that end, from the state errors (N, nx) at the start and now.
+Over: TypeAlias = Callable[[Array, Array], NDArray[np.bool_]]
+
 # Former names of kinds, which conditions and goals may still use.
 _FORMER = {"turning": "omega_b", "moving": "v_b", "rates": "joint rates"}
 
@@ -62,6 +70,20 @@ class Outcome(NamedTuple):
     input_history: Array  # (N, times, nu), zero after a run was stopped
     stop: Array  # (N,), index into STOPS
     end: Array  # (N,) [s]
+    state_errors: Array  # (N, times, nx), NaN after a run was stopped
+
+
+class Judge(Protocol):
+    """Judgement of runs that replaces the record of a campaign, and may end them early."""
+
+    FIELDS: ClassVar[tuple[str, ...]]
+
+    @property
+    def over(self) -> Over | None:
+        """Stop condition, checked every `LOOK` steps; None if every run goes on to its end."""
+
+    def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
+        """Return the FIELDS (N,) of runs from their `Outcome`, whose first history is the start."""
 
 
 def kinds_of(state: StateMap) -> NDArray[np.intp]:
@@ -81,43 +103,52 @@ def kinds_of(state: StateMap) -> NDArray[np.intp]:
     return kind
 
 
+def errors_of(state: StateMap, target: Array, q: Array, v: Array) -> tuple[Array, Array]:
+    """Return the states (N, nx) of q and v, and their errors from the target (nx,) or (N, nx)."""
+    moving = target.ndim == 2
+    near = target[0] if moving else target
+    x = unwound(state, states_of(state, q, state.velocities(v)), near)
+    e = unwound(state, moving_errors(state.frame, x, target)) if moving else x - target
+    return x, e
+
+
 def outcome_of(
     plan: Plan, state: StateMap, target: Array, steps: Array, run: Recording
 ) -> dict[str, Array]:
-    """Return the outcome, as a row of each array of `Outcome`, of a run with a row for every step.
+    """Return the outcome, a row of each array of `Outcome`, of a run with a row for every step.
 
     Errors are those from the state `target` (nx,), or from a moving one (steps + 1, nx). Histories
     are kept at `steps`.
     """
-    count, kind, nu = len(run.q), kinds_of(state), state.velocities(run.v)
-    moving = target.ndim == 2
-    target = target[:count] if moving else target
-    x = unwound(state, states_of(state, run.q, nu), target[0] if moving else target)
-    e = unwound(state, moving_errors(state.frame, x, target)) if moving else x - target
-    e, u = np.where(kind < 0, 0.0, np.abs(e)), np.abs(run.u)
+    count, kind = len(run.q), kinds_of(state)
+    target = target[:count] if target.ndim == 2 else target
+    x, signed = errors_of(state, target, run.q, run.v)
+    e, u = np.where(kind < 0, 0.0, np.abs(signed)), np.abs(run.u)
     others = [e[:, kind == of].max(axis=1, initial=0.0) for of in range(1, len(KINDS))]
     sizes = np.column_stack([attitude_errors(x, target), *others])
     settled, stop = settled_at(sizes), stop_of(run.stopped)
-    kept, last = steps[steps < count], slice(-1, None)
-    error_history = np.full((1, len(steps), len(KINDS)), np.inf)
-    input_history = np.zeros((1, len(steps), u.shape[1]))
-    error_history[0, : len(kept)], input_history[0, : len(kept)] = sizes[kept], run.u[kept]
+    late, kept = is_late(settled, count) | (stop > 0), steps[steps < count]
+
+    def history(values: Array, after: float) -> Array:
+        found = np.full((len(steps), values.shape[1]), after)
+        found[: len(kept)] = values[kept]
+        return found
+
     return Outcome(
-        q=run.q[last],
-        v=run.v[last],
-        x=x[last],
-        u=run.u[last],
-        largest_x=e.max(axis=0, keepdims=True),
-        largest_u=u.max(axis=0, keepdims=True),
-        errors=sizes[last],
-        largest=sizes.max(axis=0, keepdims=True),
-        settle=np.where(is_late(settled, count) | (stop > 0), np.inf, settled * plan.times.dt)[
-            None
-        ],
-        error_history=error_history,
-        input_history=input_history,
-        stop=np.array([float(stop)]),
-        end=np.array([run.steps * plan.times.dt]),
+        q=run.q[-1],
+        v=run.v[-1],
+        x=x[-1],
+        u=run.u[-1],
+        largest_x=e.max(axis=0),
+        largest_u=u.max(axis=0),
+        errors=sizes[-1],
+        largest=sizes.max(axis=0),
+        settle=np.where(late, np.inf, settled * plan.times.dt),
+        error_history=history(sizes, np.inf),
+        input_history=history(run.u, 0.0),
+        stop=np.array(float(stop)),
+        end=np.array(run.steps * plan.times.dt),
+        state_errors=history(signed, np.nan),
     )._asdict()
 
 
@@ -159,15 +190,14 @@ def marks_of(
         outside=np.full(kinds, -1.0),
         errors=np.full(len(steps) * kinds, np.inf),
         inputs=np.zeros(len(steps) * nu),
+        states=np.full(len(steps) * state.nx, np.nan),
     )
 
 
 class RunStatistics:
     """Statistics of eight parallel runs in compiled code; see `marks_of`."""
 
-    FIELDS: ClassVar[tuple[str, ...]] = Outcome._fields
-    every = 1
-    span = 2**20  # steps between checks of `over`
+    every, span = 1, LOOK
 
     def __init__(
         self,
@@ -176,9 +206,12 @@ class RunStatistics:
         target: Array,
         steps: Array,
         path: Sequence[Array],
+        over: Over | None = None,
     ) -> None:
-        self._dt, self._state, self._steps = plan.times.dt, state, steps
-        self.over = np.zeros(LANES, dtype=bool)  # every run goes on to its end
+        self._dt, self._state, self._target, self._steps = plan.times.dt, state, target, steps
+        self._over = over
+        if over is None:
+            self.span = _LONG
         marks = marks_of(plan, state, target, steps, path)
         self._fresh: list[tuple[Array, Array]] = []
         self._marks = laid_out(marks, loop.RUN_STATISTICS, lambda *pair: self._fresh.append(pair))
@@ -189,6 +222,13 @@ class RunStatistics:
         for lanes, initial in self._fresh:
             lanes[:] = initial
 
+    def over(self, q: Array, v: Array) -> NDArray[np.bool_]:
+        """Return the mask (LANES,) of the runs that end early at these q and v (LANES, ..)."""
+        if self._over is None:
+            return np.zeros(LANES, dtype=bool)
+        first = _by_run(self._marks.states[: self._state.nx])
+        return self._over(first, errors_of(self._state, self._target, q, v)[1])
+
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Add the rows (steps, count, ..) of q, nu, u, .. from step `first` on, also as `raw`."""
         take = kernel("loop", "take", "the run statistics")
@@ -197,26 +237,28 @@ class RunStatistics:
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
         """Return the outcomes of the runs after so many steps; `stop` are indices into STOPS."""
-        (q, nu, u), marks = self._last, self._marks
-
-        def by_run(values: Any, *shape: int) -> Array:
-            shape = shape or (len(values),)
-            return np.moveaxis(np.reshape(values, (*shape, LANES)), -1, 0)
-
-        settled = by_run(marks.outside) + 1.0
+        (q, nu, u), marks, times = self._last, self._marks, len(self._steps)
+        settled = _by_run(marks.outside) + 1.0
         late = (stop != 0.0)[:, None] | is_late(settled, done + 1)
         return Outcome(
             q=q,
             v=self._state.spread(nu),
-            x=by_run(marks.law.x),
+            x=_by_run(marks.law.x),
             u=u,
-            largest_x=by_run(marks.largest_x),
-            largest_u=by_run(marks.largest_u),
-            errors=by_run(marks.sizes),
-            largest=by_run(marks.largest),
+            largest_x=_by_run(marks.largest_x),
+            largest_u=_by_run(marks.largest_u),
+            errors=_by_run(marks.sizes),
+            largest=_by_run(marks.largest),
             settle=np.where(late, np.inf, settled * self._dt),
-            error_history=by_run(marks.errors, len(self._steps), len(KINDS)),
-            input_history=by_run(marks.inputs, len(self._steps), u.shape[1]),
+            error_history=_by_run(marks.errors, times, len(KINDS)),
+            input_history=_by_run(marks.inputs, times, u.shape[1]),
             stop=stop,
             end=np.full(LANES, done * self._dt),
+            state_errors=_by_run(marks.states, times, self._state.nx),
         )._asdict()
+
+
+def _by_run(values: Any, *shape: int) -> Array:
+    """Return values (.., LANES) of runs in lanes as rows (LANES, *shape)."""
+    shape = shape or (len(values),)
+    return np.moveaxis(np.reshape(values, (*shape, LANES)), -1, 0)

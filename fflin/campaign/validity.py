@@ -37,37 +37,39 @@ _FARTHEST = 1e6
 
 @dataclass(frozen=True, eq=False)
 class Validity(FrozenArrays):
-    """Range of validity of a linear model and its loop; prints in words.
+    """Range of validity of a linear model and its closed loop; ``print`` shows a summary.
 
-    The loop starts at displacements of several levels. A level is a fraction of the largest
-    displacement that was tested. Base attitude, base position and joints are displaced together, in
-    a random direction.
+    The closed loop is simulated from initial displacements of several levels. The level of a
+    displacement is its size as a fraction of the largest displacement that was tested. Base
+    attitude, base position and joints are displaced at the same time, in a random direction.
 
     Attributes
     ----------
     levels : ndarray (k,)
         Levels at which the prediction error was measured.
     prediction_error : ndarray (k,)
-        Largest error of the linear closed loop over three time constants, relative to the
-        displacement. Errors are measured in the norm of the loop's Lyapunov function. The value
-        is NaN if a run left the chart.
+        Largest error in the motion that the linear model predicts over three time constants of the
+        closed loop, as a fraction of the initial displacement. Errors are measured in the norm of
+        the loop's Lyapunov function. The value is NaN if a run left the chart.
     slope : float
-        Exponent of the displacement in the growth of the absolute error, fitted to the four
-        smallest levels; 2 is expected. The value is NaN if one of these errors is as small as the
-        integration error, or a run left the chart.
+        Exponent k with which the absolute error grows as displacement^k, fitted to the four
+        smallest levels. The expected value is 2, because linearisation neglects terms of second
+        order. The value is NaN if one of these errors is as small as the integration error, or a
+        run left the chart.
     trusted : dict
         Displacement {"attitude" [deg], "position" [m], "joint" [joint_unit]} at which
         `prediction_error` reaches 10 %.
     sampled : ndarray (N,)
-        Levels of the random runs, ascending.
+        Levels of the random initial displacements, ascending.
     outcomes : tuple of str
-        Outcome of each random run: "settled", "slow", "chart" or "diverged".
+        Outcome of the run from each random displacement: "settled", "slow" (not settled within the
+        allowed time), "chart" (approached a rotation of 180 deg) or "diverged".
     holds : dict
-        Displacement, with the keys of `trusted`, up to which every run settled.
+        Displacement up to which every random run settled, with the keys of `trusted`.
     inside : int
-        Number of runs with displacements up to `holds`.
+        Number of random runs with displacements up to `holds`.
     inside_rate : float
-        Lower bound, at confidence level `confidence`, on the fraction of displacements up to
+        Lower confidence bound, at the level `confidence`, on the fraction of displacements up to
         `holds` from which the loop settles.
     rate : tuple of float
         Clopper-Pearson interval of the fraction of all displacements from which the loop settles.
@@ -76,7 +78,7 @@ class Validity(FrozenArrays):
     joint_unit : str
         "rad" or "m" if all joints have this unit, otherwise "rad|m".
     frame : str
-        Frame in whose axes base velocities and inputs are fed back.
+        Frame whose axes express the base velocities and inputs in the feedback.
 
     Examples
     --------
@@ -119,17 +121,17 @@ class Validity(FrozenArrays):
         order = "the order of the error cannot be determined"
         if np.isfinite(self.slope):
             order = f"the error grows with the displacement to the power {self.slope:.3f}"
-        beyond = " and beyond" if self.trusted == self.largest else ""
+        beyond = ", the largest displacement tested" if self.trusted == self.largest else ""
         first = shown(_scaled(self.largest, float(self.sampled[0])), self.joint_unit)
         lines = [
             f"{self.robot}: the linear loop predicts the nonlinear loop within "
             f"{100.0 * TRUSTED:g} % up to {trusted}{beyond}; {order}",
-            f"every run settled up to {holds}: {self.inside} of {self.inside} runs, "
-            f"so at least {100.0 * self.inside_rate:.1f} % settle there ({sure} confidence)"
+            f"up to {holds}, every run settled ({self.inside} of {self.inside}), so at least "
+            f"{100.0 * self.inside_rate:.1f} % of such displacements settle ({sure} confidence)"
             if self.inside
             else f"the run from the smallest displacement tried, {first}, did not settle",
-            f"up to {largest}: {self.settled} of {count} runs settled, "
-            f"so {100.0 * low:.1f} to {100.0 * high:.1f} % settle there ({sure} confidence)"
+            f"up to {largest}, {self.settled} of {count} runs settled, so {100.0 * low:.1f} to "
+            f"{100.0 * high:.1f} % of such displacements settle ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]
         return folded(lines)
@@ -145,7 +147,7 @@ _ENDS = {
 def validity(
     robot: Robot,
     lin: LinearModel,
-    gain: Any,
+    gain: object,
     *,
     attitude: float = 90.0,
     position: float = 0.5,
@@ -153,25 +155,26 @@ def validity(
     samples: int = 100,
     seed: int = 0,
     confidence: float = 0.95,
-    limits: Any = None,
+    limits: object = None,
     executor: Executor | None = None,
     workers: int | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
     engine: str | None = None,
 ) -> Validity:
-    """Find the displacements up to which a linear model predicts the motion and its loop settles.
+    """Find displacements up to which a linear model predicts the motion and its loop settles.
 
-    The nonlinear robot is simulated under ``u = u0 - K (x - x0)``, held between samples if the
-    model is sampled. All runs start at displaced configurations with the operating point's
-    velocity. `validity` simulates two sets of runs:
+    The nonlinear robot is simulated under the feedback ``u = u0 - K (x - x0)``; if the model is
+    sampled, u is held between samples. All runs start from a displaced configuration and the
+    velocity of the operating point. There are two sets of runs:
 
-    - Displacements of growing size, to compare the motion with the linear prediction.
-    - Random displacements. A run has settled if its error falls to a thousandth of its initial
-      value within the allowed time. The allowed time is three times the settling time of the
-      slowest mode of the linear loop.
+    - Runs from displacements of growing size show how far the motion departs from the linear
+      prediction.
+    - Runs from random displacements show whether the loop settles. A run has settled if its error
+      falls to a thousandth of its initial value within the allowed time. The allowed time is three
+      times the settling time of the slowest mode of the linear loop.
 
-    With numba the compiled loop computes eight runs at a time.
+    If numba is installed, the compiled loop computes eight runs at a time.
 
     Parameters
     ----------
@@ -182,17 +185,17 @@ def validity(
     gain : Gain or array_like (nu, nx)
         Gain K, which must stabilise the linear loop.
     attitude, position, joint : float
-        Largest displacement of the base [deg] and [m], and of the most displaced joint [rad|m].
-        States that are not in a reduced model, or are not regulated, are not displaced, and their
-        displacement is reported as 0.
+        Largest displacements to test: of the base attitude [deg], of the base position [m] and of
+        the most displaced joint [rad|m]. A state that is missing from a reduced model, or that the
+        gain does not regulate, is not displaced; its displacement is reported as 0.
     samples, seed : int
         Number of random runs, and random seed. The same seed gives the same result for any executor
         or number of workers.
     confidence : float
         Confidence level of the intervals.
     limits : optional
-        Limits at which the inputs saturate, as in `simulate`. By default no input saturates, except
-        that thrusters never pull.
+        Limits at which the inputs saturate, as in `simulate`. By default, the only saturation is
+        that thrusters cannot pull.
     executor, workers, threads, engine, progress : optional
         As in `monte_carlo`; ``progress(done, total)`` counts the runs of both sets.
 
@@ -204,10 +207,14 @@ def validity(
     Raises
     ------
     InputError
-        If the linear loop is unstable, the operating point is not an equilibrium, the poles are so
-        far apart that a run takes a million steps, or an argument has a wrong size or value.
+        If one of these conditions is true:
+
+        - the linear loop is unstable;
+        - the operating point is not an equilibrium;
+        - the poles are so far apart that a run would take a million steps;
+        - an argument has a wrong size or value.
     FflinError
-        If a worker process died.
+        If a worker process dies.
 
     References
     ----------
@@ -228,29 +235,29 @@ def validity(
     confidence = share("confidence", confidence)
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
+    sets, work = [], []
     # Level and random stream of each run that predicts, and of each random run.
-    sets = {
-        True: (np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
-        False: (levels, _DIRECTIONS + np.arange(samples)),
-    }
-    starts = {key: partial(_starts, loop, largest, seed, *each) for key, each in sets.items()}
-    runs_of = {key: partial(settling_runs, loop, key, limits, largest["joint"]) for key in sets}
-    work = []
-    for key, (at, _) in sets.items():
-        job = runs_of[key]()
+    for predicts, at, streams in (
+        (True, np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
+        (False, levels, _DIRECTIONS + np.arange(samples)),
+    ):
+        runs_of = partial(settling_runs, loop, predicts, limits, largest["joint"])
+        starts = partial(_starts, loop, largest, seed, at, streams)
+        sets.append((runs_of, starts, len(at)))
+        job = runs_of()
         job.choose(engine)  # a wrong argument is refused before anything is compiled
-        some = np.arange(min(LANES, len(at)))
-        work.append((job, Draws(starts[key](some), some.astype(float)), len(at)))
-    total, done, found = len(_LEVELS) * _DIRECTIONS + samples, 0, {}
+        work.append((job, Draws(starts(np.arange(min(LANES, len(at))))), len(at)))
+    total, done, found = sum(count for *_, count in sets), 0, []
     with executor_of(executor, workers) as others:
         how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
         expect(progress, work, others, threads)
-        for key, (at, _) in sets.items():
+        for runs_of, starts, count in sets:
             how["progress"] = progress and partial(_report, progress, done, total)
-            found[key] = settle(runs_of[key], starts[key], np.arange(len(at)), engine, **how)
-            done += len(at)
-    error = found[True]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
-    outcomes = tuple(OUTCOMES[int(code)] for code in found[False]["outcome"])
+            found.append(settle(runs_of, starts, count, engine, **how))
+            done += count
+    predicted, random = found
+    error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
+    outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])
     failed = np.array([outcome != "settled" for outcome in outcomes])
     inside, bound, rate = until_failure(failed, confidence)
     return Validity(
@@ -322,8 +329,8 @@ def _checked_displacement(
     given = {key: number(key, value) for key, value in given.items()}
     if not 0.0 <= given["attitude"] < 175.0 or min(given.values()) < 0.0:
         raise InputError(
-            f"the displacements are {shown(given)}; expected values of 0 or more, and an "
-            "attitude below 175 deg, because the chart ends at 180 deg"
+            f"the displacements are {shown(given)}, but each must be 0 or more, and the rotation "
+            "must be less than 175 deg, because the attitude chart ends at 180 deg"
         )
     if max(given.values()) > _FARTHEST:
         raise InputError(

@@ -1,4 +1,4 @@
-"""The commands `analyze`, `modes`, `sensitivity` and `uncertain`."""
+"""Commands `analyze`, `modes`, `equilibrium`, `sensitivity` and `uncertain`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FflinWarning, InputError
-from fflin.base.tables import counted, signals
+from fflin.base.errors import FflinWarning, InputError, listed
+from fflin.base.tables import counted, folded, signals
 from fflin.commands import options, parser
 from fflin.commands.points import (
     attitude,
@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
 
+_SLACK = 1e-9  # up to which a value is at its limit, in SI units
+
+
 def add_commands(commands: parser.Commands) -> None:
-    """Add analyze, modes, sensitivity and uncertain."""
+    """Add the commands analyze, modes, equilibrium, sensitivity and uncertain."""
     analyze = parser.command(
         commands,
         "analyze",
@@ -49,20 +52,21 @@ def add_commands(commands: parser.Commands) -> None:
         "frame plot html",
     )
     options.add_point(modes)
-    options.add_figure(modes, "frequencies, damping and shapes")
+    options.add_figure(modes, "the frequencies, damping ratios and shapes of the modes")
     pages = modes.group(parser.OUTPUT)
-    pages.add("--html", "write a page that plays the mode shapes", parser.PAGE)
+    pages.add("--html", "write an HTML page that animates the mode shapes", parser.PAGE)
     held = parser.command(
         commands,
         "equilibrium",
         _equilibrium,
-        "show the inputs that hold an operating point, the spring deflections and the stability",
+        "show whether an operating point is stable, the inputs that hold the robot there, and "
+        "the spring deflections",
         example="fflin equilibrium servicer_7dof --stiffness panel_left=100 --gravity 0 0 -0.01",
         common="joint rpy velocity relative-equilibrium orbit stiffness gravity passive inputs "
         "frame output-file",
     )
     options.add_point(held)
-    what = "q, u, the deflections and the poles"
+    what = "the equilibrium (q, u, spring deflections and poles)"
     options.add_output_file(held.group(parser.OUTPUT), what, parser.RECORD, "Equilibrium")
     _add_sensitivity(commands)
     _add_uncertain(commands)
@@ -73,8 +77,8 @@ def _add_sensitivity(commands: parser.Commands) -> None:
         commands,
         "sensitivity",
         _sensitivity,
-        "show or save the derivatives of A and B with respect to masses, springs, thrusters and "
-        "others",
+        "show or save the derivatives of A and B with respect to the parameters of the robot, "
+        "such as masses, springs and thrusters",
         example="fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
         common="joint rpy velocity equilibrium inputs frame dt top only output-file",
     )
@@ -82,7 +86,7 @@ def _add_sensitivity(commands: parser.Commands) -> None:
     model = sensitivity.group("derivatives")
     model.add(
         "--dt",
-        "differentiate the model sampled at the sample time H [s] with zero-order hold",
+        "differentiate the model after it is sampled at the sample time H [s] with zero-order hold",
         float,
         "H",
     )
@@ -90,11 +94,11 @@ def _add_sensitivity(commands: parser.Commands) -> None:
     model.add("--top", top, int, default=15)
     model.add(
         "--only",
-        "show only these parameters. NAME is a kind, a link or a pattern, such as mass, link_3 or "
-        "*.density",
+        "show only the parameters that NAME selects. NAME is a kind of parameter, a link or a "
+        "pattern, such as mass, link_3 or *.density",
         metavar="NAME",
     )
-    what = "dA, dB, df0 for each parameter"
+    what = "the derivatives dA, dB and df0 for each parameter"
     options.add_output_file(sensitivity.group(parser.OUTPUT), what, parser.RECORD, "Sensitivity")
 
 
@@ -110,8 +114,8 @@ def _add_uncertain(commands: parser.Commands) -> None:
     )
     point = uncertain.group(parser.POINT)
     neutral = (
-        "position of a joint [rad|m]. The default is the position in robot.toml, or the neutral "
-        "position"
+        "position of a joint [rad|m]. The default is the position in robot.toml or, if there is "
+        "none, the neutral position"
     )
     point.add("--joint", neutral, parser.assignment, repeatable=True)
     options.add_robot(uncertain)
@@ -119,15 +123,15 @@ def _add_uncertain(commands: parser.Commands) -> None:
     uncertain.group("parameters").add(
         "--vary",
         "range of the parameter NAME, or of all parameters that match a pattern; `fflin "
-        "sensitivity` lists the names. RANGE is a fraction of the nominal value, such as 0.2, or "
-        "LEAST:LARGEST. If `,tied` follows RANGE, such as 0.2,tied, all parameters of the pattern "
-        "vary together",
+        "sensitivity` lists the names. RANGE is a largest deviation as a fraction of the nominal "
+        "value, such as 0.2, or the bounds LEAST:LARGEST. With `,tied` after RANGE, such as "
+        "0.2,tied, all parameters that match the pattern vary together",
         _range,
         "NAME=RANGE",
         repeatable=True,
         required=True,
     )
-    what = "A, B1 .. D22 and the blocks"
+    what = "the matrices A, B1 .. D22 and the blocks of Delta"
     options.add_output_file(uncertain.group(parser.OUTPUT), what, parser.RECORD, "LFT")
 
 
@@ -180,7 +184,10 @@ def _modes(arguments: argparse.Namespace) -> Report:
         result["effective_masses"] = effective_masses(lin)
         parts.append(str(result["effective_masses"]))
     if robot.orbit and not found.equilibrium:
-        parts.append("equilibria in orbit: --equilibrium, --relative-equilibrium")
+        parts.append(
+            "for the modes about an equilibrium in orbit, add --equilibrium or "
+            "--relative-equilibrium"
+        )
 
     def page(path: Path) -> None:
         from fflin.view.visualize import visualize
@@ -196,9 +203,13 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
     from fflin.base.record import write_record
     from fflin.linear.equilibrium import equilibrium
     from fflin.linear.linearization import linearize
+    from fflin.robot.limits import limits_of
 
     if arguments.effort:
-        raise InputError("this command computes the inputs at the point; remove --effort")
+        raise InputError(
+            "--effort sets inputs at the operating point, but this command computes the inputs; "
+            "remove --effort"
+        )
     robot, q, v, reference = point_of(arguments)
     if arguments.relative_equilibrium:
         q, reference = attitude(robot, q, arguments.relative_equilibrium, arguments.frame)
@@ -211,13 +222,21 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
     decays = not found.zero_eigenvalues and all(mode.margin < -1.0 for mode in found.modes)
     stability = "unstable" if found.unstable else "stable" if decays else "marginally stable"
     lines = [
-        f"{robot.name}: {stability}: largest real part of the poles {growth:.3g} 1/s, "
+        f"{robot.name}: {stability}; the largest real part of a pole is {growth:.3g} 1/s, "
         f"{counted(found.zero_eigenvalues, 'eigenvalue')} at zero",
         signals("x0", lin.x0, lin.state_names, lin.state_units) if lin.x0.any() else "x0: all zero",
         str(held),
     ]
+    names = (*lin.state_names, *lin.input_names)
+    there = dict(zip(names, (*lin.x0, *held.u), strict=True))
+    limits = limits_of(robot).items()
+    excess = {k: max(low - there[k], there[k] - high) for k, (low, high) in limits if k in there}
+    beyond = [name for name, size in excess.items() if size > _SLACK]
+    if beyond:
+        lines.append(folded([f"beyond their limits: {listed(beyond)}"]))
     result = {
         **plain(held),
+        "beyond_limits": beyond,
         "state_names": lin.state_names,
         "state_units": lin.state_units,
         "x0": lin.x0,
@@ -233,7 +252,6 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
 
 def _momentum(lin: LinearModel) -> str:
     from fflin.analysis.reduction import momentum_reduction
-    from fflin.base.tables import folded
 
     try:
         reduced = momentum_reduction(lin)
@@ -241,14 +259,18 @@ def _momentum(lin: LinearModel) -> str:
         text = f"no reduction: {error}"
     else:
         orbit = "the orbit, " * bool(lin.mean_motion)
-        text = f"no momentum is conserved: {orbit}inputs, springs and dampers act on all momenta"
+        text = (
+            f"no momentum is conserved, because {orbit}inputs, springs or dampers change every "
+            "component of the momentum"
+        )
         if len(reduced.momenta):
+            components = counted(len(reduced.momenta), "component")
             text = (
-                f"{len(reduced.momenta)} momenta are conserved for all inputs; the reduced model "
-                f"has {len(reduced.A)} states"
+                f"{components} of the momentum cannot be changed by any input; the model reduced "
+                f"by the conserved momentum has {len(reduced.A)} states"
             )
         elif not lin.is_equilibrium():
-            text = "no momentum can be removed: the operating point is not an equilibrium"
+            text = "no momentum can be removed, because the operating point is not an equilibrium"
         text = "\n".join((text, *(f"note: {note}" for note in reduced.notes)))
     return folded(text.splitlines())
 
@@ -268,7 +290,10 @@ def _uncertain(arguments: argparse.Namespace) -> Report:
 
     robot, ranges = load_robot(arguments), once("--vary", arguments.vary)
     if robot.point.get("velocity"):
-        text = "the uncertain model is at rest, so that the velocity in [point] is ignored"
+        text = (
+            "the uncertain model describes the robot at rest, so the velocity in [point] of "
+            "robot.toml is ignored"
+        )
         warnings.warn(text, FflinWarning, stacklevel=2)
     base, joints = base_of(robot.point), robot.point.get("joints")
     lft = uncertain(robot, ranges).lft(placed(robot, "--joint", arguments.joint, base, joints))

@@ -1,4 +1,4 @@
-"""The loop that commands simulate, with a controller from files or by design."""
+"""Closed loop that commands simulate, with a controller from files or designed from options."""
 
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ from fflin.commands.points import (
     velocity_of,
 )
 from fflin.commands.regulator import (
+    add_allocation,
     add_trajectory,
     add_weights,
     gain_of,
     models_along,
     regulated_part,
+    robot_of_design,
     schedule_of,
     weights_of,
 )
@@ -45,7 +47,7 @@ _TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce"
 
 
 class Loop(NamedTuple):
-    """A policy, its simulation options, and for state feedback the model of the prediction."""
+    """Policy, simulation options, and for state feedback the model that predicts the motion."""
 
     policy: Any
     options: dict[str, Any]
@@ -53,29 +55,31 @@ class Loop(NamedTuple):
 
 
 def refuse_law(arguments: argparse.Namespace) -> None:
-    """Refuse the options of a regulator together with --free."""
+    """Raise an error if --free is combined with options of a regulator."""
     refuse(
         arguments,
         ("limit", "delay"),
-        "--free means no inputs, so that limits and delays have no effect",
+        "with --free all inputs are zero, so limits and delays have no effect",
     )
     names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "reduce", "allocate", "gain", "controller", "mpc")
     refuse(
         arguments,
         names,
-        "--free means no regulator, so that weights, a target or thrusters have no effect",
+        "with --free there is no regulator, so the options of a regulator and its target have no "
+        "effect",
     )
 
 
 def add_loop(command: parser.Command) -> None:
-    """Add the options of the loop."""
+    """Add the options that define the closed loop and its simulation."""
     options.add_robot(command)
     start, goal = command.group("start"), command.group("target")
     options.add_pose(start)
     start.add(
         "--offset",
-        "initial error from the start of the trajectory, in base axes. NAME is a state, group or "
-        "pattern such as r_b.x, q_m or omega_b.z (SI units), or roll, pitch or yaw [deg]",
+        "initial error with respect to the start of the trajectory, in base axes. NAME is a "
+        "state, a group or a pattern, such as r_b.x, q_m or omega_b.z (SI units), or it is roll, "
+        "pitch or yaw [deg]",
         parser.assignment,
         repeatable=True,
     )
@@ -87,8 +91,9 @@ def add_loop(command: parser.Command) -> None:
     run = command.group(parser.SIMULATION)
     run.add(
         "--duration",
-        "duration [s]. The default is the duration of the trajectory; without a trajectory, the "
-        "settling time of the linear loop, limited to 60 ... 600 s",
+        "duration of the simulation [s]. The default is the duration of the trajectory. Without "
+        "a trajectory, the default is the settling time of the linear loop, limited to 60 ... "
+        "600 s",
         float,
         "T",
     )
@@ -102,32 +107,29 @@ def add_loop(command: parser.Command) -> None:
 def _add_controllers(group: parser.Group) -> None:
     group.add(
         "--schedule",
-        "use gains saved by `fflin tvlqr`, and follow the trajectory that FILE contains, without "
-        "--trajectory",
+        "use the gains in FILE, which `fflin tvlqr` saved, and follow the trajectory that FILE "
+        "also contains. This option replaces --trajectory",
         Path,
     )
     group.add(
         "--gain",
-        "use a gain saved by `fflin lqr`, and regulate to the operating point of its design",
+        "use the gain in FILE, which `fflin lqr` saved, and regulate to the operating point for "
+        "which the gain was designed",
         Path,
     )
     group.add(
         "--controller",
-        "use a linear controller K with positive feedback, u - u0 = K (y - y0), about the target. "
-        "FILE (.mat, .npz or .json) contains A, B, C, D, and dt or Ts if the controller is "
-        "sampled. --output defines y",
+        "use a linear controller K with positive feedback, u - u0 = K (y - y0), about the "
+        "target. FILE (.mat, .npz or .json) contains the matrices A, B, C and D of the "
+        "controller and, if the controller is sampled, its sample time dt or Ts. --output "
+        "defines y",
         Path,
     )
     group.switch(
         "--negative-feedback",
-        "use the controller of --controller with negative feedback, u - u0 = -K (y - y0)",
+        "apply the controller of --controller with negative feedback, u - u0 = -K (y - y0)",
     )
-    group.yes_or_no(
-        "--allocate",
-        "design the regulator with base torque and force, and let thrusters produce the nearest "
-        "possible wrench. Allocation is the default if the thrusters can push in every direction. "
-        "With --no-allocate, negative thrust is set to zero",
-    )
+    add_allocation(group)
     group.switch(
         "--mpc",
         "use model predictive control (MPC) with the limits of the robot; MPC requires --sample",
@@ -135,12 +137,15 @@ def _add_controllers(group: parser.Group) -> None:
     group.add("--horizon", "number of samples in the horizon of --mpc", int, default=20)
     group.switch("--free", "simulate the robot without a regulator and without inputs")
     options.add_limits(group)
-    delay = "delay [s] from a sample until the command computed from this sample acts"
+    delay = (
+        "delay [s] between a sample and the application of the command that is computed from "
+        "this sample"
+    )
     group.add("--delay", delay, float, "T", default=0.0)
 
 
 def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
-    """Return the loop of the options of `add_loop`."""
+    """Return the loop that the options of `add_loop` define."""
     from fflin.control.policies import StateFeedback
     from fflin.simulation.times import SHORTEST, time_to_settle
 
@@ -153,12 +158,19 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         "duration": arguments.duration,
     }
     if not arguments.controller:
-        refuse(arguments, ("negative_feedback",), "only --controller has a feedback sign")
+        refuse(
+            arguments,
+            ("negative_feedback",),
+            "the sign of the feedback can be chosen only for --controller",
+        )
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
         return Loop(policy, settings | start)
     if arguments.offset or arguments.hold:
-        raise InputError("--offset and --hold need a --trajectory; give one, or leave them out")
+        raise InputError(
+            "--offset and --hold apply only along a trajectory; add --trajectory FILE, or remove "
+            "--offset and --hold"
+        )
     if arguments.free:
         refuse_law(arguments)
         settings["q0"], settings["v0"] = start_of(robot, arguments)
@@ -176,9 +188,9 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
 def start_of(
     robot: Robot, arguments: argparse.Namespace, reference: pin.SE3 | None = None
 ) -> tuple[Array, Array | None]:
-    """Return the initial q (nq,) and v (nv,) of the arguments or of the robot."""
+    """Return the initial q (nq,) and v (nv,) from the arguments or the robot."""
     from fflin.base.names import rates_by_name
-    from fflin.robot.fields import combined
+    from fflin.dynamics.points import combined
 
     point, number = robot.point, arguments.relative_equilibrium
     if number:  # the start is relative to this pose, which replaces the pose of the point
@@ -197,50 +209,49 @@ def start_of(
 def about_point(
     robot: Robot, arguments: argparse.Namespace
 ) -> tuple[Feedback | Allocation, Any, LinearModel | None]:
-    """Return the policy, its feedback, and the model that predicts every row."""
-    from fflin.control.authority import thrusters_give_every_wrench
+    """Return the policy, its feedback, and the model that predicts every row of the motion."""
     from fflin.control.linear_controller import LinearController
     from fflin.control.policies import Allocation, StateFeedback
 
     gain: Gain | None = None
     if arguments.mpc:
         names = ("allocate", "gain", "controller", "reduce")
-        refuse(arguments, names, "--mpc computes the inputs itself")
+        refuse(arguments, names, "--mpc replaces the regulator and its options")
         arguments.allocate = False
-    allocate = (
-        thrusters_give_every_wrench(robot) if arguments.allocate is None else arguments.allocate
-    )
     if arguments.gain:
         from fflin.control.gain import Gain
 
         refuse(
-            arguments, (*_WEIGHTS, *_TARGETS), "--gain contains its weights and its operating point"
+            arguments,
+            (*_WEIGHTS, *_TARGETS),
+            "the file of --gain already contains the weights and the operating point of the design",
         )
         gain = Gain.load(arguments.gain)
-        # A gain designed for the motors and thrusters needs no allocation of a wrench.
-        if arguments.allocate is None:
-            allocate = allocate and "tau_b.x" in gain.input_names
-        design = _without_thrusters(robot) if allocate else robot
+        design = robot_of_design(robot, arguments.allocate, gain)
         lin = _about_gain(design, gain, arguments)
     else:
-        design = _without_thrusters(robot) if allocate else robot
+        design = robot_of_design(robot, arguments.allocate)
         lin = _about_target(design, arguments)
     if arguments.controller:
-        refuse(arguments, (*_WEIGHTS, "gain", "reduce"), "--controller replaces the regulator")
+        refuse(
+            arguments,
+            (*_WEIGHTS, "gain", "reduce"),
+            "--controller replaces the regulator and its options",
+        )
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback: Any = LinearController(arguments.controller, lin, sign=sign)
     elif arguments.mpc:
         feedback = _mpc(lin, arguments)
     else:
-        gain = gain or gain_of(lin, arguments)
+        gain = gain or gain_of(lin, arguments, allocated=design is not robot)
         feedback = StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
-    if allocate:
+    if design is not robot:
         return Allocation(feedback, design), feedback, None
     return feedback, feedback, None if arguments.reduce else lin
 
 
 def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Feedback:
-    """Return the predictive controller of the weights and limits."""
+    """Return the predictive controller with the weights and limits of the arguments."""
     from fflin.control.mpc import mpc
     from fflin.control.weights import rule_weights
 
@@ -255,7 +266,7 @@ def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Feedback:
 
 
 def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
-    """Return the feedback along a trajectory, and its start options."""
+    """Return the feedback along a trajectory, and the options of its start."""
     from fflin.control.gain_schedule import GainSchedule
     from fflin.control.policies import Allocation
     from fflin.control.tracking import TrajectoryFeedback
@@ -263,16 +274,23 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
     refuse(
         arguments,
         ("free", "mpc", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS),
-        "the trajectory defines the target",
+        "the target and the regulator follow from the trajectory",
     )
     poses = ("joint", "rpy", "position", "velocity")
-    refuse(arguments, poses, "the start is on the trajectory, or displaced from it by --offset")
-    design = _without_thrusters(robot) if arguments.allocate else robot
+    refuse(
+        arguments,
+        poses,
+        "the simulation starts on the trajectory, and only --offset displaces the start from it",
+    )
+    design = robot_of_design(robot, bool(arguments.allocate))
     if arguments.schedule is None:
         models = models_along(arguments, design)
         policy = TrajectoryFeedback(models, schedule_of(models, arguments))
     else:
-        why = "the file of --schedule contains the trajectory, weights and sample time"
+        why = (
+            "the file of --schedule already contains the trajectory, its hold, the weights and "
+            "the sample time"
+        )
         refuse(arguments, ("trajectory", "hold", *_WEIGHTS), why)
         schedule = GainSchedule.load(arguments.schedule)
         policy = TrajectoryFeedback(schedule.trajectory(design), schedule)
@@ -283,9 +301,9 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
 
 
 def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> LinearModel:
-    """Return the model about the operating point of a gain.
+    """Return the linear model about the operating point of a gain.
 
-    If the gain is about its reference, the reference is the target pose of the base.
+    If the operating point is at its own reference, the target pose of the base is the reference.
     """
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
@@ -299,27 +317,16 @@ def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> Linea
         require_same(made, robot, kind, own, (there.names, there.units))
     q, v = state.to_pinocchio(gain.x0)
     if gain.x0[:6].any():
-        refuse(arguments, _POSE, "--gain contains the pose of the base")
+        refuse(
+            arguments,
+            _POSE,
+            "the operating point in the file of --gain already contains the pose of the base",
+        )
     else:
         q[:7] = target_of(robot, arguments)[0][:7]
     if number := arguments.relative_equilibrium:
         q, reference = attitude(robot, q, number, gain.frame)
     return linearize(robot, q, v, gain.u0, frame=gain.frame, reference=reference)
-
-
-def _without_thrusters(robot: Robot) -> Robot:
-    from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
-
-    others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
-    if len(others) == len(robot.inputs):
-        raise InputError(
-            f"--allocate: '{robot.name}' has no thrusters; give --inputs with thrusters"
-        )
-    missing = [
-        kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)
-    ]
-    base = tuple(kind() for kind in missing)
-    return robot.replace(inputs=(*base, *others))
 
 
 def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
@@ -332,8 +339,8 @@ def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
 
 
 def target_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:
-    """Return q (nq,) and v (nv,) of the target, which is the point of the robot by default."""
-    from fflin.robot.fields import combined
+    """Return the target q (nq,) and v (nv,), by default the operating point of the robot."""
+    from fflin.dynamics.points import combined
 
     refuse_pose(arguments, "target_")
     state = combined(robot.point, robot.target)

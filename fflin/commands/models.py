@@ -1,4 +1,4 @@
-"""The commands `robots`, `info`, `init`, `linearize` and `check`."""
+"""Commands `robots`, `info`, `init`, `linearize` and `check`."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: parser.Commands) -> None:
-    """Add robots, info, init, linearize and check."""
+    """Add the commands robots, info, init, linearize and check."""
     summary = "list the robots that can be loaded by name"
     parser.command(commands, "robots", _robots, summary, example="fflin robots")
     info = parser.command(
         commands,
         "info",
         _info,
-        "show mass, inertia, wheels and thrusters at a configuration, and the joint tree, limits "
-        "and settings",
+        "show the joint tree, limits and settings of a robot, and its mass, inertia, wheels and "
+        "thrusters at a configuration",
         example="fflin info servicer_7dof",
     )
     options.add_robot(info)
@@ -45,7 +45,8 @@ def add_commands(commands: parser.Commands) -> None:
         commands,
         "init",
         _init,
-        "write a first robot.toml for a URDF, with all inputs, limits and unactuated joints",
+        "write an initial robot.toml for a URDF; the file lists all inputs, limits and "
+        "unactuated joints",
         example="fflin init my.urdf && fflin simulate my.toml",
     )
     urdf = "path of a URDF, or a robot name listed by `fflin robots`"
@@ -73,12 +74,13 @@ def _add_linearize(commands: parser.Commands) -> None:
     made.add("--dt", "sample the model at the sample time H [s] with zero-order hold", float, "H")
     made.add(
         "--for",
-        "convert the model to the coordinates of a tool, and save the result; requires -o FILE",
+        "convert the model to the coordinates that a tool uses, and save the result; requires -o "
+        "FILE",
         choices=("drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"),
         dest="tool",
     )
     add_trajectory(linearize)
-    what = "A, B, C, D (with .csv one file per matrix: NAME.A.csv, ...)"
+    what = "A, B, C and D (.csv: one file per matrix, such as NAME.A.csv)"
     options.add_output_file(
         made, what, parser.TABLE, "LinearModel", "LinearTrajectory", "ToolModel"
     )
@@ -90,7 +92,8 @@ def _add_check(commands: parser.Commands) -> None:
         commands,
         "check",
         _check,
-        "compare A and B with two independent computations; exit code 1 if they differ",
+        "compare A and B with two independent computations; the exit code is 1 if the results "
+        "differ",
         example="fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
         common="joint rpy position velocity effort equilibrium frame reference inputs trajectory "
         "tolerance plot",
@@ -98,7 +101,9 @@ def _add_check(commands: parser.Commands) -> None:
     options.add_point(check)
     add_trajectory(check)
     shown = check.group(parser.OUTPUT)
-    tolerance = "relative tolerance of all errors. By default, each error has a different tolerance"
+    tolerance = (
+        "relative tolerance for all errors. By default, each kind of error has its own tolerance"
+    )
     shown.add("--tolerance", tolerance, float, "X")
     options.add_figure(check, "the errors and their tolerances")
 
@@ -112,7 +117,7 @@ def _robots(_: argparse.Namespace) -> Report:
     for name in list_robots():
         try:
             with warnings.catch_warnings():
-                # `fflin info` shows the warnings of each robot.
+                # These warnings are left to `fflin info`.
                 warnings.simplefilter("ignore", FflinWarning)
                 entries.append((name, load(name), find_robot(name).origin))
         except FflinError as error:
@@ -188,11 +193,13 @@ def _init(arguments: argparse.Namespace) -> Report:
 
 
 def _linearize(arguments: argparse.Namespace) -> Report:
-    if arguments.tool and (arguments.trajectory or not arguments.output_file):
+    if arguments.tool and arguments.trajectory:
         raise InputError(
-            "--for converts a model at a point and saves it; use --for with -o FILE and without "
-            "--trajectory"
+            "--for converts the model about one operating point, but --trajectory defines many; "
+            "remove one of them"
         )
+    if arguments.tool and not arguments.output_file:
+        raise InputError("--for saves the converted model; add -o FILE")
     if arguments.output_file and (arguments.tool or arguments.trajectory):
         check_ending(arguments.output_file, parser.RECORD.endings)
     if arguments.trajectory:
@@ -225,7 +232,7 @@ _MOVES = 1e-9
 
 
 def model_report(lin: LinearModel) -> str:
-    """Show a linear model: its point, A, B, C, D and its certificate."""
+    """Format a linear model: its operating point, A, B, C, D and its certificate."""
     import numpy as np
 
     nx, nu = lin.B.shape
@@ -233,18 +240,18 @@ def model_report(lin: LinearModel) -> str:
     point = "a fixed point" if stays else "not a fixed point"
     if stays and (lin.moving or f0.any()):
         point = "a relative equilibrium"
-    head = f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}, {point}"
-    if lin.dt:
-        head += f", sampled every {lin.dt:g} s"
+    sampled = f", sampled every {lin.dt:g} s" if lin.dt else ""
+    head = f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}{sampled}"
+    head += f"; the operating point is {point}"
     parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # In motion the poles of a frozen model do not show stability. If A A = 0, all are zero.
+    # The poles of a model in motion do not show stability. If A A = 0, all poles are zero.
     if stays and not lin.dt and (lin.A @ lin.A).any():
         from fflin.analysis.modes import modes
 
         if growing := modes(lin).unstable:
             shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
-            shown = f"unstable: poles with a positive real part {shown}"
+            shown = f"unstable poles (positive real part): {shown}"
             parts.append(textwrap.fill(shown, width()))
     moved = [
         signals(title, values, names, units)
@@ -260,20 +267,21 @@ def model_report(lin: LinearModel) -> str:
     parts.append(_named_matrix("A", lin.A, lin.state_names, lin.state_names))
     parts.append(_named_matrix("B", lin.B, lin.state_names, lin.input_names))
     if lin.output_names == lin.state_names and not lin.D.any():
-        parts.append("C = E, D = 0: the output is the state")
+        parts.append("C = I, D = 0: the output is the state")
     else:
         parts.append(_named_matrix("C", lin.C, lin.output_names, lin.state_names))
         parts.append(_named_matrix("D", lin.D, lin.output_names, lin.input_names))
     c = lin.certificate
     parts.append(
-        f"A and B against ABA derivatives: {c.route_A:.1e} and {c.route_B:.1e}; M M^-1 - E: "
-        f"{c.inertia_residual:.1e};\ncond(M), scaled: {c.condition:.1e}; |f0|: {c.f0:.1e}"
+        f"relative error compared with ABA derivatives: A {c.route_A:.1e}, B "
+        f"{c.route_B:.1e}\nlargest entries: M M^-1 - I {c.inertia_residual:.1e}, f0 "
+        f"{c.f0:.1e}\ncondition number of the scaled M: {c.condition:.1e}"
     )
     return "\n\n".join(parts)
 
 
 def inputs_report(robot: Robot) -> str:
-    """Show the inputs of a robot and their limits."""
+    """Format the inputs of a robot and their limits."""
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
     from fflin.robot.limits import limits_of
@@ -283,7 +291,7 @@ def inputs_report(robot: Robot) -> str:
     for name, unit in zip(acting.names, acting.units, strict=True):
         ends = limits.get(name, (-math.inf, math.inf))
         rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
-    return grid(cut(rows, "see linearize -o"), "ll")
+    return grid(cut(rows, "see --json"), "ll")
 
 
 def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
@@ -294,7 +302,7 @@ def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Seque
 
 
 def _units(lin: LinearModel) -> str:
-    """Return the units of states, inputs and outputs, once for each group."""
+    """Return the units of the states, inputs and outputs, once for each group of names."""
     lines = [("x", lin.state_names, lin.state_units), ("u", lin.input_names, lin.input_units)]
     if lin.output_names != lin.state_names:
         lines.append(("y", lin.output_names, lin.output_units))

@@ -1,10 +1,9 @@
-"""Options that several commands share."""
+"""Options that are shared by several commands."""
 
 from __future__ import annotations
 
 import argparse
 import warnings
-from typing import Any
 
 from fflin.base.errors import FflinWarning
 from fflin.commands.parser import (
@@ -25,9 +24,11 @@ from fflin.commands.parser import (
 
 
 class _FormerName(argparse.Action):
-    """Option under its former name, which warns of the new one."""
+    """Option under its former name; it warns that there is a new name."""
 
-    def __call__(self, _: Any, given: argparse.Namespace, value: Any, option: Any = None) -> None:
+    def __call__(
+        self, _: object, given: argparse.Namespace, value: object, option: object = None
+    ) -> None:
         new = f"--{self.dest.replace('_', '-')}"
         warnings.warn(
             f"{option} has the new name {new}; write {new} {value}", FflinWarning, stacklevel=2
@@ -36,7 +37,7 @@ class _FormerName(argparse.Action):
 
 
 def add_former_name(group: Group, name: str, new: str) -> None:
-    """Add the former name of an option for a time in seconds."""
+    """Add the former name of a time option."""
     text = f"former name of --{new}"
     group.add_argument(name, dest=new, type=number, metavar="H", action=_FormerName, help=text)
 
@@ -47,15 +48,15 @@ def add_robot(command: Command) -> None:
     command.add_argument("robot", metavar="ROBOT", type=input_name, help=what)
     command.group(ROBOT).add(
         "--lock",
-        "lock a joint at VALUE [rad|m]; by default at its neutral position. In every option, "
-        "NAME can also be a pattern such as 'hinge_*'",
+        "lock a joint at VALUE [rad|m]. Without VALUE, the joint is locked at its neutral "
+        "position. In every option, NAME can also be a pattern such as 'hinge_*'",
         lock,
         repeatable=True,
     )
 
 
 def add_point(command: Command) -> None:
-    """Add the robot and the options of its operating point."""
+    """Add the robot and the options of the operating point."""
     point = command.group(POINT)
     add_robot(command)
     add_pose(point)
@@ -69,8 +70,8 @@ def add_pose(group: Group) -> None:
     """Add the options for the configuration and velocity of the robot."""
     group.add(
         "--joint",
-        "position of a joint [rad|m]. The default is the position in robot.toml, or the neutral "
-        "position",
+        "position of a joint [rad|m]. The default is the position in robot.toml or, if there is "
+        "none, the neutral position",
         assignment,
         repeatable=True,
     )
@@ -79,8 +80,8 @@ def add_pose(group: Group) -> None:
     group.add("--position", "base position [m]", float, ("X", "Y", "Z"))
     group.add(
         "--velocity",
-        "velocity of a joint or wheel [rad/s|m/s], or a component omega_b.x ... v_b.z of the base "
-        "velocity in base axes",
+        "velocity of a joint or wheel [rad/s|m/s], or a component of the base velocity in base "
+        "axes (omega_b.x ... v_b.z)",
         assignment,
         repeatable=True,
     )
@@ -90,8 +91,8 @@ def add_target(group: Group) -> None:
     """Add the options for the configuration and velocity of the target."""
     group.add(
         "--target-joint",
-        "target position of a joint [rad|m]. The default is the value in [target] of robot.toml, "
-        "then in [point], then the neutral position",
+        "target position of a joint [rad|m]. The default is the first of these that exists: the "
+        "value in [target] of robot.toml, the value in [point], the neutral position",
         assignment,
         repeatable=True,
     )
@@ -111,23 +112,23 @@ def add_limits(group: Group) -> None:
     """Add --limits and --limit."""
     group.add(
         "--limits",
-        "limits of the inputs. `urdf` (default) uses the limits of the robot and of --limit; "
-        "`none` uses only --limit. The limits of the robot are the efforts in the URDF, max and "
-        "min of the inputs, and the speeds of the wheels",
+        "limits of the inputs. `urdf` (default) uses the limits of the robot and the limits of "
+        "--limit; `none` uses only the limits of --limit. The limits of the robot are the joint "
+        "efforts in the URDF, the min and max of its inputs, and the largest speeds of its wheels",
         choices=("urdf", "none"),
         default="urdf",
     )
     group.add(
         "--limit",
-        "largest magnitude of an input, or of all inputs in a group or pattern such as tau_m. This "
-        "limit replaces the limit of the robot",
+        "largest magnitude of an input, or of each input in a group or pattern such as tau_m. "
+        "This limit replaces the limit of the robot",
         assignment,
         repeatable=True,
     )
 
 
 def add_step(group: Group) -> None:
-    """Add --dt, and --step as it was called."""
+    """Add --dt, and its former name --step."""
     group.add("--dt", "integration step [s]; chosen automatically by default", float, "H")
     group.add("--step", "former name of --dt", float, "H")
 
@@ -157,14 +158,15 @@ def add_inputs_there(group: Group) -> None:
     group.switch(
         "--equilibrium",
         "apply the minimum-norm inputs that make the operating point an equilibrium (or a steady "
-        "motion) under springs and gravity. Passive joints deflect their springs to balance the "
-        "load. If no inputs keep the robot at the operating point, the command reports an error",
+        "motion) under springs and gravity. The springs of passive joints deflect until they "
+        "balance the load. If no inputs can hold the robot at the operating point, the command "
+        "reports an error",
     )
     group.add(
         "--relative-equilibrium",
-        "for a robot in orbit: use the N-th of the 24 attitudes without gravity-gradient torque (1 "
-        "by default), and the inputs that --equilibrium computes. Attitude and position in the "
-        "state are relative to the pose of this equilibrium",
+        "for a robot in orbit: use the N-th of the 24 attitudes without gravity-gradient torque "
+        "(1 by default), and the inputs that --equilibrium computes. The state measures attitude "
+        "and position from this equilibrium pose",
         int,
         "N",
         nargs="?",
@@ -174,7 +176,7 @@ def add_inputs_there(group: Group) -> None:
 
 
 def add_reference(group: Group) -> None:
-    """Add the option for the reference of attitude and position."""
+    """Add the option for the origin of attitude and position."""
     group.add(
         "--reference",
         "pose from which the attitude and position in the state are measured: the base pose at "
@@ -188,12 +190,13 @@ def add_frame(group: Group) -> None:
     """Add the option for the axes of velocities and wrenches."""
     group.add(
         "--frame",
-        "axes of base velocities and wrenches. `hybrid` (default) uses base axes for angular parts "
-        "and reference axes for linear parts. `local` uses base axes for all parts, and `world` "
-        "uses reference axes for all parts. A robot in orbit has the axes of `hybrid`, and an "
-        "orbital frame is its world. In `lvlh` (default in orbit), x is along the orbit, y "
-        "opposite to the orbit normal and z towards the central body. In `hill`, x is away from "
-        "the central body, y along the orbit and z along the orbit normal",
+        "axes of base velocities and wrenches. `hybrid` (default) uses base axes for angular "
+        "parts and reference axes for linear parts. `local` uses base axes for all parts, and "
+        "`world` uses reference axes for all parts. For a robot in orbit, the axes are as in "
+        "`hybrid`, but the world is an orbital frame, `lvlh` (default) or `hill`. In `lvlh`, x "
+        "points along the orbit, y opposite to the orbit normal and z towards the central body. "
+        "In `hill`, x points away from the central body, y along the orbit and z along the orbit "
+        "normal",
         choices=("hybrid", "local", "world", "lvlh", "hill"),
     )
 
@@ -209,7 +212,7 @@ def add_orbit(group: Group) -> None:
 
 
 def add_system(command: Command) -> None:
-    """Add the options for forces, inputs and outputs, which robot.toml may set too."""
+    """Add the options for forces, inputs and outputs, which robot.toml can also set."""
     group = command.group(ROBOT)
     add_orbit(group)
     group.add(
@@ -220,8 +223,8 @@ def add_system(command: Command) -> None:
     )
     group.add(
         "--damping",
-        "damping of a joint [N m s/rad|N s/m], or one value for all joints. The value `urdf` means "
-        "the damping in the URDF",
+        "damping of a joint [N m s/rad|N s/m], or one value for all joints. With `urdf` as "
+        "VALUE, the damping in the URDF is used",
         joint_or_all,
         repeatable=True,
     )
@@ -236,8 +239,8 @@ def add_system(command: Command) -> None:
     group.add(
         "--inputs",
         "inputs of the robot: a TOML file of inputs, a bundled name such as cubesat, `joints` "
-        "(joint torques only) or `base` (base torque and force only). The default is the inputs in "
-        "robot.toml. If robot.toml has none, it is base torque, base force and all joint torques",
+        "(joint torques only) or `base` (base torque and force only). The default is the inputs "
+        "in robot.toml or, if there are none, base torque, base force and all joint torques",
         input_name,
     )
     group.add(
@@ -254,7 +257,7 @@ def add_system(command: Command) -> None:
 def add_output_file(
     group: Group, what: str, endings: OutputFile, *kinds: str, required: bool = False
 ) -> None:
-    """Add -o FILE, and --force if `kinds` of results are given; see `require_own_kind`."""
+    """Add -o FILE, and --force if `kinds` of results are given (see `require_own_kind`)."""
     group.add_argument(
         "-o",
         "--output-file",
@@ -266,8 +269,8 @@ def add_output_file(
     if kinds:
         group.switch(
             "--force",
-            "let -o replace a file of any content; by default -o replaces only results of the same "
-            "kind",
+            "replace the file of -o, whatever it contains. Without --force, -o replaces only a "
+            "file that contains a result of the same kind",
         )
         group.set_defaults(kinds=kinds)
 

@@ -1,4 +1,4 @@
-"""The commands `validity` and `funnel`: regions in which a model or a regulator is valid."""
+"""Commands `validity` and `funnel`: regions in which a model or a regulator is valid."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from pathlib import Path
 from fflin.base.errors import InputError
 from fflin.commands import options, parser
 from fflin.commands.loops import along
-from fflin.commands.points import limits_of_options, linear_model, load_robot, once
-from fflin.commands.regulator import add_trajectory, add_weights, gain_of, regulated_part
+from fflin.commands.points import limits_of_options, load_robot, once
+from fflin.commands.regulator import add_allocation, add_trajectory, add_weights, designed
 from fflin.commands.results import Report, figure_of
 
 _ERRORS = "attitude [deg], position [m], joints, omega_b, v_b or joint rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
 
-# Options of other commands, which `along` refuses.
+# `along` refuses these options of other commands, so they need a value here.
 _NONE = "free mpc gain controller target_joint target_rpy target_position target_velocity effort"
 _NONE += " equilibrium"
 _NONE += " joint rpy position velocity"
 
 
 def add_commands(commands: parser.Commands) -> None:
-    """Add validity and funnel."""
+    """Add the commands validity and funnel."""
     _add_validity(commands)
     _add_funnel(commands)
 
@@ -39,6 +39,7 @@ def _add_validity(commands: parser.Commands) -> None:
     )
     options.add_point(validity)
     add_weights(validity)
+    add_allocation(validity.group(parser.CONTROLLER))
     runs = validity.group("runs")
     runs.add("--attitude", "largest rotation of the base [deg]", float, "X", default=90.0)
     runs.add("--offset", "largest displacement of the base [m]", float, "X", default=0.5)
@@ -48,8 +49,8 @@ def _add_validity(commands: parser.Commands) -> None:
     runs.add("--jobs", "number of processes; at most one per core", int, default=1)
     runs.add(
         "--limits",
-        "urdf: saturate the inputs at the limits of the robot; none (default): do not saturate the "
-        "inputs",
+        "saturate the inputs at the limits of the robot (urdf), or do not saturate them (none, "
+        "default)",
         choices=("urdf", "none"),
         default="none",
     )
@@ -74,19 +75,19 @@ def _add_funnel(commands: parser.Commands) -> None:
     runs, shown = funnel.group("runs"), funnel.group(parser.OUTPUT)
     funnel.group(parser.CONTROLLER).add(
         "--schedule",
-        "use gains saved by `fflin tvlqr`, and the trajectory that FILE contains, without "
-        "--trajectory",
+        "use the gains in FILE, which `fflin tvlqr` saved, and the trajectory that FILE also "
+        "contains. This option replaces --trajectory",
         Path,
     )
-    goal = f"largest error allowed at the end: {_ERRORS}"
+    goal = f"largest error allowed at the end of a run: {_ERRORS}"
     runs.add("--goal", goal, parser.assignment, repeatable=True)
-    within = "largest error allowed at any time of a run. NAME is as in --goal"
+    within = "largest error allowed at any time of a run, named as in --goal"
     runs.add("--within", within, parser.assignment, repeatable=True)
     options.add_limits(runs)
     runs.add("--knots", "number of knots to test", int, default=10)
     runs.add("--samples", "number of runs from each knot", int, default=100)
     runs.add("--seed", "random seed of the runs", parser.whole, "S", default=0)
-    runs.add("--confidence", "confidence level of the intervals", float, "P", default=0.95)
+    runs.add("--confidence", "confidence level of all intervals", float, "P", default=0.95)
     runs.add("--threads", "number of threads; by default one per core", int)
     options.add_step(runs)
     options.add_figure(funnel, "the funnel")
@@ -94,21 +95,19 @@ def _add_funnel(commands: parser.Commands) -> None:
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 
-_FREE = "not limited; --limits urdf saturates the inputs"
+_FREE = "not saturated; --limits urdf saturates them at the limits of the robot"
 
 
 def _validity(arguments: argparse.Namespace) -> Report:
     from fflin.base.process import Progress
     from fflin.campaign.validity import validity
 
-    robot, lin = linear_model(arguments)
-    lin = regulated_part(lin, arguments)
-    gain = gain_of(lin, arguments)
+    robot, design, lin, gain = designed(arguments)
     judged = lin.discretize(arguments.sample) if arguments.sample else lin
     bar, cut = Progress(), arguments.limits == "urdf"
     try:
         found = validity(
-            robot,
+            design,
             judged,
             gain,
             attitude=arguments.attitude,
@@ -125,6 +124,8 @@ def _validity(arguments: argparse.Namespace) -> Report:
     text = str(found)
     if cut or any(name in lin.limits for name in lin.input_names):
         text += "\ninputs were " + ("saturated at the limits of the robot" if cut else _FREE)
+    if design is not robot:
+        text += "\nan ideal torque and force on the base replace the thrusters (--no-allocate)"
     return Report(robot.name, found, text, {arguments.plot: figure_of("plot_validity", found)})
 
 

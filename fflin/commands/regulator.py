@@ -1,4 +1,4 @@
-"""The commands `lqr`, `tvlqr` and `export`, and the design options that other commands share."""
+"""Commands `lqr`, `tvlqr` and `export`, and design options that other commands share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityError
+from fflin.base.errors import (
+    EquilibriumError,
+    FflinWarning,
+    InputError,
+    StabilizabilityError,
+    UnknownNameError,
+)
+from fflin.base.tables import folded
 from fflin.commands import DONE, FELL_SHORT, options, parser
 from fflin.commands.points import linear_model, load_robot, once, refuse
 from fflin.commands.results import Report, figure_of
@@ -17,6 +24,7 @@ from fflin.commands.results import Report, figure_of
 if TYPE_CHECKING:
     from fflin.control.gain import Gain
     from fflin.control.gain_schedule import GainSchedule
+    from fflin.control.kalman import Compensator
     from fflin.linear.check import Check
     from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
@@ -24,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: parser.Commands) -> None:
-    """Add lqr, tvlqr and export."""
+    """Add the commands lqr, tvlqr and export."""
     _add_lqr(commands)
     _add_tvlqr(commands)
     _add_export(commands)
@@ -42,8 +50,9 @@ def _add_lqr(commands: parser.Commands) -> None:
     )
     options.add_point(lqr)
     add_weights(lqr)
+    add_allocation(lqr.group(parser.CONTROLLER))
     options.add_output_file(lqr.group(parser.OUTPUT), "the gain", parser.RECORD, "Gain")
-    options.add_figure(lqr, "the poles, and the loop gain of each input with its margins,")
+    options.add_figure(lqr, "the poles, the loop gain of each input and the stability margins")
 
 
 def _add_tvlqr(commands: parser.Commands) -> None:
@@ -51,7 +60,7 @@ def _add_tvlqr(commands: parser.Commands) -> None:
         commands,
         "tvlqr",
         _tvlqr,
-        "design the time-varying regulator along a trajectory",
+        "design a time-varying linear quadratic regulator along a trajectory",
         example="fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 "
         "-o gains.npz",
         common="trajectory hold strict weights q r bryson sample qf inputs frame output-file",
@@ -86,14 +95,14 @@ def _add_export(commands: parser.Commands) -> None:
     group.add_argument("-o", "--output-folder", metavar="FOLDER", required=True, help=folder)
     group.add(
         "--robot",
-        "robot of the design: a name listed by `fflin robots`, or the path of a URDF or "
-        "robot.toml. The default is the robot named in FILE",
+        "robot for which FILE was designed: a name listed by `fflin robots`, or the path of a "
+        "URDF or robot.toml. The default is the robot that FILE names",
         metavar="ROBOT",
         type=parser.input_name,
     )
     limits = (
-        "urdf: saturate the inputs at the limits of the robot, as `fflin simulate` does; none "
-        "(default): do not saturate the inputs"
+        "saturate the inputs at the limits of the robot as `fflin simulate` does (urdf), or do "
+        "not saturate them (none, default)"
     )
     group.add("--limits", limits, choices=("urdf", "none"), default="none")
     group.add("--name", "prefix of all names in the C code", metavar="NAME", default="controller")
@@ -102,9 +111,9 @@ def _add_export(commands: parser.Commands) -> None:
 
 
 def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
-    """Add the options of the cost, the sample time and the regulated states.
+    """Add the options for the cost, the sample time and the regulated states.
 
-    If a loop is `integrated`, --dt is its integration step; otherwise it is the former --sample.
+    With `integrated`, --dt is the integration step. Otherwise, --dt is the former name of --sample.
     """
     group = command.group(parser.CONTROLLER)
     group.add(
@@ -131,8 +140,9 @@ def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
     )
     group.add(
         "--bryson",
-        "largest acceptable value of a state, an input or a group. The weight is 1/VALUE^2, and "
-        "the weights of the rule are scaled to match",
+        "largest acceptable value of a state, an input or a group. Its weight is 1/VALUE^2, and "
+        "all weights set by the rule are multiplied by one factor, so that both kinds of weights "
+        "are comparable",
         parser.assignment,
         repeatable=True,
     )
@@ -151,22 +161,69 @@ def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
     )
     group.yes_or_no(
         "--wheel-speeds",
-        "regulate the speeds of reaction wheels to their values at the operating point, or not. By "
-        "default, wheel speeds are regulated if thrusters or a base torque can absorb the wheel "
-        "torque. --wheel-speeds also regulates combinations of wheel speeds without net torque on "
-        "the robot (redundant wheels)",
+        "whether to regulate the speeds of reaction wheels to their values at the operating "
+        "point. By default, wheel speeds are regulated if thrusters or a base torque can absorb "
+        "the wheel torque. --wheel-speeds also regulates the combinations of wheel speeds that "
+        "exert no net torque on the robot (redundant wheels)",
     )
 
 
+def add_allocation(group: parser.Group) -> None:
+    """Add --allocate and --no-allocate."""
+    group.yes_or_no(
+        "--allocate",
+        "design the regulator with base torque and force as inputs, and allocate its commands to "
+        "the thrusters, which produce the nearest possible wrench. Allocation is the default if "
+        "the thrusters can push in every direction. With --no-allocate, the regulator commands "
+        "each thruster itself, and negative thrust is cut at zero",
+    )
+
+
+def robot_of_design(
+    robot: Robot, allocate: bool | None, law: Gain | GainSchedule | Compensator | None = None
+) -> Robot:
+    """Return the robot of a design; with allocation, base torque and force replace the thrusters.
+
+    By default, thrusters are allocated if they can push in every direction, unless the law in a
+    file was designed for other inputs.
+    """
+    from fflin.control.authority import thrusters_give_every_wrench
+    from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
+
+    if allocate is None:
+        of_wrench = law is None or "tau_b.x" in law.input_names
+        allocate = of_wrench and thrusters_give_every_wrench(robot)
+    if not allocate:
+        return robot
+    others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
+    if len(others) == len(robot.inputs):
+        raise InputError(
+            f"--allocate needs thrusters, but '{robot.name}' has none; define them in the file of "
+            "--inputs"
+        )
+    missing = [
+        kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)
+    ]
+    return robot.replace(inputs=(*(kind() for kind in missing), *others))
+
+
+def designed(arguments: argparse.Namespace) -> tuple[Robot, Robot, LinearModel, Gain]:
+    """Return the robot, the robot of the design, the regulated model, and the regulator."""
+    robot = load_robot(arguments)
+    design = robot_of_design(robot, arguments.allocate)
+    lin = regulated_part(linear_model(arguments, design)[1], arguments)
+    return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
+
+
 def weights_of(arguments: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """Return the weights of --q, --r and --bryson; nothing if none of them is given."""
+    """Return the weights of --q, --r and --bryson, or {} if none of these options is given."""
     names = ("q", "r", "bryson")
     given = {name: once(f"--{name}", getattr(arguments, name)) for name in names}
     return given if any(given.values()) else {}
 
 
 def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearModel:
-    """Return the model of the design; with --reduce, its controllable part."""
+    """Return the model for the design: the controllable part of `lin` if --reduce is given."""
     if not arguments.reduce:
         return lin
     from fflin.analysis.reduction import momentum_reduction
@@ -174,8 +231,8 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
     return momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
 
 
-def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
-    """Return the regulator of the weights; warn if its margins are small."""
+def gain_of(lin: LinearModel, arguments: argparse.Namespace, *, allocated: bool = False) -> Gain:
+    """Return the regulator for the weights in the arguments; warn if its margins are small."""
     from fflin.control.gain import fragility, one_sided
     from fflin.control.lqr import lqr, require_fixed_point
     from fflin.control.weights import rule_weights
@@ -183,7 +240,8 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     try:
         require_fixed_point(lin)
     except EquilibriumError as error:
-        # --equilibrium balances forces, but a moving base is not a fixed point.
+        # --equilibrium balances the forces, but a moving base is still not a fixed point. The hint
+        # is therefore omitted at nonzero velocity.
         given = arguments.equilibrium or arguments.relative_equilibrium or lin.v.any()
         more = ", --relative-equilibrium" if lin.frame in ("lvlh", "hill") else ""
         raise EquilibriumError(str(error) if given else f"{error} (--equilibrium{more})") from None
@@ -196,6 +254,9 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
             gain = replace(lqr(lin, *weights, wheel_speeds=speeds), weights=rule)
         else:
             gain = lqr(lin, weights=arguments.weights, wheel_speeds=speeds)
+    except UnknownNameError as error:
+        hint = "; --no-allocate weights single thrusters" * allocated
+        raise UnknownNameError(f"{error}{hint}") from None
     except StabilizabilityError as error:
         hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
         raise StabilizabilityError(f"{error}{hint}") from None
@@ -204,13 +265,23 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     return gain
 
 
+_ALLOCATED = (
+    "allocation: tau_b and F_b are realised by the thrusters, in `fflin simulate --gain` too; "
+    "--no-allocate designs the thrusts themselves"
+)
+
+
 def _lqr(arguments: argparse.Namespace) -> Report:
-    _, lin = linear_model(arguments)
-    gain = gain_of(regulated_part(lin, arguments), arguments)
-    # The warnings are on the standard error output.
+    from fflin.base.record import record_of
+
+    robot, design, _, gain = designed(arguments)
+    # The warnings of the gain already appear on stderr.
     text = "\n\n".join(x for x in str(gain).split("\n\n") if not x.startswith("warning: "))
+    if design is not robot:
+        text += f"\n\n{folded([_ALLOCATED])}"
     files = {arguments.output_file: gain.save, arguments.plot: figure_of("plot_loops", gain)}
-    return Report(gain.robot, gain, text, files)
+    result = {**record_of(gain), "margins": gain.margins, "allocated": design is not robot}
+    return Report(gain.robot, result, text, files)
 
 
 def _export(arguments: argparse.Namespace) -> Report:
@@ -223,36 +294,41 @@ def _export(arguments: argparse.Namespace) -> Report:
 
     kinds = {kind.__name__: kind for kind in (Gain, GainSchedule, Compensator)}
     with reading(arguments.file, "Gain, GainSchedule or Compensator"):
-        kind = kinds[text(read_record(arguments.file)[0]["kind"])]
-    law = kind.load(arguments.file)
+        found = text(read_record(arguments.file)[0]["kind"])
+        if found not in kinds:
+            raise ValueError(f"the file contains: {found}")
+    law = kinds[found].load(arguments.file)
+    robot = robot_of_design(load(arguments.robot), None, law) if arguments.robot else None
     folder = write_c(
         law,
         arguments.output_folder,
-        robot=load(arguments.robot) if arguments.robot else None,
+        robot=robot,
         limits=None if arguments.limits == "none" else arguments.limits,
         name=arguments.name,
         real=arguments.real,
     )
     name, real = arguments.name, arguments.real
     test = f"cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm && ./{name}_test"
-    said = f"{law!r} in C99, with numbers of type {real}\nto test it in {folder}: {test}"
+    said = f"C99 code of {law!r}, with numbers of type {real}\nto test it in {folder}: {test}"
     return Report(law.robot, {"name": name, "real": real, "folder": str(folder)}, said)
 
 
 def add_trajectory(command: parser.Command, *, required: bool = False) -> None:
-    """Add --trajectory, --hold and --strict; the file then sets the default of --frame."""
+    """Add --trajectory, --hold and --strict. A trajectory file sets the default of --frame."""
     group = command.group(parser.TRAJECTORY)
     group.add(
         "--trajectory",
-        "use the trajectory in FILE: .npz, .mat, .json or .csv; see fflin.Trajectory.load. --frame "
-        "defines the axes of the data. The default of --frame is the frame named in FILE, or local",
+        "use the trajectory in FILE: .npz, .mat, .json or .csv; see fflin.Trajectory.load. "
+        "--frame states the axes in which FILE gives base velocities and wrenches. The default "
+        "of --frame is the frame named in FILE or, if there is none, local",
         Path,
         required=required,
     )
     group.add(
         "--hold",
         "inputs between the knots of FILE: linearly interpolated (linear), or constant from each "
-        "knot to the next (previous). The default is the setting in FILE, or linear",
+        "knot to the next (previous). The default is the setting in FILE or, if there is none, "
+        "linear",
         choices=("linear", "previous"),
     )
     group.switch(
@@ -261,12 +337,17 @@ def add_trajectory(command: parser.Command, *, required: bool = False) -> None:
 
 
 def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> LinearTrajectory:
-    """Return the linear models along the given trajectory."""
+    """Return the linear models along the trajectory in the arguments."""
     from fflin.linear.linear_trajectory import linearize_trajectory
     from fflin.linear.trajectory import Trajectory
 
     point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
-    refuse(arguments, point, "--trajectory defines a motion, and no operating point applies")
+    refuse(
+        arguments,
+        point,
+        "with --trajectory, the models are about the points of the trajectory, not about an "
+        "operating point",
+    )
     robot = robot or load_robot(arguments)
     settings = {"hold": arguments.hold, "frame": arguments.frame}
     motion = Trajectory.load(arguments.trajectory, robot, **settings)
@@ -274,7 +355,7 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
 
 
 def linearize_along(arguments: argparse.Namespace) -> Report:
-    """Show or save the models along a trajectory."""
+    """Show or save the linear models along a trajectory."""
     along = models_along(arguments)
     if arguments.dt is not None:
         along = along.discretize(arguments.dt)
@@ -282,7 +363,7 @@ def linearize_along(arguments: argparse.Namespace) -> Report:
 
 
 def check_along(arguments: argparse.Namespace) -> Report:
-    """Check the models along a trajectory."""
+    """Check the linear models along a trajectory."""
     from fflin.linear.check import held_to
 
     along = models_along(arguments)
@@ -291,13 +372,18 @@ def check_along(arguments: argparse.Namespace) -> Report:
 
 
 def checked(robot: Robot, found: Check, text: str, files: Any = MappingProxyType({})) -> Report:
-    """Return the report of a check."""
+    """Return the report of a check, with the exit code."""
     result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
     return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)
 
 
 def _tvlqr(arguments: argparse.Namespace) -> Report:
-    refuse(arguments, ("reduce",), "the finite-horizon cost along a trajectory always exists")
+    refuse(
+        arguments,
+        ("reduce",),
+        "a regulator along a trajectory needs no reduced model, because its finite-horizon cost "
+        "always exists",
+    )
     along = models_along(arguments)
     schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
     return Report(along.robot.name, schedule, str(schedule), {arguments.output_file: schedule.save})
@@ -306,7 +392,7 @@ def _tvlqr(arguments: argparse.Namespace) -> Report:
 def schedule_of(
     along: LinearTrajectory, arguments: argparse.Namespace, Qf: Any = "steady"
 ) -> GainSchedule:
-    """Return the regulator of the weights along a trajectory."""
+    """Return the regulator along a trajectory for the weights in the arguments."""
     from fflin.control.default_weights import pace_along
     from fflin.control.tvlqr import steady_end, tvlqr
     from fflin.control.weights import rule_weights

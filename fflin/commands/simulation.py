@@ -1,4 +1,4 @@
-"""The commands `plan`, `simulate` and `montecarlo`: a trajectory, a motion, and many motions."""
+"""Commands `plan`, `simulate` and `montecarlo`: plan a trajectory, simulate one or many motions."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import argparse
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import InputError
+from fflin.base.errors import FileError, InputError
 from fflin.base.names import chosen, input_keys
+from fflin.base.tables import folded
 from fflin.commands import DONE, FELL_SHORT, options, parser
 from fflin.commands.loops import add_loop, loop_of, target_of
 from fflin.commands.points import configuration_of, limits_of_options, load_robot, once, velocity_of
@@ -24,7 +25,7 @@ _PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
 
 
 def add_commands(commands: parser.Commands) -> None:
-    """Add plan, simulate and montecarlo."""
+    """Add the commands plan, simulate and montecarlo."""
     _add_plan(commands)
     _add_simulate(commands)
     _add_montecarlo(commands)
@@ -57,7 +58,8 @@ def _add_plan(commands: parser.Commands) -> None:
     options.add_output_file(
         plan.group(parser.OUTPUT), "the trajectory", parser.TABLE, "Trajectory", "Motion"
     )
-    # Options of other commands, which the start and the target read.
+    # The functions for start and target read these options of other commands, so they need a value
+    # here.
     plan.set_defaults(relative_equilibrium=None)
 
 
@@ -75,13 +77,13 @@ def _add_simulate(commands: parser.Commands) -> None:
     add_loop(simulate)
     simulate.group(parser.SIMULATION).add(
         "--every",
-        "save one row for every N integration steps; by default N is 1, or larger for long runs",
+        "save the state at every N-th integration step; by default N is 1, or larger for long runs",
         int,
     )
     simulate.group(parser.SIMULATION).add(
         "--engine",
-        "simulate in compiled code or in Python. The default is compiled for long runs, if numba "
-        "is installed",
+        "simulate in compiled code or in Python. By default, long runs use compiled code if "
+        "numba is installed, and all other runs use Python",
         choices=("compiled", "python"),
     )
     options.add_figure(simulate, "the nonlinear and the linear motion")
@@ -127,18 +129,19 @@ def _simulate(arguments: argparse.Namespace) -> Report:
 
 
 def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
-    """Return the motion of the arguments."""
+    """Return the motion that the arguments define."""
     from fflin.simulation.simulate import simulate
 
     loop = loop_of(robot, arguments)
-    # The continuous model predicts every row, a sampled model only its samples.
+    # A continuous model predicts all rows of the motion, a sampled model only the rows at its
+    # samples.
     shown = {"every": arguments.every, "engine": arguments.engine}
     return simulate(robot, loop.policy, **shown, **loop.options, **loop.prediction)
 
 
 def _plan(arguments: argparse.Namespace) -> Report:
     from fflin.control.plan import plan
-    from fflin.robot.fields import combined
+    from fflin.dynamics.points import combined
 
     robot = load_robot(arguments)
     state = combined(robot.point, robot.start)
@@ -181,8 +184,8 @@ def _add_montecarlo(commands: parser.Commands) -> None:
     runs.add("--seed", "random seed", parser.whole, "S", default=0)
     runs.add(
         "--until",
-        "stop when the success rate of CONDITION, such as 'attitude < 1 deg', has a confidence "
-        "interval of at most --width",
+        "stop the runs when the confidence interval of the success rate is at most --width wide. "
+        "CONDITION defines success, such as 'attitude < 1 deg'",
         metavar="CONDITION",
     )
     width = "width of the confidence interval at which --until stops the runs"
@@ -195,15 +198,18 @@ def _add_montecarlo(commands: parser.Commands) -> None:
     shown.add(
         "--goal",
         "report the fraction of runs that meet CONDITION, such as 'attitude < 1 deg and settle < "
-        "60 s', and plot the bounds in CONDITION",
+        "60 s', and draw the bounds of CONDITION in --plot",
         metavar="CONDITION",
         repeatable=True,
     )
     shown.add("--worst", "list the K worst runs", parser.whole, "K", default=3)
     options.add_figure(montecarlo, "quantile bands over time, histograms and the worst runs")
-    what = "the runs (with .h5, the same command resumes after an interruption)"
-    force = "replace the file of -o even if the file contains another campaign"
-    options.add_output_file(shown, what, parser.ROWS)
+    what = (
+        "the runs (.csv and .mat are tables for other programs; with .h5, the same command resumes "
+        "after an interruption)"
+    )
+    force = "replace the file of -o even if it contains the runs of another command"
+    options.add_output_file(shown, what, parser.RUNS)
     shown.switch("--force", force)
     add_pictures(montecarlo, "that plays the worst run")
 
@@ -212,8 +218,12 @@ def _montecarlo(arguments: argparse.Namespace) -> Report:
     from fflin.campaign.monte_carlo import monte_carlo
     from fflin.campaign.report import campaign_record, worst_runs
     from fflin.campaign.spreads import load_dispersions
+    from fflin.control.policies import bound
 
     path = arguments.output_file
+    is_table = path is not None and path.suffix in (".csv", ".mat")
+    if is_table and path.exists() and not arguments.force:
+        raise FileError(f"{path} already exists; give another file name, or add --force")
     dispersions = load_dispersions(arguments.dispersions)
     robot = load_robot(arguments)
     check_pictures(robot, arguments)
@@ -221,14 +231,17 @@ def _montecarlo(arguments: argparse.Namespace) -> Report:
     settings: dict[str, Any] = {name: getattr(arguments, name) for name in _PASSED} | loop.options
     settings |= {"goals": arguments.goal, "histories": _ROWS if arguments.plot else 0}
     with going_on(path, "runs") as progress:
-        settings |= {"progress": progress, "out": path}
+        settings |= {"progress": progress, "out": None if is_table else path}
         settings["overwrite"] = arguments.force
         campaign = monte_carlo(robot, loop.policy, dispersions, **settings)
     worst = cache(lambda: campaign.replay(campaign.worst(1)[0]))
     files = {
-        path: None,
+        path: campaign.save if is_table else None,
         arguments.plot: figure_of("plot_campaign", campaign),
         **pictures(robot, worst, arguments),
     }
-    text = "\n".join([str(campaign), *worst_runs(campaign, arguments.worst)])
-    return Report(robot.name, campaign_record(campaign, arguments.worst), text, files)
+    notes = getattr(bound(loop.policy, robot), "notes", ()) if loop.policy else ()
+    shown = [str(campaign), *(folded([note]) for note in notes)]
+    text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
+    result = {**campaign_record(campaign, arguments.worst), "notes": notes}
+    return Report(robot.name, result, text, files)

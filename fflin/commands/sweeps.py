@@ -1,4 +1,4 @@
-"""The command `sweep`: linear models about many points."""
+"""Command `sweep`: linear models about many points."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def add_commands(commands: parser.Commands) -> None:
     )
     points = sweep.group(
         "points",
-        "give --grid or --random. The default velocity of all points is the velocity in [point] of "
-        "robot.toml, or zero",
+        "give --grid or --random. By default, all points have the velocity in [point] of "
+        "robot.toml or, if there is none, zero velocity",
     )
     points.add(
         "--grid",
@@ -48,12 +48,12 @@ def add_commands(commands: parser.Commands) -> None:
         "JOINT=LO:HI:N",
         repeatable=True,
     )
-    drawn = "N points, uniformly distributed within the joint limits"
+    drawn = "number of random points, uniformly distributed within the joint limits"
     points.add("--random", drawn, int)
     points.add("--seed", "random seed of --random", parser.whole, "S", default=0)
     points.add(
         "--range",
-        "range of a joint [rad|m] for --random; replaces the joint limits",
+        "range of a joint [rad|m] for --random, in place of its joint limits",
         _range,
         "JOINT=LO:HI",
         repeatable=True,
@@ -74,8 +74,8 @@ def add_commands(commands: parser.Commands) -> None:
     work = sweep.group("computation")
     work.add(
         "--engine",
-        "compute the points in compiled code or in Python. The default is compiled if numba is "
-        "installed and the outputs are the state",
+        "compute the points in compiled code or in Python. By default, the code is compiled if "
+        "numba is installed and the outputs are the state",
         choices=("compiled", "python"),
     )
     workers = "distribute the work over N processes; at most one per core"
@@ -87,7 +87,7 @@ def add_commands(commands: parser.Commands) -> None:
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
-    """Split JOINT=A:B:... into the name and the values of the form."""
+    """Split JOINT=A:B:... into the name and its values, as many as `form` has."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
     if not name or len(parts) != len(form.split(":")):
@@ -125,7 +125,9 @@ def _sweep(arguments: argparse.Namespace) -> Report:
     # All options are valid.
     scale, unit = (1e9, "GB") if size >= 1e9 else (1e3, "kB")
     needs = f"{size / scale:,.1f} {unit}"
-    said = f"fflin: {len(q):,} points of '{robot.name}', {needs} to {path}{resuming}"
+    said = (
+        f"fflin: linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}{resuming}"
+    )
     print(said, file=sys.stderr)
     with going_on(path, "points") as progress:
         work = {"engine": arguments.engine, "workers": arguments.workers, "progress": progress}
@@ -140,7 +142,7 @@ def _sweep(arguments: argparse.Namespace) -> Report:
 def _points(
     robot: Robot, arguments: argparse.Namespace
 ) -> tuple[Configurations, Array | None, Array | None]:
-    """Return q, v and u of the points."""
+    """Return q, v and u of the points of a sweep."""
     import numpy as np
 
     from fflin.batch.configurations import grid, random_configurations
@@ -148,7 +150,7 @@ def _points(
     from fflin.robot.joints import by_joint
 
     if bool(arguments.grid) == (arguments.random is not None):
-        raise InputError("the points of the sweep are not defined; give either --grid or --random")
+        raise InputError("a sweep needs exactly one of --grid and --random; give one of them")
     if arguments.range and arguments.random is None:
         raise InputError("--range needs --random; --grid has its own ranges")
     v = velocity_of(robot, arguments, robot.point, "velocity")
@@ -177,7 +179,7 @@ def _base(robot: Robot, q: Array) -> pin.SE3:
 
 @contextmanager
 def going_on(path: Path | None, what: str) -> Iterator[Progress]:
-    """Yield the progress bar; after Ctrl-C report the progress and the saved part."""
+    """Show a progress bar; after Ctrl-C, report the progress and the file that can be resumed."""
     from fflin.base.process import Progress
     from fflin.batch.files import part_of
 

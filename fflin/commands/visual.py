@@ -1,4 +1,4 @@
-"""The command `view`, and the options of commands that display a motion."""
+"""Command `view`, and the options of commands that display a motion."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ def add_commands(commands: parser.Commands) -> None:
     frames = "orbital frame used as the world; lvlh by default"
     page.add("--frame", frames, choices=("lvlh", "hill"))
     _add_scene(page)
-    page.switch("--no-open", "do not open a browser, and print the address on stderr")
+    page.switch("--no-open", "do not open a browser; the address of the page is printed on stderr")
     port = "port on 127.0.0.1; a free port by default"
     page.add("--port", port, parser.whole, "N")
 
 
 def add_pictures(command: parser.Command, page: str = "that plays the motion offline") -> None:
-    """Add the options of pages, pictures and animations of a motion."""
+    """Add the options for pages, pictures and animations of a motion."""
     group = command.group(parser.OUTPUT)
     group.add("--html", f"write a page {page}", parser.PAGE)
     group.add(
         "--png",
-        "write a picture with a strip of images at the times of --times (four images by default); "
-        "requires Chromium",
+        "write a picture that shows the motion as a strip of images at the times of --times "
+        "(four images by default); requires Chromium",
         parser.PICTURE,
     )
     group.add("--gif", "write an animation; requires Chromium", parser.ANIMATION)
@@ -61,20 +61,20 @@ def add_pictures(command: parser.Command, page: str = "that plays the motion off
 def _add_scene(group: parser.Group) -> None:
     group.add(
         "--scene",
-        "background: sky and planet (space), or a floor with a grid (lab). The default under "
-        "gravity is lab",
+        "background: sky and planet (space), or a floor with a grid (lab). The default is lab "
+        "under uniform gravity, otherwise space",
         choices=("space", "lab"),
     )
     group.add("--tool", "draw the axes and the path of this frame", metavar="FRAME")
     group.yes_or_no(
         "--follow",
-        "let the camera follow the base, or not. By default, the camera follows the base in long "
-        "motions",
+        "whether the camera follows the base. By default, the camera follows the base if the "
+        "robot moves far compared with its size",
     )
 
 
 def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
-    """Refuse the options that `pictures` refuses, before the simulation."""
+    """Raise an error before the simulation if `pictures` would refuse the options."""
     from fflin.view.visualize import check_outputs, check_rates, check_times, check_tool
 
     if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
@@ -93,7 +93,7 @@ def pictures(
     motion: Callable[[], Motion],
     arguments: argparse.Namespace,
 ) -> dict[Path | None, Callable[[Path], object]]:
-    """Return the files of the options of `add_pictures`, with the functions that write them."""
+    """Return {path: function that writes the file} for the options of `add_pictures`."""
     how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *_SHOWN)}
 
     def show(path: Path) -> None:
@@ -106,7 +106,7 @@ def pictures(
 
 
 def _view(arguments: argparse.Namespace) -> Report:
-    from fflin.robot.fields import combined
+    from fflin.dynamics.points import combined
     from fflin.view.live import Live
     from fflin.view.visualize import visualize
 

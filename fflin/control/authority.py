@@ -55,8 +55,8 @@ def point_report(properties: Mapping[str, Any]) -> str:
         along = ["." if abs(x) < _ROUNDING else f"{x:.4f}" for x in axis]
         rows.append([name, *shown, f"{moment:.5g}", *along])
     head_line = (
-        f"centre of mass {_vector(properties['center_of_mass'])} m from the base frame; inertia "
-        "about it in kg\u00a0m^2; at the operating point, in base axes"
+        f"centre of mass at {_vector(properties['center_of_mass'])} m in the base frame, and "
+        "inertia about the centre of mass in kg\u00a0m^2, in base axes, at the operating point"
     )
     parts = [f"{folded([head_line])}\n\n{grid(rows)}"]
     parts.append(wheel_report(properties["wheel_momentum"]))
@@ -111,11 +111,14 @@ def wheel_report(properties: Mapping[str, Any]) -> str:
     total, least = properties["total"], properties["least"]
     text = (
         f"{counted(properties['wheels'], 'wheel')}: total momentum {_vector(total)} N m s, "
-        f"{np.linalg.norm(total):.4g} in all; they span "
+        f"magnitude {np.linalg.norm(total):.4g}; they span "
         f"{('no', 'only one', 'only two', 'three')[properties['axes']]} axes"
     )
     if least is not None:
-        text += f", with at least {least:.4g} N m s in every direction at their largest speeds"
+        text += (
+            f", and they store at least {least:.4g} N m s in every direction at their largest "
+            "speeds"
+        )
     return folded([text])
 
 
@@ -149,14 +152,14 @@ def thruster_report(properties: Mapping[str, Any]) -> str:
         return ""
     text = f"{counted(properties['thrusters'], 'thruster')} alone "
     if not properties["every_way"]:
-        return folded([f"{text}do not push every way: they lack some pure force or torque"])
-    text += "push every way"
+        return folded([f"{text}cannot produce a force and a torque in every direction"])
+    text += "produce forces and torques in every direction"
     if not properties["bounded"]:
-        text += "; not all of them have a limit (max)"
+        text += "; some of them have no limit (max)"
     elif properties["least_force"] is not None:
         text += (
-            f": in any direction at least {properties['least_force']:.4g} N without torque about "
-            f"the centre of mass, or {properties['least_torque']:.4g} N m without force"
+            f": at least {properties['least_force']:.4g} N without a torque about the centre of "
+            f"mass, or {properties['least_torque']:.4g} N m without a force"
         )
     return folded([text])
 

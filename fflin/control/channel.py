@@ -140,7 +140,7 @@ class Law:
 
     def __init__(
         self,
-        policy: Callable[[float, Array, Array], Any],
+        policy: Callable[[float, Array, Array], object],
         names: tuple[str, ...],
         limits: tuple[Array, Array],
         slow: float,
@@ -231,7 +231,7 @@ class Channel:
         """Whether the applied inputs may differ from the command."""
         return bool(self._limited or self._wheels or self._pulses)
 
-    def begin(self, step: int, *point: Any) -> Array:
+    def begin(self, step: int, *point: object) -> Array:
         """Return the applied inputs at the start of a step."""
         if not (self._rules.sample or self._limited or self._wheels):
             return self._law(*point)
@@ -241,6 +241,6 @@ class Channel:
         rules.transmit(self._rules, step, speeds, self._u)
         return self._u.copy()
 
-    def ask(self, *point: Any) -> Array:
+    def ask(self, *point: object) -> Array:
         """Return the applied inputs of the law's present command, if there is no sample time."""
         return self.begin(0, *point)

@@ -275,7 +275,9 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
     source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
     slow = f"; bandwidth limited by {limit.what}" if limit.what else ""
     if beyond := [name for name, room in _efforts_left(lin).items() if room <= 0.0]:
-        slow += f"; already at or beyond the URDF limit at the operating point: {listed(beyond)}"
+        slow += (
+            f"; inputs already at or beyond the URDF limit at the operating point: {listed(beyond)}"
+        )
     pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"
     return f"from {source}, for displacements of {' and '.join(from_where)}: {pace}{slow}"
 
@@ -385,7 +387,7 @@ def _achieved(lin: LinearModel, trial: _Trial) -> str:
     said += f"damping ratio at least {(decay / fast).min():.2g}"
     slow = decay < _AS_SLOW * math.sqrt(0.5) * trial.limit.bandwidth
     if names := _moving_most(lin, trial.modes[:, slow]):
-        said += f"; decaying more slowly: {listed(names)}"
+        said += f"; modes decaying more slowly: {listed(names)}"
     return said
 
 

@@ -52,31 +52,32 @@ class Gain(Design):
     residual : float
         Norm of the Riccati equation's residual, relative to the sum of the norms of its terms.
     margin : float
-        Distance of the poles to the stability boundary: the slowest decay rate [1/s] for a
+        Distance of the poles from the stability boundary: the slowest decay rate [1/s] for a
         continuous model, 1 minus the largest modulus for a sampled model.
     method : str
-        Solver: "structured" (half-size), "general" (SciPy) or "closed form".
+        Method that computed K: "structured" (eigenproblem of half the usual size), "general"
+        (SciPy's Riccati solver) or "closed form" (`acceleration_lqr`).
     A, B, Q, R, N : ndarray
         Matrices of the model, and weights on the deviations x - x0 and u - u0. N is zero if no
         cross weight was given.
     x0 : ndarray (nx,)
     u0 : ndarray (nu,)
-        State and inputs at the point.
+        State and inputs at the operating point.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, state_units, input_units : tuple of str
     frame, robot : str
         Frame of the model and name of the robot.
     weights : str
-        Description of the rule that made the weights.
+        Description of the rule that set the weights.
     regulated : tuple of str (nz,)
-        States that are fed back; if empty, all states are fed back. K, P, Q and N are zero for
-        states that are not fed back.
+        Names of the states that are fed back; empty if all states are fed back. The entries of K,
+        P, Q and N are zero for states that are not fed back.
     placement : ndarray (7,)
-        Reference of the model: position [m] and quaternion x, y, z, w. The array is empty if a
-        file of an older version lacks the reference.
+        Pose of the model's reference: position [m] and quaternion x, y, z, w. The array is empty if
+        the gain was loaded from a file of an older version, which lacks the pose.
     urdf_sha256 : str
-        Hash of the robot of the design, see `Robot`.
+        SHA-256 of the URDF of the robot that the gain was designed for, see `Robot`.
 
     Examples
     --------
@@ -129,7 +130,7 @@ class Gain(Design):
         if self.K.size <= _LARGE:
             shown = f"\n\n{matrix(self.K, self.input_names, self.state_names)}"
         else:
-            shown = ": large, not shown; save() writes every entry"
+            shown = " is too large to show; save() (-o FILE) writes every entry"
         fold = partial(textwrap.fill, width=width())
         more = {
             "not regulated": _unregulated(self),
@@ -176,7 +177,7 @@ class Gain(Design):
         Raises
         ------
         InputError
-            If the gain is from a file, or its model lacks states of the robot.
+            If the gain was loaded from a file, or its model lacks some states of the robot.
         UnknownNameError
             If there is no such tool.
         """
@@ -184,8 +185,8 @@ class Gain(Design):
 
         if self._lin is None:
             raise InputError(
-                "the gain was read from a file, which does not contain the model; design the gain "
-                "again, or use lin.to(tool) and T_u K T_left"
+                "the gain was read from a file, which does not contain the model; design the "
+                "gain again, or compute T_u K T_left with the matrices of lin.to(tool)"
             )
         return tool_gain(self._lin, self.K, tool)
 
@@ -249,11 +250,15 @@ def fragility(gain: Gain) -> str:
     margins = gain.margins
     if margins.disk >= _FRAGILE:
         return ""
-    remedy = "shorten dt, or slow the loop" if gain.dt else "give a diagonal R"
+    remedy = (
+        "shorten dt, or slow the loop as the default weights do"
+        if gain.dt
+        else "give a diagonal R, such as the R of the default weights"
+    )
     return (
         f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
         f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or model error makes the loop "
-        f"unstable; {remedy}, as the default weights do"
+        f"unstable; {remedy}"
     )
 
 
@@ -266,10 +271,10 @@ def one_sided(gain: Gain) -> str:
     if not thrusters:
         return ""
     return (
-        f"the design requires thrusters to pull ({listed(thrusters)}): negative thrust is cut at "
-        "zero, so the poles and margins do not hold; design with torque and force on the base, "
-        "and allocate them to thrusters with fflin.Allocation. `fflin simulate` "
-        "allocates by default if the thrusters push in every direction"
+        f"the gain commands negative thrust ({listed(thrusters)}), which is cut at zero, so the "
+        "poles and margins do not hold; design with torque and force on the base, and allocate "
+        "them to the thrusters with fflin.Allocation. `fflin lqr` and `fflin simulate` do so by "
+        "default if the thrusters can push in every direction"
     )
 
 
@@ -279,8 +284,8 @@ def _unregulated(gain: Gain) -> str:
     if not left:
         return ""
     return (
-        f"{listed(left)} (no input reaches them, or other states determine them; "
-        "wheel_speeds=True regulates all controllable wheel speeds)"
+        f"{listed(left)} (not reached by any input, or determined by other states; "
+        "wheel_speeds=True (--wheel-speeds) regulates all controllable wheel speeds)"
     )
 
 

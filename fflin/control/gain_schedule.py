@@ -48,7 +48,7 @@ class Schedule(Design):
 
     @cached_property
     def interpolant(self) -> Interpolant:
-        """Gain and cost over time."""
+        """Gain and matrix P over time."""
         raise NotImplementedError
 
 
@@ -59,30 +59,30 @@ class GainSchedule(Schedule):
     Attributes
     ----------
     t : ndarray (M,)
-        Times [s] of the knots: the trajectory's knots, and knots added to interpolate P. For a
-        sampled schedule, the sample times.
+        Times [s] of the knots. A continuous schedule has the knots of the trajectory and further
+        knots for the interpolation of P. The knots of a sampled schedule are the sample times.
     K : ndarray (M, nu, nx)
         Gains. In a sampled schedule, the last two gains are equal.
     P : ndarray (M, nx, nx)
         Cost matrix: the optimal cost from time t to the end is e' P(t) e.
     A : ndarray (M, nx, nx)
     B : ndarray (M, nx, nu)
-        Linear model at the knots. A sampled schedule has M - 1 matrices A and B; each pair gives
-        the transition from one sample to the next.
+        Linear model at the knots. A sampled schedule has M - 1 matrices A and B; each pair
+        describes the transition from one sample to the next.
     Q, R, Qf : ndarray
         Weights of the continuous cost.
     residual : float
-        Largest residual of the differential Riccati equation midway between the knots, relative
-        to the sum of the norms of its terms. For a sampled schedule, the residual of the
-        difference equation.
+        Largest residual of the differential Riccati equation midway between the knots, relative to
+        the sum of the norms of its terms. A sampled schedule has the residual of the Riccati
+        difference equation instead.
     state_names, input_names : tuple of str
     robot : str
     dt : float
         Sampling time [s], over which u is held; 0 for continuous time.
     weights : str
-        Description of the rule that made the weights.
+        Description of the rule that set the weights.
     knots, q, v, u, hold, frame
-        The trajectory, see `trajectory`.
+        Data of the trajectory, which `trajectory` returns as a `Trajectory`.
 
     Examples
     --------
@@ -144,12 +144,12 @@ class GainSchedule(Schedule):
         return Trajectory(robot, self.knots, **values, hold=self.hold, frame=self.frame)
 
     def cost_to_go(self, t: float) -> Array:
-        """Return P (nx, nx) at time t by cubic interpolation; if sampled, at the latest sample."""
+        """Return P (nx, nx) at time t: interpolated, or of the latest sample if sampled."""
         return self.interpolant.cost(self._within(t))
 
     @cached_property
     def interpolant(self) -> Interpolant:
-        """Gain and cost over time."""
+        """Gain and cost matrix over time."""
         model = (self.A, self.B, self.Q, self.R)
         return Interpolant(self.t, self.P, self.K, model, self.dt)
 
@@ -158,8 +158,9 @@ class GainSchedule(Schedule):
 class FilterSchedule(Schedule):
     r"""Time-varying Kalman filter for the error e relative to a trajectory.
 
-    With the innovation :math:`\nu = y - y^*(t) - C \hat e - D\,\delta u` of a sample, the estimate
-    for the next sample is
+    Let :math:`y^*(t)` be the outputs along the trajectory, and
+    :math:`\nu = y - y^*(t) - C \hat e - D\,\delta u` the innovation at a sample. The estimate for
+    the next sample is
 
     .. math:: \hat e^+ = A\,\hat e + B\,\delta u + L\,\nu.
 
@@ -179,7 +180,8 @@ class FilterSchedule(Schedule):
     V : ndarray (ny, ny)
         Covariance of the measurement noise at a sample.
     residual : float
-        Residual of the difference equation of P, as in `GainSchedule`.
+        Residual of the Riccati difference equation for P, relative to its terms as in
+        `GainSchedule`.
     state_names, input_names, output_names : tuple of str
     robot : str
     dt : float
@@ -223,7 +225,7 @@ class FilterSchedule(Schedule):
 
     @cached_property
     def interpolant(self) -> Interpolant:
-        """Gain and cost over time."""
+        """Filter gain and error covariance over time."""
         return Interpolant(self.t, self.P, self.L, (), self.dt)
 
 

@@ -128,7 +128,7 @@ class Horizon:
 class Receding:
     """Policy that applies the first input of each plan; `at(t, q, v)` returns u* and e."""
 
-    def __init__(self, horizon: Horizon, at: Any = None) -> None:
+    def __init__(self, horizon: Horizon, at: object = None) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
         self.solves = self.softened = self.unfinished = self.exceeded = 0
@@ -140,14 +140,20 @@ class Receding:
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the run: plans, exceeded limits and failures of the solver."""
-        said = f"{self.solves} plans of {self.of.samples} samples of {self.of.dt:g} s"
+        said = (
+            f"number of MPC plans, each of {self.of.samples} samples of {self.of.dt:g} s: "
+            f"{self.solves}"
+        )
         if self.softened:
-            said += f"; {self.softened} plans exceed a soft limit (worst: {self._said})"
+            said += f"; plans that exceed a soft limit: {self.softened} (worst: {self._said})"
         if self.exceeded:
-            said += f"; the robot exceeds a soft limit at {self.exceeded} samples"
+            said += f"; samples at which the robot exceeds a soft limit: {self.exceeded}"
             said += f" (worst: {self._met})"
         if self.unfinished:
-            said += f"; the saturated LQR command replaces {self.unfinished} plans without solution"
+            said += (
+                "; plans without a solution, replaced by the saturated LQR command: "
+                f"{self.unfinished}"
+            )
         return (said,) if self.solves else ()
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
@@ -181,8 +187,8 @@ class Receding:
             if self.unfinished == 1:
                 warnings.warn(
                     f"the MPC optimisation found no solution at t = {t:g} s (DAQP exit flag "
-                    f"{flag}); in such samples, the LQR command is applied, saturated at the "
-                    "input limits",
+                    f"{flag}); at such samples, the LQR command is applied instead, saturated at "
+                    "the input limits",
                     FflinWarning,
                     2,
                 )

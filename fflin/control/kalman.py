@@ -26,8 +26,9 @@ from fflin.linear.model import LinearModel, state_space
 class Estimator(Design):
     r"""Steady-state Kalman filter for the deviations of the state from the operating point.
 
-    In continuous time, ``d(xh)/dt = A xh + B u + L (y - C xh - D u)``. For a sampled model, the
-    left side is the prediction for the next sample. The filtered estimate, which uses the present
+    With u and y as deviations from u0 and y0, the estimate xh of x - x0 follows
+    ``d(xh)/dt = A xh + B u + L (y - C xh - D u)``. For a sampled model, the right side is the
+    prediction of xh for the next sample. The filtered estimate, which also uses the present
     measurement, is ``xh + L_update (y - C xh - D u)``.
 
     Attributes
@@ -35,8 +36,8 @@ class Estimator(Design):
     L : ndarray (nx, ny)
         Filter gain.
     L_update : ndarray (nx, ny)
-        Gain of the measurement update: ``L = A L_update`` for a sampled model; equal to L in
-        continuous time.
+        Gain of the measurement update. For a sampled model, ``L = A L_update``. In continuous time,
+        `L_update` equals `L`.
     P : ndarray (nx, nx)
         Covariance of the estimation error.
     poles : ndarray (nz,) of complex
@@ -45,20 +46,20 @@ class Estimator(Design):
     residual : float
         Residual of the Riccati equation, relative to the sum of the norms of its terms.
     margin : float
-        Distance of the poles to the stability boundary, as in `Gain`.
+        Distance of the poles from the stability boundary, as in `Gain`.
     A, B, C, D : ndarray
-        The model.
+        Matrices of the model.
     W, V : ndarray
         Covariances of the state disturbance and of the measurement noise.
     x0, u0, y0 : ndarray
-        State, inputs and outputs at the point.
+        State, inputs and outputs at the operating point.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
     robot : str
     estimated : tuple of str (nz,)
-        Estimated states; if empty, all states are estimated. L, P and W are zero for states that
-        are not estimated.
+        Names of the estimated states; empty if all states are estimated. The entries of L, P and W
+        are zero for states that are not estimated.
 
     Examples
     --------
@@ -112,8 +113,8 @@ class Estimator(Design):
 class Compensator(Design):
     r"""Output-feedback compensator ``d(z)/dt = A z + B (y - y0)``, ``u - u0 = C z``.
 
-    For a sampled model, the left side is z at the next sample. The state z is the estimate of
-    x - x0.
+    For a sampled model, ``A z + B (y - y0)`` is the value of z at the next sample. The state z is
+    the estimate of x - x0.
 
     Attributes
     ----------
@@ -124,7 +125,7 @@ class Compensator(Design):
         Closed-loop poles of the model with the compensator: the poles of the gain and of the
         estimator.
     y0, u0 : ndarray
-        Outputs and inputs at the point.
+        Outputs and inputs at the operating point.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
@@ -178,15 +179,16 @@ def kalman(
 ) -> Estimator:
     r"""Return the steady-state Kalman filter of a model about a fixed point.
 
-    White noise w acts on the state and n on the outputs, ``dx/dt = ... + w`` and ``y = ... + n``,
-    with intensities W and V. For a sampled model, W and V are the covariances per sample. P solves
+    White noise w of intensity W acts on the state, ``dx/dt = ... + w``, and white noise n of
+    intensity V on the outputs, ``y = ... + n``. For a sampled model, W and V are the covariances
+    per sample. In continuous time, the covariance P of the estimation error and the gain L satisfy
 
     .. math:: A P + P A^T - P C^T V^{-1} C P + W = 0,\qquad L = P C^T V^{-1}
 
-    For a sampled model, P solves the discrete-time Riccati equation. SciPy solves the equation,
-    and Newton's method refines the solution, as in `lqr`. For a model with reaction wheels, the
-    filter estimates only the states that `lqr` regulates. The filter uses only outputs that
-    depend on the estimated states alone.
+    For a sampled model, P satisfies the discrete-time Riccati equation. Both equations are solved
+    by SciPy, and Newton's method refines the solution, as in `lqr`. For a model with reaction
+    wheels, the filter estimates only the states that `lqr` regulates. It therefore uses only
+    outputs that depend on no other states.
 
     Parameters
     ----------
@@ -210,17 +212,18 @@ def kalman(
     Raises
     ------
     DetectabilityError
-        If the outputs do not observe a mode that does not decay by itself; the message names the
-        mode.
+        If a mode neither decays by itself nor can be observed from the outputs; the message names
+        the mode.
     EquilibriumError
-        If the point is not a fixed point.
+        If the operating point is not a fixed point.
     InputError
         If a size or value is wrong, or if no disturbance reaches a mode that does not decay by
-        itself. A filter without such a disturbance would stop correcting the mode.
+        itself. Without a disturbance, the filter would in time stop correcting the estimate of this
+        mode.
     UnknownNameError
         If a name does not exist.
     ModelError
-        If the robot's Pinocchio model was changed after `load`.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     References
     ----------
@@ -290,8 +293,8 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     Raises
     ------
     InputError
-        If gain and estimator belong to different models, or the gain feeds back a state that is not
-        estimated.
+        If gain and estimator belong to different models, or the gain feeds back a state that the
+        estimator does not estimate.
 
     Examples
     --------

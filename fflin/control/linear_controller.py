@@ -49,14 +49,14 @@ class LinearController(Feedback):
 
     .. math:: \dot z = A z + B (y - y_0),\qquad u - u_0 = C z + D (y - y_0),\qquad z(0) = 0
 
-    y is the vector of the robot's outputs in the chart of the model, as `outputs` returns it. The
-    output of the controller is added to u0. The sign is positive feedback, as for controllers
-    from ``hinfsyn`` and ``h2syn``.
+    Here y is the vector of the robot's outputs in the chart of the model, as `outputs` returns it.
+    The output of the controller is added to u0. Feedback is positive by default, which is the
+    convention of ``hinfsyn`` and ``h2syn``; `sign` selects negative feedback.
 
     A continuous controller is integrated together with the robot, in the same Runge-Kutta stages.
     If `simulate` is given `sample` or `delay`, y is held between samples and z is advanced exactly.
-    A sampled controller is evaluated at its own sample times, which must be multiples of the step.
-    The output u of a sampled controller is held between samples.
+    A sampled controller is evaluated at its own sample times, which must be multiples of the
+    integration step. The output u of a sampled controller is held between samples.
 
     Parameters
     ----------
@@ -70,22 +70,23 @@ class LinearController(Feedback):
         - a .mat, .npz or .json file with D alone.
 
         The controller's input names must be names of the model's outputs, and its output names must
-        be names of the model's inputs, with dots or underscores. In a file the names are
-        ``input_names`` or ``InputName``, ... Some names may be omitted. Without names, the
-        controller must use all outputs and inputs of the model, in order. If the controller has no
-        dt, the model's dt is used.
+        be names of the model's inputs; underscores may replace dots. In a file, the names are in
+        ``input_names`` and ``output_names``, or in ``InputName`` and ``OutputName``. A controller
+        with names may use only some of the model's outputs and inputs. A controller without names
+        must use all of them, in order. If the controller has no dt, the model's dt is used.
     lin : LinearModel
-        Continuous or sampled model. The controller acts on deviations from the point of this model.
+        Continuous or sampled model. The controller acts on deviations from the operating point of
+        this model.
     sign : {1, -1}
-        Sign of the feedback: -1 for a controller designed for negative feedback, u - u0 = -K (y -
-        y0).
+        Sign of the feedback: 1 for positive feedback, -1 for a controller that was designed for
+        negative feedback, ``u - u0 = -K (y - y0)``.
     noise : callable, optional
-        noise(t) -> (ny,), added to y.
+        Function noise(t) that returns measurement noise (ny,), which is added to y.
 
     Attributes
     ----------
     system : tuple of A, B, C, D, dt, inputs, outputs
-        The controller over all outputs and inputs of the model, with `sign` applied.
+        The controller from all outputs to all inputs of the model, with `sign` applied.
     loop : ndarray (nx + nz, nx + nz)
         Closed-loop matrix of the model's state and z.
 
@@ -98,7 +99,7 @@ class LinearController(Feedback):
         - an entry is not finite, or a transfer function is improper;
         - D acts on an output with direct feedthrough from the inputs (algebraic loop).
     FileError
-        If the file cannot be read or lacks the matrices named above.
+        If the file cannot be read or does not contain the matrices listed above.
 
     Examples
     --------
@@ -129,17 +130,17 @@ class LinearController(Feedback):
         felt = lin.D.any(axis=1) & by.D.any(axis=0)
         if felt.any():
             raise InputError(
-                "D of the controller forms an algebraic loop with "
-                f"{listed(compress(lin.output_names, felt))}, which depends directly on the "
-                "inputs; set D to 0 for this output, for example with a low-pass filter"
+                "the controller and the model form an algebraic loop through "
+                f"{listed(compress(lin.output_names, felt))}, because D of both is nonzero "
+                "there; set D of the controller to 0 there, for example with a low-pass filter"
             )
         dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
         dt = lin.dt or dt if dt < 0.0 else dt  # of a sampled system without a sampling time
         if dt < 0.0 or (lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt):
             raise InputError(
-                f"the controller has dt = {'unknown' if dt < 0.0 else f'{dt:g} s'}, the model has "
-                f"dt = {lin.dt:g} s (0: continuous); give the controller the dt of the model, or "
-                "the continuous model and the controller's own dt"
+                f"the controller has dt = {'unknown' if dt < 0.0 else f'{dt:g} s'}, but the "
+                f"model has dt = {lin.dt:g} s (0: continuous); give a controller with the dt of "
+                "the model, or give the continuous model"
             )
         self.system = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
         self.sign = 1.0  # `system` has it from here on
@@ -156,17 +157,17 @@ class LinearController(Feedback):
 
     @property
     def terms(self) -> Sample:
-        """Matrices and offsets that apply at each sample or stage."""
+        """Matrices and offsets that apply at each sample or Runge-Kutta stage."""
         (A, B, C, D, *_), lin = self.system, self.lin
         return Sample(A, B, C, D, lin.u0, lin.y0)
 
     def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot, with a separate state z for each call.
+        """Return policy(t, q, v) -> u for a robot; each call returns a policy with its own z.
 
         Raises
         ------
         InputError
-            If the robot's states, inputs or outputs differ from the model's. The masses may differ.
+            If the robot has other states, inputs or outputs than the model. Masses may differ.
         """
         lin, stays = self.lin, self.terms
         state = self.state_map(robot)
@@ -175,7 +176,7 @@ class LinearController(Feedback):
         return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
 
     def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
-        """Return the model with the controller's states, and K and u of the law u + K e."""
+        """Return the model with the controller's states added, and K and u of the law u + K e."""
         A, B, C, D, u0, y0, *_ = self.terms
         apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
         both = replace(
@@ -235,7 +236,7 @@ class OutputFeedback(LinearController):
 
     At each sample, u - u0 = C z is applied and y is measured. The state z is then advanced to the
     next sample. Accelerometer outputs are computed with the commanded u, before saturation. The
-    initial estimate of the deviation from the point is zero.
+    initial estimate of the deviation from the operating point is zero.
 
     Parameters
     ----------
@@ -243,7 +244,7 @@ class OutputFeedback(LinearController):
         Sampled model that the compensator was designed for.
     compensator : Compensator
     noise : callable, optional
-        noise(t) -> (ny,), added to y.
+        Function noise(t) that returns measurement noise (ny,), which is added to y.
 
     Raises
     ------
@@ -304,7 +305,7 @@ def _system_of(given: Any) -> System:
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
 
-def _realised(given: Any) -> Any:
+def _realised(given: object) -> Any:
     try:
         if hasattr(given, "to_ss"):
             return given.to_ss()
@@ -386,8 +387,9 @@ def _indices(
     named = not all(map(_NUMBERED.fullmatch, names))
     if size != len(names if named else known):
         raise InputError(
-            f"the controller has {size} {kind}s and {len(names) if named else 'no'} names, "
-            f"expected a name for each, or one {kind} for each {of} of the model: {listed(known)}"
+            f"the controller has {size} {kind}s and {len(names) if named else 'no'} names for "
+            f"them, expected a name for each {kind}, or one {kind} for each {of} of the model: "
+            f"{listed(known)}"
         )
     if not named:
         return list(range(size))
@@ -397,7 +399,7 @@ def _indices(
     for name, key in zip(names, own, strict=True):
         if key not in there:
             text = unknown(f"{of} of the model", name, known)
-            raise InputError(f"{kind} of the controller: {text} (or leave out all names)")
+            raise InputError(f"{kind} of the controller: {text}; or omit all {kind} names")
         if own.count(key) > 1:
             raise InputError(
                 f"two {kind}s of the controller are named '{name}'; give them different names"

@@ -51,26 +51,26 @@ def lqr(
     `sampled_cost` converts the weights of the integral to weights of the sum.
 
     For a fully actuated model, the Riccati equation is solved by an eigenproblem of half the usual
-    size. For any other model, SciPy solves the Riccati equation. Newton's method refines both
-    solutions. The result contains the residual in the model's own variables. A weight computed
-    from an ill-conditioned inertia, such as M^-1 R_a M^-1 for accelerations, is inaccurate with
-    any solver. `acceleration_lqr` avoids this loss of accuracy.
+    size. For any other model, SciPy solves the Riccati equation. Newton's method refines either
+    solution, and the result contains the residual in the model's own variables. If a weight is
+    computed from an ill-conditioned inertia, such as M^-1 R_a M^-1 for weighted accelerations, the
+    weight itself is inaccurate, and no solver can recover the accuracy. In this case, use
+    `acceleration_lqr`.
 
-    Without weights, the regulator respects the limits of the URDF, see (10.7) of
-    docs/derivation.md. The slowest closed-loop motion has a bandwidth of 0.2 rad/s. The bandwidth
-    is lower if the robot would otherwise exceed an effort or speed limit. The limits are checked
-    for a return from a displacement of 30 deg of the base and 0.3 rad of each joint. With these
-    weights, each input has a phase margin of at least 60 deg and tolerates any gain factor above
-    one half. With springs or gravity, each controllable mode decays as fast as without springs
-    and gravity (10.8). ``gain.weights`` states the bandwidth, decay rate and damping of the loop,
-    and lists the modes that decay more slowly.
+    If no weights are given, fflin chooses weights that respect the limits of the URDF, see (10.7)
+    of docs/derivation.md. The slowest closed-loop motion then has a bandwidth of 0.2 rad/s. The
+    bandwidth is lower if the robot would otherwise exceed an effort or speed limit while it returns
+    from a displacement of 30 deg of the base and 0.3 rad of each joint. Each input has a phase
+    margin of at least 60 deg and tolerates any gain factor above one half. With springs or gravity,
+    the controllable modes decay as fast as without them (10.8). ``gain.weights`` states the
+    bandwidth, decay rate and damping of the loop, and lists any modes that still decay more slowly.
 
-    For a model with reaction wheels, only the controllable part is regulated, see (9.4) of
-    docs/derivation.md; ``gain.regulated`` lists its states. Weights on the following states have
+    For a model with reaction wheels, only the controllable states are regulated, see (9.4) of
+    docs/derivation.md; ``gain.regulated`` lists these states. Weights on the following states have
     no effect:
 
     - wheel angles, which are ignorable;
-    - wheel speeds that are determined by the body's rate, if only wheels rotate the body;
+    - wheel speeds, if only wheels rotate the body, because the body's rate then determines them;
     - the position and velocity of the base, if no input pushes the base.
 
     Parameters
@@ -81,19 +81,19 @@ def lqr(
         Weight on the state, positive semidefinite: a matrix, its diagonal, or {name: weight} with
         names of states or of their groups, such as ``q_b``. Unnamed states have zero weight.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
-        Weight on the inputs, positive definite, in the forms of Q.
+        Weight on the inputs, positive definite, in the same forms as Q.
     N : array_like (nx, nu), optional
         Cross weight. Q - N R^-1 N' must be positive semidefinite.
     weights : {"urdf", "identity"}, optional
         Rule for the weights if Q and R are omitted. The rule "urdf" (default) respects the limits
-        of the URDF, "identity" is 1 on every state and input. For a sampled model, the rule
-        defines the continuous-time cost, which `sampled_cost` converts.
+        of the URDF. The rule "identity" gives each state and input a weight of 1. For a sampled
+        model, the rule defines the continuous-time cost, which `sampled_cost` converts.
     wheel_speeds : bool, optional
-        Whether to regulate the wheel speeds to their values at the point. By default, wheel
-        speeds are regulated if inputs other than the wheels can change them. With True,
-        combinations of wheel speeds without net torque on the base are also regulated. With
-        False, no wheel speed is regulated. With the default weights, wheel speeds converge at a
-        tenth of the bandwidth.
+        Whether to regulate the wheel speeds to their values at the operating point. By default,
+        wheel speeds are regulated if inputs other than the wheels can change them. If True,
+        combinations of wheel speeds that exert no net torque on the base are also regulated. If
+        False, no wheel speed is regulated. With the default weights, the bandwidth of wheel speeds
+        is a tenth of the bandwidth of the other states.
 
     Returns
     -------
@@ -102,17 +102,17 @@ def lqr(
     Raises
     ------
     EquilibriumError
-        If the point is not a fixed point; the message lists the nonzero rows of f0.
+        If the operating point is not a fixed point; the message lists the nonzero entries of f0.
     StabilizabilityError
-        If the inputs cannot stabilise a mode that does not decay by itself; the message names the
-        mode.
+        If a mode neither decays by itself nor can be stabilised by the inputs; the message names
+        the mode.
     InputError
         If a weight has a wrong size, is not positive (semi)definite, or is zero for a mode that
         does not decay by itself.
     UnknownNameError
         If a name does not exist.
     ModelError
-        If the robot's Pinocchio model was changed after `load`.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     Warns
     -----
@@ -137,9 +137,7 @@ def lqr(
     if Q is None and R is None and N is None:
         Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
     elif weights is not None or Q is None or R is None:
-        raise InputError(
-            "give the weights either by both Q and R, or by weights='urdf' or 'identity' alone"
-        )
+        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     Q, R, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:
@@ -152,24 +150,23 @@ def lqr(
 def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Gain:
     r"""Return the linear quadratic regulator with weighted accelerations, in closed form.
 
-    Let the accelerations :math:`a = L u` be the inputs, where L is the lower block of B. A model
-    at rest then has one double integrator per coordinate, :math:`\ddot q_i = s_i a_i`, with s =
-    1/2 for attitude coordinates and s = 1 for all others. Diagonal weights decouple the
-    coordinates. By (10.2) of docs/derivation.md, the regulator is
+    Let the accelerations :math:`a = L u` be the inputs, where L is the lower half of B. A model at
+    rest then consists of one double integrator per coordinate, :math:`\ddot q_i = s_i a_i`, with
+    s = 1/2 for attitude coordinates and s = 1 for all others. If the weights are diagonal, the
+    coordinates are decoupled, and by (10.2) of docs/derivation.md the regulator is
 
     .. math:: k_p = \sqrt{q_p/r_a},\quad k_d = \sqrt{q_v/r_a + 2 s k_p},\quad
               u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
 
-    and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. Wheel speeds are not
-    regulated. The weight on u is
-    :math:`L^T R_a L`. The gain is computed without the product :math:`L^T R_a L`, so that an
-    ill-conditioned inertia does not reduce the accuracy of the gain.
+    and its poles are the roots of :math:`\lambda^2 + k_d \lambda + s k_p`. The equivalent weight on
+    u is :math:`L^T R_a L`. Since the gain is computed without this product, an ill-conditioned
+    inertia does not reduce the accuracy of the gain. Wheel speeds are not regulated.
 
     Parameters
     ----------
     lin : LinearModel
         Continuous model at rest, without gravity, orbit, springs or dampers. Every coordinate that
-        `lqr` regulates must be actuated. For a sampled regulator, give the weights Q and R of the
+        `lqr` regulates must be actuated. For a sampled regulator, pass the weights Q and R of the
         returned gain to `sampled_cost`.
     Qp, Qv, Ra : array_like (6 + n,) or float, or mapping
         Diagonal weights on the positions (q_b, r_b, q_m), the velocities and the accelerations.
@@ -184,19 +181,20 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
     Raises
     ------
     EquilibriumError
-        If the point is not a fixed point.
+        If the operating point is not a fixed point.
     StabilizabilityError
         If a coordinate is not actuated.
     InputError
         If the model is sampled, its dynamics are not double integrators, or a weight is negative or
         not diagonal. Qp and Ra must be positive.
     ModelError
-        If the robot's Pinocchio model was changed after `load`.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     References
     ----------
     Y. Yang, Analytic LQR design for spacecraft control system based on quaternion model, J.
-    Aerospace Engineering 25(3), 2012: its attitude regulator is the weight Ra = J R J.
+    Aerospace Engineering 25(3), 2012. The attitude regulator of this paper has the weight
+    ``Ra = J R J``.
 
     Examples
     --------
@@ -294,7 +292,7 @@ def _difference(a: Array, b: Array, c: Array) -> Array:
     return np.where(np.abs(difference) > rounding, difference, 0.0)
 
 
-def _near_boundary(poles: Values, dt: float) -> bool:
+def near_boundary(poles: Values, dt: float) -> bool:
     """Whether a pole of a stable loop is close to the boundary of stability."""
     decay = 1.0 - np.abs(poles) if dt else -poles.real
     return decay.min() < _NEAR_BOUNDARY * np.abs(poles - 1.0 if dt else poles).max()
@@ -302,7 +300,7 @@ def _near_boundary(poles: Values, dt: float) -> bool:
 
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
     structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
-    if structured is not None and not _near_boundary(structured.poles, lin.dt):
+    if structured is not None and not near_boundary(structured.poles, lin.dt):
         return structured
     # A general solver would fail without saying which mode is to blame.
     require_stabilizable(lin)

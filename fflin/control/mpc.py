@@ -41,24 +41,25 @@ def mpc(
     *,
     horizon: int = 20,
     dt: float | None = None,
-    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = "urdf",
+    limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     Qf: Weight | str = "steady",
     weights: str | None = None,
 ) -> Mpc | TrajectoryMpc:
     r"""Return the model predictive controller about a fixed point or along a trajectory.
 
-    At each sample, the controller computes the inputs of the next N samples that respect the
+    At each sample, the controller computes inputs for the next N samples. These inputs respect the
     limits and minimise
 
     .. math:: e_N^T Q_f\,e_N + \int_0^{N h} e^T Q\,e + \delta u^T R\,\delta u\;dt.
 
-    The controller applies the first of these inputs. If no limit is active over the horizon, the
-    controller is the regulator of `lqr` or `tvlqr`.
+    The controller applies only the inputs of the first sample, and repeats the computation at the
+    next sample. If no limit is active over the horizon, the controller equals the regulator of
+    `lqr` or `tvlqr`.
 
     - Input limits are hard: inputs never exceed these limits.
-    - Limits of states and outputs are soft. Soft limits apply to the values that the linear model
-      predicts at the samples. If the quadratic program is infeasible, soft limits are exceeded
-      slightly, as the motion's `notes` report.
+    - Limits of states and outputs are soft. They apply to the values that the linear model predicts
+      at the samples. If the quadratic program would otherwise be infeasible, soft limits are
+      exceeded slightly; the motion's `notes` report this.
     - If the solver finds no solution, the LQR command is applied, saturated at the input limits,
       and a warning is issued.
 
@@ -70,17 +71,17 @@ def mpc(
     lin : LinearModel or LinearTrajectory
         Continuous model or trajectory, or a sampled model that `discretize` returned.
     Q, R : see `lqr`, optional
-        Weights of the integral. The default is the same as in `lqr` for a model, and as in
-        `tvlqr` for a trajectory. The argument `weights` selects the rule.
+        Weights of the integral. If both are omitted, a rule sets the weights, as in `lqr` for a
+        model and in `tvlqr` for a trajectory. The argument `weights` selects the rule.
     horizon : int
         Number N of samples in the horizon.
     dt : float
         Sampling time h [s].
     limits : "urdf", float, mapping or list of them, optional
         Limits as in `simulate`, for inputs, states and outputs: {name, group or pattern: magnitude,
-        or (least, largest)}. The limits bound the values of these signals; along a trajectory,
-        limits of q_b and r_b bound the error. With None, the only limit is that thrusters cannot
-        pull.
+        or (least, largest)}. The limits bound the values of these signals. Along a trajectory,
+        however, limits of q_b and r_b bound the error relative to the trajectory. With None, the
+        only limit is that thrusters cannot pull.
     Qf : "steady", or as Q
         Weight on the error after N samples, or at the end of a trajectory. "steady" is the cost
         to go of the regulator from the end of the horizon on.
@@ -92,16 +93,16 @@ def mpc(
     Mpc or TrajectoryMpc
         Policy for `simulate` and `monte_carlo`. The method ``matrices(e)`` of the policy
         (``matrices(e, t)`` along a trajectory) returns the quadratic program at a state error e,
-        for other solvers.
+        for use with other solvers.
 
     Raises
     ------
     InputError
-        If an argument has a wrong size or value, or the point exceeds the limits.
+        If an argument has a wrong size or value, or the operating point exceeds the limits.
     EquilibriumError, StabilizabilityError
         See `lqr` and `tvlqr`.
     MissingPackageError
-        If DAQP is not installed, at its first use.
+        If DAQP is not installed; raised when DAQP is first used.
     UnknownNameError
         If a name does not exist.
 
@@ -134,8 +135,8 @@ def mpc(
     names, at, rows = _limits(source, limits)
     if samples**2 * (len(at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
         raise InputError(
-            f"horizon is {samples} samples with {len(at)} limits, which makes the program too "
-            "large; give a shorter horizon or fewer limits"
+            f"horizon is {samples} samples with {len(at)} limits, which makes the optimisation "
+            "problem too large; give a shorter horizon or fewer limits"
         )
     designed: Any = _along if isinstance(source, LinearTrajectory) else _about
     made, stages = designed(source, (Q, R, weights), Qf, samples, dt, names, rows)

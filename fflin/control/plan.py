@@ -47,7 +47,7 @@ def plan(
     v0: ArrayLike | None = None,
     knots: int = 101,
     hold: str = "previous",
-    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = "urdf",
+    limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     R: Weight | None = None,
     free: Sequence[str] = (),
     progress: bool | None = None,
@@ -55,32 +55,32 @@ def plan(
     r"""Plan a low-effort trajectory to a goal within limits, such as a slew or detumbling.
 
     The plan minimises :math:`\int u^T R\,u\;dt`. Inputs, joints and wheels stay within their
-    limits. The method is multiple shooting: the state at the start of each interval is a
-    variable. Sequential quadratic programming searches for a local minimum in at most 50
-    iterations. The quadratic programs are built from the linear models along the motion and
+    limits. The method is multiple shooting: the state at the start of each interval is an
+    optimisation variable. Sequential quadratic programming searches for a local minimum in at most
+    50 iterations. The quadratic programs are built from the linear models along the motion and
     solved by PIQP (``pip install 'fflin[mpc]'``).
 
-    The base may rotate by any angle. The base makes full turns if the angular rates at both ends
-    require full turns. Continuous joints take the shorter direction.
+    The base may rotate by any angle, including full turns if the angular rates at both ends require
+    them. Continuous joints take the shorter direction.
 
-    Limits of joints and wheels are satisfied at the knots, and may be exceeded by up to 1 %
-    between knots. If the motion between knots exceeds a limit, the quadratic program includes
-    this limit at points within the interval. If limits cannot be satisfied between knots, they
-    are satisfied at the knots only, and a warning is issued. Printing the trajectory shows the
-    largest excess, its limit and its time.
+    Limits of joints and wheels are satisfied at the knots, and may be exceeded by up to 1 % between
+    knots. If the motion between knots exceeds a limit, the quadratic program includes this limit at
+    points within the interval. If limits cannot be satisfied between knots, they are satisfied at
+    the knots only, and a warning is issued. Printing the trajectory shows the largest violation,
+    the limit that is violated and the time.
 
     Parameters
     ----------
     robot : Robot
     goal : LinearModel, (q, v) or array_like (nx,)
         End of the motion: the operating point of a model, a configuration and velocity in
-        Pinocchio's order, or a state of `StateMap` in frame "hybrid". In (q, v), None means
-        neutral or at rest. Wheels may end at any angle.
+        Pinocchio's order, or a state of `StateMap` in frame "hybrid". In (q, v), q=None means the
+        neutral configuration, and v=None means rest. Wheels may end at any angle.
     duration : float
         Duration of the motion [s].
     x0, q0, v0 : array_like, optional
-        Start of the motion, as in `simulate`: a state, or a configuration and velocity. By default
-        the robot's `start`.
+        Start of the motion, as in `simulate`: a state, or a configuration and velocity. The default
+        is the robot's `start`.
     knots : int
         Number of equally spaced knots.
     hold : {"previous", "linear"}
@@ -89,28 +89,27 @@ def plan(
         Limits of inputs and states, as in `simulate`. With None, the only limit is that thrusters
         cannot pull.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
-        Diagonal weight on the inputs, as in `lqr`. By default 1/limit^2, or 1 for an input without
-        a limit.
+        Diagonal weight on the inputs, as in `lqr`. The default weight of an input is 1/limit^2, or
+        1 if the input has no limit.
     free : sequence of str
         States whose end value is free, by name, group or pattern:
         ``["r_b", "qdot_m.wheel_*"]``.
     progress : bool, optional
         Whether to show the iteration, the cost relative to the initial guess, and the largest
-        violation on stderr; by default on a terminal, for long runs.
+        violation on stderr. By default, they are shown for long runs if stderr is a terminal.
 
     Returns
     -------
     Trajectory
-        Planned motion and its inputs. Torques and forces on the base are in base axes, and are
-        constant in base axes between knots if held.
+        Planned motion and its inputs. Torques and forces on the base are in base axes. If `hold` is
+        "previous", they are constant in these axes between knots.
 
     Raises
     ------
     InputError
-        If an argument has a wrong size or value, the start or goal is outside a limit, or no
-        motion to the goal within the limits is found. The message gives the largest error of the
-        last trial: how far it misses the goal, or exceeds a limit. A feasible motion may still
-        exist.
+        If an argument has a wrong size or value, the start or goal is outside a limit, or no motion
+        to the goal within the limits is found. The message states by how much the last trial misses
+        the goal or exceeds a limit. A feasible motion may exist even if none is found.
     MissingPackageError
         If PIQP is not installed.
     UnknownNameError
@@ -254,14 +253,15 @@ def _failure(
         if far[i] > _REACHED
     ]
     advice = (
-        "give a longer duration, wider limits, more knots, or name states with a free end value by "
-        "`free` (--free-end)"
+        "give a longer duration, wider limits or more knots, or leave the final value of some "
+        "states free with `free` (--free-end)"
     )
     internal = all(isinstance(each, JointTorque | ReactionWheel) for each in robot.inputs)
     if internal and asked[state.groups.omega_b].any() and asked[state.groups.v_b].any():
         advice = (
-            "the inputs cannot change the momentum, which determines omega_b and v_b at the end; "
-            "name omega_b and v_b by `free` (--free-end), and r_b or q_b if the goal moves the base"
+            "the inputs cannot change the momentum, so omega_b and v_b at the end cannot be "
+            "chosen; leave them free with `free` (--free-end), and also r_b or q_b if the goal "
+            "moves the base"
         )
     return InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
@@ -277,4 +277,4 @@ def _note(shooting: Shooting, made: _Made, size: Array) -> str:
         at = (k + (part + 1) / _PARTS) * shooting.h[0]
         percent = f"{100.0 * made.most:.2g} %"
         most = f"exceeds the limit of {shooting.state.names[i]} by {percent} at t = {at:.4g} s"
-    return f"the integrated motion {most}, checked at {_PARTS} points per interval"
+    return f"the integrated motion {most} (checked at {_PARTS} points per interval)"

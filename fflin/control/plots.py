@@ -47,9 +47,10 @@ def plot_poles(
     poles : array_like or Gain or LinearModel
         Poles [1/s], an object with poles, or several sets {label: poles}.
     path : str or Path, optional
-        File to write, .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to write, .png, .pdf or .svg. See `plot_motion` for possible errors.
     dt : float
-        Sampling time [s] of poles given as numbers. If not 0, the unit circle is drawn.
+        Sampling time [s], if the poles are given as numbers. If it is not 0, the unit circle is
+        drawn.
     title : str
         Title of the figure.
 
@@ -82,7 +83,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     ----------
     gain : Gain
     path : str or Path, optional
-        File to write, .png, .pdf or .svg. The possible errors are listed in `plot_motion`.
+        File to write, .png, .pdf or .svg. See `plot_motion` for possible errors.
 
     Returns
     -------
@@ -116,9 +117,10 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
         poles.set_title("poles of A - B K as ln(z)/dt" if gain.dt else "poles of A - B K")
         low, high = gain.margins.gain
         figure.suptitle(
-            f"{gain.robot}{f', sampled at {gain.dt:g} s' if gain.dt else ''}: loop of each input, "
-            f"the others closed\nmargins for simultaneous changes: phase {gain.margins.phase:.3g} "
-            f"deg, gain {low:.2g} to {high:.3g} (disk margin {gain.margins.disk:.3g})",
+            f"{gain.robot}{f', sampled at {gain.dt:g} s' if gain.dt else ''}: open loop at each "
+            "input, with the loops of all other inputs closed\nmargins for simultaneous "
+            f"changes: phase {gain.margins.phase:.3g} deg, gain {low:.2g} to {high:.3g} (disk "
+            f"margin {gain.margins.disk:.3g})",
             x=0.02,
             ha="left",
         )

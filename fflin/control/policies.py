@@ -56,9 +56,9 @@ class Feedback:
 
 @dataclass(eq=False)
 class StateFeedback(Feedback):
-    """State feedback ``u = u0 - K (x - x0)`` about the point of a linear model.
+    """State feedback ``u = u0 - K (x - x0)`` about the operating point of a model.
 
-    The angle of a continuous joint is unwrapped to differ from x0 by at most half a turn.
+    The angle of a continuous joint is unwrapped, so that it differs from x0 by at most half a turn.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class StateFeedback(Feedback):
     Raises
     ------
     InputError
-        If K has a wrong shape, or the model is about a moving reference.
+        If K has a wrong shape, or the model is about a moving reference (``moving=True``).
 
     Examples
     --------
@@ -97,7 +97,7 @@ class StateFeedback(Feedback):
         self.K = frozen(shaped("K", self.K, self.lin.B.shape[::-1], hint))
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
-        """Return K and offset of u = offset - K x for a robot's whole state x, and its x0."""
+        """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
         lin = self.lin
         fed = np.array([state.names.index(name) for name in lin.state_names])
         near = np.zeros(state.nx)
@@ -112,7 +112,7 @@ class StateFeedback(Feedback):
         Raises
         ------
         InputError
-            If the robot's states or inputs differ from the model's. Its masses may differ.
+            If the robot has other states or inputs than the model. Masses may differ.
         """
         state = self.state_map(robot)
         command = readout(state, *self.terms(state))
@@ -123,10 +123,11 @@ class StateFeedback(Feedback):
 class Allocation:
     """Allocation of a policy's commands to thrusters and motors within their limits.
 
-    The policy commands the inputs of the robot `design`, such as torque and force on the base.
-    The thrusters and motors of the simulated robot produce the generalised force that is closest
-    to the commanded force. The distance between two forces is the sum of squared differences
-    between the resulting accelerations. No thrust is negative, and no input exceeds its limit.
+    The policy commands the inputs of the robot `design`, such as torque and force on the base. The
+    thrusters and motors of the simulated robot then produce the generalised force that is closest
+    to the commanded force, without negative thrust and without exceeding an input limit. The
+    distance between the two forces is the sum of squared differences between the accelerations that
+    they cause.
 
     Parameters
     ----------
@@ -150,7 +151,7 @@ class Allocation:
 
     @property
     def lin(self) -> LinearModel | None:
-        """Linear model of `design`, the robot for which the policy was made, or None."""
+        """Linear model that the policy was designed for, or None if the policy has none."""
         return getattr(self.policy, "lin", None)
 
     def bind(self, robot: Robot) -> Policy:
@@ -328,8 +329,9 @@ class Loop(Compensation):
             self._clock.tick(t)
         elif len(self.estimate) and len(self.rates) != self.stages + 1:
             raise InputError(
-                "the states of a continuous controller are integrated by fflin.simulate; give it "
-                "the LinearController itself as the policy, or sample the controller"
+                "only fflin.simulate can integrate the states of a continuous controller; pass "
+                "the LinearController itself to fflin.simulate as the policy, or sample the "
+                "controller"
             )
         measure, near = self._there(t)
         state, x = measure.state, measure.state.read(q, v, near=near)

@@ -51,8 +51,8 @@ class TrajectoryFeedback(Feedback):
         Result of `tvlqr`.
     held : bool
         Whether commands are held between samples; commands of a sampled schedule are always held.
-        If commands are held, the command at the last knot includes the inputs that keep the
-        robot in the final state.
+        The command of the last knot, if held, acts after the end of the trajectory, so it already
+        contains the holding inputs.
 
     Examples
     --------
@@ -83,7 +83,7 @@ class TrajectoryFeedback(Feedback):
 
     @cached_property
     def end(self) -> LinearModel:
-        """Model at rest in the last configuration; `InputError` if no inputs hold it there."""
+        """Model at rest in the last configuration; `InputError` if no inputs hold the robot."""
         try:
             return resting_end(self.trajectory)
         except EquilibriumError as error:
@@ -104,7 +104,7 @@ class TrajectoryFeedback(Feedback):
 
     @property
     def over(self) -> float:
-        """Time [s] after which the command holds the robot at the end."""
+        """Time [s] after which the command holds the robot at the end of the trajectory."""
         held = self.held or self.schedule.dt
         return self.duration * (2.0 - AT_THE_END if held else AT_THE_END)
 
@@ -115,7 +115,7 @@ class TrajectoryFeedback(Feedback):
 
     @property
     def ahead(self) -> float:
-        """Time [s] after a sample at which a changing input is closest to its mean."""
+        """Time [s] after a sample at which the reference input equals its mean over the sample."""
         return 0.5 * self.schedule.dt if self.trajectory.hold == "linear" else 0.0
 
     def commanded(self, t: float) -> tuple[Array, Array, Array]:
@@ -127,7 +127,7 @@ class TrajectoryFeedback(Feedback):
 
     @cached_property
     def end_gain(self) -> Array:
-        """Gain K (nu, nx) of the regulator with the same weights about `end`."""
+        """Gain K (nu, nx) of the regulator about `end`, with the weights of the schedule."""
         by = self.schedule
         return steady_regulator(self.end, by.Q, by.R, by.dt)[1]
 
@@ -137,13 +137,13 @@ class TrajectoryFeedback(Feedback):
         Parameters
         ----------
         offset : mapping
-            {name, group or pattern of states: error, in the base axes at the start}. The names
-            ``roll``, ``pitch`` and ``yaw`` [deg] can replace q_b.
+            Mapping {name, group or pattern of states: initial error}, in the base axes at the
+            start. The keys ``roll``, ``pitch`` and ``yaw`` [deg] can replace q_b.
 
         Raises
         ------
         InputError
-            If the attitude is given twice, or ``|q_b|`` is not less than 1.
+            If the attitude is given both by q_b and by angles, or ``|q_b|`` is not less than 1.
         UnknownNameError
             If a state does not exist.
         """
@@ -172,7 +172,7 @@ class TrajectoryFeedback(Feedback):
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
 
     def state_map(self, robot: Robot) -> StateMap:
-        """Return the robot's states in base axes; `InputError` if the trajectory does not fit."""
+        """Return the robot's states in base axes; `InputError` if the robot does not fit."""
         origin = self.trajectory.robot
         state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
         made = f"the trajectory was made for '{origin.name}'"
@@ -182,7 +182,7 @@ class TrajectoryFeedback(Feedback):
         return state
 
     def deviation(self, robot: Robot) -> Callable[..., tuple[Array, Array]]:
-        """Return f(t, q, v) -> u*, e: the inputs of the trajectory, and the error."""
+        """Return f(t, q, v) -> u*, e: the inputs of the trajectory, and the error from it."""
         state = self.state_map(robot)
 
         def deviation(t: float, q: Array, v: Array) -> tuple[Array, Array]:
@@ -197,7 +197,7 @@ class TrajectoryFeedback(Feedback):
         Raises
         ------
         InputError
-            If the robot's states or inputs differ from the trajectory's. Its masses may differ.
+            If the robot has other states or inputs than the trajectory. Masses may differ.
         """
         deviation = self.deviation(robot)
 
@@ -208,7 +208,7 @@ class TrajectoryFeedback(Feedback):
         return policy
 
 
-def followed(policy: Any, robot: Robot, held: float = 0.0) -> Any:
+def followed(policy: object, robot: Robot, held: float = 0.0) -> Any:
     """Return a policy as it is simulated, with commands held for `held` [s].
 
     A gain schedule becomes the feedback along its trajectory.
@@ -253,10 +253,10 @@ def largest_rate(schedule: GainSchedule) -> float:
 class TrajectoryOutputFeedback(TrajectoryFeedback):
     r"""Feedback ``u = u*(t) - K(t) eh`` of the estimated error relative to a trajectory.
 
-    At each sample, u is applied and y is measured. The filter then advances the estimate eh to
-    the next sample, as in `OutputFeedback`. Positions and attitudes are measured relative to the
-    base pose of the trajectory. The policy returned by `bind` has an attribute ``estimate``
-    (nx,), the estimate of the error at the next sample.
+    At each sample, u is applied and y is measured. The filter then advances the estimate eh to the
+    next sample, as in `OutputFeedback`. Measured positions and attitudes are relative to the base
+    pose of the trajectory. The policy returned by `bind` has an attribute ``estimate`` (nx,), the
+    estimate of the error at the next sample.
 
     Parameters
     ----------
@@ -266,12 +266,12 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
     filter : FilterSchedule
         Result of `tvkalman` with the same sampling time.
     noise : callable, optional
-        noise(t) -> (ny,), added to y.
+        Function noise(t) that returns measurement noise (ny,), which is added to y.
 
     Raises
     ------
     InputError
-        If the gains and the filter differ in sampling time or trajectory.
+        If the gains and the filter have different sampling times or trajectories.
 
     Examples
     --------
@@ -300,12 +300,12 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
             )
 
     def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot, with a separate estimate for each call.
+        """Return policy(t, q, v) -> u for a robot; each call returns one with its own estimate.
 
         Raises
         ------
         InputError
-            If the robot's states, inputs or outputs differ from the trajectory's.
+            If the robot has other states, inputs or outputs than the trajectory.
         """
         origin, home = self.trajectory.robot, self.state_map(robot)
         own = sensed(StateMap(origin, frame="local"))

@@ -21,12 +21,12 @@ from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
-from fflin.dynamics.rnea import rotor_names
 from fflin.linear.equilibrium import equilibrium
 from fflin.linear.linear_trajectory import LinearTrajectory, Steps, along, transitions
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
+from fflin.robot.mass_properties import rotor_names
 
 
 @in_one_thread
@@ -47,15 +47,16 @@ def tvlqr(
     .. math:: e(T)^T Q_f\,e(T) + \int_t^T e^T Q\,e + \delta u^T R\,\delta u\;d\tau.
 
     The differential Riccati equation is :math:`-\dot P = A^T P + P A - P B R^{-1} B^T P + Q`, with
-    :math:`P(T) = Q_f`. The Riccati equation is solved backwards from knot to knot by maps
-    :math:`P_0 = W + T^T P_1 (I + G P_1)^{-1} T` with positive semidefinite W and G. Each map is
-    computed from a short matrix exponential by doubling, so P stays positive semidefinite over any
-    horizon. The method has order four in general, and is exact if A and B are constant. Knots are
-    added until the estimated errors of the steps and of the interpolation of P are below 1e-7.
+    :math:`P(T) = Q_f`. The Riccati equation is solved backwards from knot to knot, by maps
+    :math:`P_0 = W + \Phi^T P_1 (I + G P_1)^{-1} \Phi` from the cost :math:`P_1` at a knot to the
+    cost :math:`P_0` at the previous knot. W and G are positive semidefinite. Each map is computed
+    from a short matrix exponential by doubling, so P stays positive semidefinite over any horizon.
+    The method has order four in general, and is exact if A and B are constant. Knots are added
+    until the estimated errors of the steps and of the interpolation of P are below 1e-7.
 
     With `sample`, the regulator is sampled: e is measured at the samples, and :math:`\delta u` is
     held between samples. The cost is still the integral over continuous time, evaluated by (10.1)
-    and (10.3) along the motion.
+    and (10.3) of docs/derivation.md along the motion.
 
     Parameters
     ----------
@@ -65,18 +66,18 @@ def tvlqr(
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
         Weight on the inputs, positive definite.
     Qf : "steady", or as Q
-        Weight on the error at the end. "steady" is the infinite-horizon cost of `lqr` about the
-        end point. The end point is the last configuration at rest, or in its final motion if this
-        motion is steady. States that the inputs cannot stabilise have zero weight in Qf, see
-        `momentum_reduction`.
+        Weight on the error at the end. "steady" is the infinite-horizon cost of `lqr` about the end
+        point. The end point is the last configuration, in its final motion if this motion is
+        steady, otherwise at rest. States that the inputs cannot stabilise have zero weight in Qf,
+        see `momentum_reduction`.
     sample : float, optional
         Sampling time [s], which must divide the duration.
     weights : {"urdf", "identity"}, optional
         Rule for the weights if Q and R are omitted. The rule of `lqr` is applied to the linear
-        model at the last point of the trajectory, with displacements a tenth as large as in
-        `lqr`. With these weights, errors decay within the duration of the trajectory.
+        model at the last point of the trajectory, with two changes: the limits are checked for
+        displacements a tenth as large, and errors decay within the duration of the trajectory.
     rule : str
-        Description of the rule that made Q and R.
+        Description of the rule that set Q and R.
 
     Returns
     -------
@@ -112,9 +113,7 @@ def tvlqr(
     steady = asks_steady(Qf)
     given, by_rule = list[Any]((Q, R)), Q is None and R is None
     if not by_rule and (weights is not None or Q is None or R is None):
-        raise InputError(
-            "give the weights either by both Q and R, or by weights='urdf' or 'identity' alone"
-        )
+        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     end: Any = steady_end(traj) if steady or by_rule else None
     if by_rule:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
@@ -159,7 +158,7 @@ _OF_REGULATOR = ("state_names", "input_names", "verified", "q", "v", "u", "hold"
 _OF_FILTER = ("state_names", "input_names", "output_names", "verified")
 
 
-def asks_steady(value: Any, name: str = "Qf", kind: str = "a weight") -> bool:
+def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool:
     """Return whether a value is "steady"; raise `InputError` if it is another string."""
     if isinstance(value, str) and value != "steady":
         raise InputError(f"{name} is {value!r}, expected 'steady' or {kind}")
@@ -250,9 +249,10 @@ def tvkalman(
     computed forward from P0 by (10.4) of docs/derivation.md:
 
     .. math:: P_{k+1} = \Phi (P - P C^T (C P C^T + V)^{-1} C P)_k \Phi^T + W_k,\qquad
-              L = \Phi P C^T (C P C^T + V)^{-1},
+              L = \Phi P C^T (C P C^T + V)^{-1}.
 
-    with the transition :math:`\Phi` of a sample and the disturbance :math:`W_k` integrated over it.
+    Here :math:`\Phi` is the transition matrix over one sample, and :math:`W_k` is the covariance of
+    the disturbance integrated over this sample.
 
     Parameters
     ----------
@@ -263,13 +263,13 @@ def tvkalman(
     V : array_like (ny, ny) or (ny,), float, or mapping
         Covariance of the measurement noise at a sample, positive definite.
     G : array_like (nx, nw) or (N, nx, nw), optional
-        Input matrix of the disturbance, linear between the knots; W is then (nw, nw). With
-        ``G=traj.B``, the disturbance acts at the inputs, and the keys of a mapping W are names of
-        inputs.
+        Input matrix of the disturbance, interpolated linearly between the knots; W is then (nw,
+        nw). With ``G=traj.B``, the disturbance acts at the inputs, and the keys of a mapping W are
+        names of inputs.
     P0 : "steady", or as W
         Covariance at the start. "steady" is the covariance of `kalman` about the start point. The
-        start point is the first configuration at rest, or in its initial motion if this motion is
-        steady.
+        start point is the first configuration, in its initial motion if this motion is steady,
+        otherwise at rest.
     sample : float
         Sampling time [s], which must divide the duration.
 
@@ -285,8 +285,8 @@ def tvkalman(
     UnknownNameError
         If a name does not exist.
     EquilibriumError, DetectabilityError
-        If P0 is "steady", and no inputs can hold the robot at the start point or the model at
-        this point is not detectable.
+        If P0 is "steady", and either no inputs can hold the robot at the start point or the model
+        at this point is not detectable.
 
     References
     ----------

@@ -35,13 +35,13 @@ _SPEEDS = 0.1
 def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) -> Array:
     r"""Return the diagonal of a weight by Bryson's rule: :math:`1/\text{largest}^2` per entry.
 
-    The largest acceptable deviation of each signal then contributes 1 to the cost.
+    With this weight, each signal contributes 1 to the cost at its largest acceptable deviation.
 
     Parameters
     ----------
     lin : LinearModel or LinearTrajectory
     largest : mapping
-        {name: largest acceptable value}, for states or for inputs. A name is one of
+        Mapping {name: largest acceptable value}, for states or for inputs. A name is one of
 
         - a single name in ``lin.state_names`` or ``lin.input_names``;
         - a group such as ``q_b``, ``r_b``, ``q_m``, ``omega_b``, ``v_b``, ``qdot_m``, ``tau_b``,
@@ -179,9 +179,9 @@ class SampledCost(NamedTuple):
 def sampled_cost(
     lin: LinearModel, dt: float, Q: Weight, R: Weight, N: ArrayLike | None = None
 ) -> SampledCost:
-    r"""Return discrete-time weights that sum up to a continuous-time cost.
+    r"""Return discrete-time weights whose summed cost equals a continuous-time cost.
 
-    For inputs with zero-order hold, the cost summed over samples equals the integral cost.
+    The sum over the samples equals the integral if the inputs are held between samples.
 
     By (10.1) of docs/derivation.md, the weights are
 
@@ -189,8 +189,9 @@ def sampled_cost(
               \begin{bmatrix} Q & N \\ N^T & R \end{bmatrix} e^{F t}\,dt,\qquad
               F = \begin{bmatrix} A & B \\ 0 & 0 \end{bmatrix}
 
-    At rest F^3 = 0, and the integral is an exact polynomial in h. In motion, the integral is
-    computed over a short step (van Loan), which is then doubled repeatedly.
+    At rest F^3 = 0, so the integral is a polynomial in h and is computed exactly. In motion, the
+    integral is computed over a short step by van Loan's method, and the step is then doubled until
+    it equals h.
 
     Parameters
     ----------
@@ -226,7 +227,9 @@ def sampled_cost(
     0.1
     """
     if not isinstance(lin, LinearModel) or lin.dt:
-        raise InputError("lin must be a continuous LinearModel; give the model that was sampled")
+        raise InputError(
+            "lin must be a continuous LinearModel; give the model before it is sampled"
+        )
     h = positive("dt", dt, "s")
     Q, R, cross = cost_weights(lin, Q, R, N)
     nx, nu = lin.B.shape
@@ -248,7 +251,9 @@ def _diagonal(
     found = by_name(f"entry of {what}", checked, names)
     if complete and len(found) < len(names):
         missing = next(name for index, name in enumerate(names) if index not in found)
-        raise InputError(f"{what} has no value for {missing}; give a value for each entry")
+        raise InputError(
+            f"{what} has no value for {missing}; give a value for every entry of {what}"
+        )
     return np.array([found.get(index, 0.0) for index in range(len(names))])
 
 
@@ -263,7 +268,7 @@ def _negative(what: str, value: float, where: str, definite: bool) -> InputError
 def rule_weights(
     lin: LinearModel,
     name: str | None,
-    given: Mapping[str, Any] | None = None,
+    given: Mapping[str, object] | None = None,
     *,
     wheel_speeds: bool | None = None,
     pace: Pace = AT_A_POINT,
@@ -282,7 +287,7 @@ def rule_weights(
         Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
     elif name == "identity":
         nx, nu = lin.B.shape
-        Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
+        Q, R, rule = np.eye(nx), np.eye(nu), "1 for every state and every input (identity)"
     else:
         raise unknown("rule of weights", name, ("urdf", "identity"))
     given_weights: dict[int, _Given] = {}
@@ -293,8 +298,8 @@ def rule_weights(
         named |= dict.fromkeys(names)
     if named:
         Q, R = _reweighed(lin, Q, R, terms, given_weights)
-        rule = f"{', '.join(named)} as given, the others {rule}"
-        rule += " (with this rule alone)" if terms.any() else ""
+        rule = f"{', '.join(named)} as given; all other weights: {rule}"
+        rule += " (these figures are for this rule alone)" if terms.any() else ""
     if source.dt == lin.dt:
         return Q, R, None, rule
     return (*sampled_cost(source, lin.dt, Q, R), rule)
@@ -322,7 +327,10 @@ def _of_regulated(
     found = default_weights(body, pace, dict(zip(names, room, strict=True)))
     Q, R, rule, bandwidth, (of_positions, of_inputs) = found
     if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
-        rule += f"; already at or beyond the URDF limit at the operating point: {listed(beyond)}"
+        rule += (
+            "; wheel speeds already at or beyond the URDF limit at the operating point: "
+            f"{listed(beyond)}"
+        )
     S = selection(body.state_names, lin.state_names)
     Q = S.T @ Q @ S
     terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
@@ -332,7 +340,7 @@ def _of_regulated(
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
         X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
-        rule = f"{rule}; wheel speeds at {slow:.3g} rad/s"
+        rule = f"{rule}; wheel speeds regulated with a bandwidth of {slow:.3g} rad/s"
     return Q, R, rule, terms
 
 

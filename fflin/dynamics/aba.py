@@ -7,7 +7,6 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import PIN_ANGULAR
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT
 
@@ -23,21 +22,23 @@ class Aba:
         self._weightless = robot.model
         self._model = robot.model.copy()
         self._model.gravity.linear = np.array(robot.gravity)
-        # M^-1 in base axes as ABA has it, of the last slopes.
+        # M^-1 in base axes from ABA, at the point of the last call of `slopes`.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
-        self.field = field_of(robot, state.frame)
+        self.field = state.field
         self._resists = bool(np.any(robot.springs))
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
     def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
-        """Return dv/dt (nv,) in Pinocchio's order; u in base axes, tau (nv,) a force besides."""
+        """Return dv/dt (nv,) in Pinocchio's order for u in base axes and an extra force tau."""
         forces = self.actuation.torques(u)
         if self._resists:
             forces += self._passive_force(q, v)
         if tau is not None:
             forces += self.state.forces(tau)
         absolute = self.field.absolute(q, v) if self.field else v
-        rate = self._accelerate(self._model, q, absolute, forces, self._pulls(q, absolute, u))
+        rate = self._accelerate(
+            self._model, q, absolute, forces, self._external_wrenches(q, absolute, u)
+        )
         return self.field.relative(v, absolute, rate) if self.field else rate
 
     def accelerations(self, q: Array, v: Array, u: Array) -> Array:
@@ -55,7 +56,7 @@ class Aba:
         return found
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
-        """Return the size (6 + n,) of the terms that add up to the accelerations; `u` as above."""
+        """Return the sum of the magnitudes of the terms of the accelerations (6 + n,)."""
         state, data = self.state, self._data
         M = state.project(pin.crba(self._model, data, q).T)
         columns = self.actuation.columns(data, q)
@@ -65,18 +66,18 @@ class Aba:
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return d(nudot)/d(tangent of q, nu, u) in state order, (6 + n, ...); `u` in base axes."""
-        # Wrenches of thrusters are constant in the frames of their links, so that the first holds
-        # d(B u)/dq too. B comes from the accelerations of unit inputs at rest.
+        # Wrenches of thrusters are constant in the frames of their links, so that the derivative
+        # over q includes d(B u)/dq. B comes from the accelerations of unit inputs at rest.
         state = self.state
         stiffness, damping, _ = state.robot.springs
         tau, field = state.lift(self.actuation.torques(u) + self._passive_force(q, v)), self.field
         here = q, v
         if field:
             q, v = field.near(q, v)
-        external = self._pulls(q, v, u)
+        external = self._external_wrenches(q, v, u)
         if state.robot.followers:
             assert state.S is not None
-            by_q, by_v, by_force = self._constrained_slopes(q, v, external, tau, state.S)
+            by_q, by_v, by_force = self._constrained_derivatives(q, v, external, tau, state.S)
         else:
             slopes = pin.computeABADerivatives(self._model, self._data, q, v, tau, external)
             by_q, by_v, by_force = (state.velocities(slope.T).T for slope in slopes)
@@ -84,7 +85,7 @@ class Aba:
             by_force = state.velocities(by_force)
         self.inverse = by_force
         for joint, momentum in state.robot.stored_momentum:
-            jacobian, turning = self._turning(joint, q, v)
+            jacobian, turning = self._angular_velocity_derivatives(joint, q, v)
             torque = by_force @ state.forces(jacobian.T) @ skew(momentum)
             by_q += torque @ state.columns(turning)
             by_v += torque @ state.columns(jacobian)
@@ -102,8 +103,8 @@ class Aba:
             by_u.append(state.velocities(rate))
         return by_q, by_v, np.column_stack(by_u)
 
-    def _pulls(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
-        """Return `_wrenches` with the pull of an orbit's field."""
+    def _external_wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
+        """Return the wrenches on the links, including the gravity gradient of an orbit."""
         wrenches = self._wrenches(q, v, u)
         if self.field:
             wrenches = pin.StdVec_Force(wrenches)
@@ -113,7 +114,7 @@ class Aba:
         return wrenches
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
-        """Return what acts on the links, stored momentum turned with them included."""
+        """Return the wrenches of inputs and of gyroscopic torques on the links."""
         stored = self.state.robot.stored_momentum
         wrenches = self.actuation.wrenches(u) or self._none
         if not stored:
@@ -125,10 +126,11 @@ class Aba:
             total[joint] = wrenches[joint] + pin.Force(np.zeros(3), torque)
         return total
 
-    def _turning(self, joint: int, q: Array, v: Array) -> tuple[Array, Array]:
+    def _angular_velocity_derivatives(self, joint: int, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the derivatives (3, nv) over v and q of a link's angular velocity in its axes."""
-        # A turn of a joint l that carries it, about s in its axes, changes it by omega_p x s, with
-        # omega_p the angular velocity of what carries l; a turn of the base changes nothing.
+        # Let a joint between base and link have the axis s (in link axes) and a parent with the
+        # angular velocity omega_p. The derivative over the joint angle is omega_p x s. The
+        # derivative over a rotation of the base is zero.
         model, data = self._model, self._data
         pin.forwardKinematics(model, data, q, v)
         pin.computeJointJacobians(model, data, q)
@@ -160,14 +162,14 @@ class Aba:
         bias = pin.rnea(model, self._data, q, v, np.zeros(model.nv), external)
         return state.spread(np.linalg.solve(M, forces - state.forces(bias)))
 
-    def _constrained_slopes(
+    def _constrained_derivatives(
         self, q: Array, v: Array, external: pin.StdVec_Force, tau: Array, S: Array
     ) -> tuple[Array, Array, Array]:
         """Return the derivatives for robots with mimic joints: S^T M a = S^T (tau - b)."""
-        # The forces that keep the joints in step drop out of this equation. ABA needs a regular M,
-        # which it is not where one of these joints carries no mass. So each gets, as a rotor, an
-        # inertia as large as the one that they share, and what the rotors add to S^T M' S is
-        # subtracted again.
+        # The constraint forces of mimic joints drop out of this equation. ABA needs a regular M,
+        # but M is singular if a mimic joint or its leader moves no mass. So each of these joints
+        # gets a rotor with the inertia of their common coordinate. The contribution of the rotors
+        # to S^T M S is subtracted afterwards.
         state, data = self.state, self._data
         shared = S @ state.project(pin.crba(self._model, data, q)).diagonal()
         model = self._model.copy()

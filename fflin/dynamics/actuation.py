@@ -1,4 +1,4 @@
-"""Generalised forces of the inputs: the columns that multiply u, and the wrenches on links."""
+"""Generalised forces of the inputs: columns of the input matrix, and wrenches on links."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Actuation:
-    """Inputs of a robot, prepared for evaluation."""
+    """Inputs of a robot, with their names, units, columns and wrenches."""
 
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
@@ -26,8 +26,8 @@ class Actuation:
         groups: list[str] = []
         columns: list[Array] = []
         held: list[slice] = []
-        # Thrusters and wheels that are no joints, by the Pinocchio joint that carries them:
-        # (input, wrench (6,) of a unit in its frame).
+        # Thrusters and wheels without a joint of their own. {joint on which they are mounted:
+        # (index of the input, wrench (6,) of a unit input in the joint's frame)}.
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
         for item, own in kinds.named_inputs(robot.inputs):
@@ -56,29 +56,31 @@ class Actuation:
         if len({*names}) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"two inputs are named '{twice}'; give one of them another name")
-        # As a model calls them too.
+        # Linear models call them `input_names` and `input_units`.
         self.names = self.input_names = tuple(names)
         self.units = self.input_units = tuple(units)
-        # {group: indices}: tau_b, F_b, tau_m, thrust, wheel, in order of appearance.
+        # {group: indices of its inputs} with the groups tau_b, F_b, tau_m, thrust and wheel, in
+        # order of appearance.
         self.groups = {
             group: np.flatnonzero(np.array(groups) == group) for group in dict.fromkeys(groups)
         }
-        # Inputs that form a vector on the base in reference axes, three each.
+        # Slices of three inputs that form a torque or force on the base in reference axes.
         self.held = tuple(held)
-        # Generalised force (6 + n, nu) of the inputs that the configuration does not change.
+        # Generalised force (6 + n, nu) per unit of each input; zero for the inputs whose
+        # generalised force depends on the configuration.
         self.fixed: Array = np.column_stack(columns) if columns else np.zeros((nv, 0))
-        # Whether they are tau_b, F_b and every joint's, so that the columns are the identity.
+        # Whether the inputs are tau_b, F_b and all joint torques, so that `fixed` is the identity.
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
-        # By joint: the inputs that it carries, and their wrenches (6, ..) in its frame.
+        # (joint, indices of the inputs mounted on it, their wrenches (6, ..) in its frame).
         self.wrench_columns: list[tuple[int, Any, Array]] = [
             (joint, np.array([at for at, _ in items]), np.column_stack([w for _, w in items]))
             for joint, items in carried.items()
         ]
-        self.carried = bool(carried)  # so that their columns depend on the configuration
+        self.carried = bool(carried)  # whether columns depend on the configuration
         self._of_carried = [at for items in carried.values() for at, _ in items]
 
     def columns(self, data: pin.Data, q: Array) -> Array:
-        """Return B_u (6 + n, nu), the force in base axes of a unit of each input (6.1)."""
+        """Return B_u (6 + n, nu), the generalised force in base axes per unit input (6.1)."""
         if not self.carried:
             return self.fixed
         columns = self.fixed.copy()
@@ -91,17 +93,17 @@ class Actuation:
         return columns
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
-        """Return u (.., nu) with reference-frame wrenches in base axes."""
+        """Rotate the reference-frame wrenches in u (.., nu) to base axes."""
         if not self.held:
             return u
         return chart.to_base(self.held, u[..., None])[..., 0]
 
     def turn_columns(self, chart: Chart, by_u: Array) -> None:
-        """Convert derivatives (.., k, nu) over `in_base_axes` to those over u: F_u^T of (4.7)."""
+        """Convert derivatives (.., k, nu) over inputs in base axes to derivatives over u (4.7)."""
         chart.turn_columns(self.held, by_u)
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
-        """Return the wrench of thrusters and wheels on every joint, in its frame, if any."""
+        """Return the wrench of thrusters and wheels on each joint in its frame, or None."""
         if not self.carried:
             return None
         external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())
@@ -110,5 +112,5 @@ class Actuation:
         return external
 
     def torques(self, u: Array) -> Array:
-        """Return the generalised forces (6 + n,) in base axes of all inputs without `wrenches`."""
+        """Return the generalised forces (6 + n,) of the inputs that act without `wrenches`."""
         return self.fixed @ u

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 Frame = Literal["hybrid", "local", "world", "lvlh", "hill"]
 
-# The frames of a circular orbit, which are the world of a robot that has one.
+# Frames of a circular orbit. The world of a robot in orbit is one of them.
 ORBITAL: tuple[Frame, ...] = ("lvlh", "hill")
 
-# Which base velocities (omega_b, v_b), and wrenches (tau_b, F_b) with them, stand in the axes
-# of the reference instead of the base's.
+# Whether (omega_b, v_b) are expressed in reference axes instead of base axes. The same holds for
+# the wrenches (tau_b, F_b).
 IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     "hybrid": (False, True),
     "local": (False, False),
@@ -42,9 +42,9 @@ IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     **dict.fromkeys(ORBITAL, (False, True)),
 }
 
-# Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order,
+# Rows of the base's angular and linear part in a velocity or force (6 + n) of state order,
 ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
-# and in Pinocchio's v and spatial vectors.
+# The same rows in Pinocchio's v and spatial vectors.
 PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 
 
@@ -54,7 +54,7 @@ def unknown_frame(frame: object) -> InputError:
 
 
 def frame_of(robot: Robot, frame: object) -> Frame:
-    """Return the requested frame, or a robot's default frame, checked against its orbit."""
+    """Return the requested or default frame; raise `InputError` if it does not fit the orbit."""
     if frame is None:
         return ORBITAL[0] if robot.orbit else "hybrid"
     if not isinstance(frame, str) or frame not in get_args(Frame):
@@ -69,7 +69,7 @@ def frame_of(robot: Robot, frame: object) -> Frame:
 
 
 def refuse_orbit(robot: Any, what: str) -> None:
-    """Raise `InputError` if a robot is in orbit, which `what` does not support."""
+    """Raise `InputError` if a robot is in orbit; `what` names the unsupported feature."""
     if getattr(robot, "orbit", None):
         raise InputError(
             f"{what} are defined only without an orbit, but '{robot.name}' is in orbit; remove the "
@@ -89,7 +89,7 @@ class Groups(NamedTuple):
 
 
 def state_units(robot: Robot) -> dict[str, str]:
-    """Return {name: unit} of the 12 + 2n states."""
+    """Return the names and units of the 12 + 2n states as {name: unit}."""
     units = dict.fromkeys(("q_b.x", "q_b.y", "q_b.z"), "1")
     units |= dict.fromkeys(("r_b.x", "r_b.y", "r_b.z"), "m")
     for joint in robot.joints:
@@ -102,7 +102,7 @@ def state_units(robot: Robot) -> dict[str, str]:
 
 
 def forces_of(robot: Robot) -> dict[str, str]:
-    """Return {name: unit} of the 6 + n generalised forces."""
+    """Return the names and units of the 6 + n generalised forces as {name: unit}."""
     units = dict.fromkeys(("tau_b.x", "tau_b.y", "tau_b.z"), BaseTorque.UNIT)
     units |= dict.fromkeys(("F_b.x", "F_b.y", "F_b.z"), BaseForce.UNIT)
     for joint in robot.joints:
@@ -110,7 +110,7 @@ def forces_of(robot: Robot) -> dict[str, str]:
     return units
 
 
-# Where q0 is below the square root of the rounding unit, sqrt(1 - |q_b|^2) has no correct digit.
+# If q0 is below the square root of the machine epsilon, sqrt(1 - |q_b|^2) has no correct digit.
 SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 
 _IDENTITY = np.eye(3)
@@ -160,11 +160,11 @@ class Chart:
         return 0.5 * omega if self.standing else times(self.N, omega)
 
     def rotated(self, vectors: Array) -> Array:
-        """Return vectors (.., 3) in base axes in reference axes."""
+        """Rotate vectors (.., 3) from base axes to reference axes."""
         return vectors if self.standing else times(self.R, vectors)
 
     def turned(self, columns: Array) -> Array:
-        """Return columns (.., 3, k) in base axes in reference axes."""
+        """Rotate columns (.., 3, k) from base axes to reference axes."""
         return columns if self.standing else product(self.R, columns)
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
@@ -175,29 +175,29 @@ class Chart:
         return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
 
     def over_q_b(self, by_turn: Array) -> Array:
-        """Return derivatives (.., k, 3) over base rotations as derivatives over q_b (1.3)."""
+        """Convert derivatives (.., k, 3) over base rotations to derivatives over q_b (1.3)."""
         return 2.0 * by_turn if self.standing else product(by_turn, self.J)
 
     def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Rotate parts of x (.., m, k), three rows each, by R in place."""
+        """Multiply parts of x (.., m, k), three rows each, by R in place."""
         _turn(self.R, () if self.standing else parts, x)
 
     def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Rotate parts of x (.., k, m), three columns each, by R^T in place."""
+        """Multiply parts of x (.., k, m), three columns each, by R^T from the right, in place."""
         for columns in () if self.standing else parts:
             x[..., columns] = product(x[..., columns], self._back)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) with some parts, three rows each, turned by R."""
+        """Return x (.., m, k) with parts, three rows each, rotated by R to reference axes."""
         return x if self.standing or not parts else _turn(self.R, parts, x.copy("K"))
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) with some parts, three rows each, turned to base axes by R^T."""
+        """Return x (.., m, k) with parts, three rows each, rotated by R^T to base axes."""
         return x if self.standing or not parts else _turn(self._back, parts, x.copy("K"))
 
 
 class Standing(Chart):
-    """Chart of one or many bases at the reference, where R = Q = I and J = 2 I."""
+    """Chart at one or many attitudes equal to the reference: R = Q = I and J = 2 I."""
 
     standing = True
     N = 0.5 * _IDENTITY
@@ -228,7 +228,7 @@ def states_of(state: StateMap, q: Array, nu: Array) -> Array:
 def unwound(state: StateMap, x: Array, near: Any = 0.0) -> Array:
     """Remove full turns of continuous joints from states or errors (.., nx), in place.
 
-    Their angles are then within half a turn of those of `near` (nx,).
+    Afterwards each angle is within half a turn of its value in `near` (nx,).
     """
     joints = 6 + state.unbounded
     apart = x[..., joints] - np.broadcast_to(near, state.nx)[joints]
@@ -239,14 +239,15 @@ def unwound(state: StateMap, x: Array, near: Any = 0.0) -> Array:
 def readout(
     state: StateMap, K: Array, offset: Array, near: Array
 ) -> Callable[[Array, Array], Array]:
-    """Return f(q, v) = offset - K x(q, v) (m,), with joints on the turn nearest to `near`."""
-    # The attitude is linear in the quaternion, the place in the base's, and velocities in reference
-    # axes in R v: one product with all these gives f, in a fifth of the time of the state.
+    """Return the function f(q, v) = offset - K x(q, v) (m,), with angles nearest to `near`."""
+    # q_b is linear in the quaternion of q, r_b is linear in the position of q, and velocities in
+    # reference axes are linear in R v. So f is one matrix-vector product, which takes a fifth of
+    # the time of computing x.
     robot, g = state.robot, state.groups
     idx_q = np.array([joint.idx_q for joint in robot.joints], dtype=np.intp)
     circling, cos = state.unbounded, idx_q[state.unbounded]
     middle = near[g.q_m][circling]
-    # Of q, v, the angles of continuous joints, R omega, R v and 1.
+    # f = gains z, where z stacks q, v, the angles of continuous joints, R omega, R v and 1.
     ends = np.cumsum((robot.nq, robot.nv, len(circling), 3, 3))
     gains = np.zeros((len(K), ends[-1] + 1))
     of_q, of_v, of_angles, of_angular, of_linear, constant = np.split(gains, ends, axis=1)
@@ -294,9 +295,9 @@ def readout(
 def state_history(
     state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
 ) -> Array:
-    """Return the states (N, nx) of a motion; continuous joints count turns, from `near` on."""
-    # With the times t (N,) as many turns as the rates make between rows, else less than half of
-    # one.
+    """Return the states (N, nx) of a motion, with angles unwrapped from `near` (nx,) on."""
+    # If the times t (N,) are given, the joint rates decide the number of turns between rows.
+    # Otherwise the step between rows is taken as less than half a turn.
     rates = state.velocities(v)
     x = states_of(state, q, rates)
     q_m = x[:, state.groups.q_m]
@@ -311,14 +312,14 @@ def state_history(
 
 
 def attitude_errors(x: Array, target: Array) -> Array:
-    """Return the angles (N,) [deg] between the attitudes of states and of a target, or of rows."""
+    """Return the angles (N,) [deg] between the attitudes of states and one or N targets."""
     turned, scalar = _apart(x, target)
     angles: Array = 2.0 * np.arctan2(np.linalg.norm(turned, axis=1), np.abs(scalar[:, 0]))
     return np.degrees(angles)
 
 
 def _apart(x: Array, target: Array) -> tuple[Array, Array]:
-    """Return the vector part (N, 3) and the scalar part (N, 1) of target^-1 x."""
+    """Return vector (N, 3) and scalar (N, 1) of the quaternion from target to x."""
     at, to = x[:, :3], target[..., :3]
     w, d = (
         np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
@@ -339,7 +340,7 @@ def moving_errors(frame: str, x: Array, target: Array) -> Array:
 
 
 def moved_by(frame: str, target: Array, e: Array) -> Array:
-    """Return the states (N, nx) whose `moving_errors` are e; not finite if |q_b| exceeds 1."""
+    """Return the states (N, nx) with errors e from a target; NaN if |q_b| of e exceeds 1."""
     x, (turn_target, R_target), (turn, R) = target + e, _turned(target), _turned(e)
     q_e, q_target = e[:, :3], target[:, :3]
     x[:, :3] = turn_target * q_e + turn * q_target + np.cross(q_target, q_e)
@@ -354,13 +355,13 @@ def moved_by(frame: str, target: Array, e: Array) -> Array:
 
 
 def _turned(x: Array) -> tuple[Array, Array]:
-    """Return the scalar part (N, 1) of the attitude of states, not negative, and the rotation."""
+    """Return the nonnegative scalar part (N, 1) and the rotation (N, 3, 3) of states' attitudes."""
     scalar = np.sqrt(1.0 - (x[:, :3] ** 2).sum(axis=1, keepdims=True))
     return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
 
 
 def _in_reference(frame: str, nx: int) -> list[Any]:
-    """Return the rows of the base velocities in reference axes."""
+    """Return the indices of the base velocities that are in reference axes."""
     velocities = np.arange(nx)[nx // 2 :]
     return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
 

@@ -60,7 +60,7 @@ class Impact(FrozenArrays):
     momentum: Array
     momentum_after: Array
     event: str
-    # Of the robot that it was, just before.
+    # Robot, configuration and velocity just before the impact.
     _before: tuple[Robot, Array, Array] = field(kw_only=True)
 
     def __repr__(self) -> str:
@@ -71,7 +71,7 @@ class Impact(FrozenArrays):
 
     @property
     def told(self) -> str:
-        """Event, impulse and lost energy, in one line."""
+        """One-line summary of the event, its impulse and the lost energy."""
         felt = f"largest impulse {np.abs(self.impulse).max(initial=0.0):.4g}"
         return f"{self.event}: {felt}, {self.energy_lost:.4g} J lost"
 
@@ -85,33 +85,41 @@ def jam(
 ) -> Impact:
     r"""Stop joints or wheels instantly and permanently at their present positions.
 
-    The other joints are free during the impact. Immediately after the impact, the velocity
-    satisfies :math:`M_+ \nu_+ = G^T M \nu` (13.1), where G is the Jacobian of the robot with the
-    jammed joints fixed. Linear and angular momentum are conserved. For a failed motor whose joint
-    still moves freely, use ``robot.replace(passive=[joint])`` instead of `jam`.
+    The other joints are free during the impact. The velocity :math:`\nu_+` just after the impact
+    satisfies :math:`M_+ \nu_+ = G^T M \nu`, see (13.1) of docs/derivation.md. M and :math:`M_+` are
+    the inertia matrices before and after the impact, and :math:`\nu` is the velocity before the
+    impact. G is the Jacobian that maps velocities of the jammed robot to velocities of the robot
+    before the impact. Linear and angular momentum are conserved.
+
+    If a motor fails but its joint still moves freely, use ``robot.replace(passive=[joint])``
+    instead of `jam`.
 
     Parameters
     ----------
     robot : Robot
     joints : str or sequence of str
-        Names or patterns of joints. The mimic joints of a jammed joint are also jammed.
+        Names or patterns of the joints to jam. Mimic joints of a jammed joint are also jammed.
     q, v : array_like (nq,), (nv,), optional
         Configuration and velocity just before the impact; neutral and at rest by default.
 
     Returns
     -------
     Impact
-        Result of the impact. The jammed joints are welded in `robot` and have no inputs.
+        Result of the impact. The jammed joints of `Impact.robot` are welded and have no inputs.
 
     Raises
     ------
     UnknownNameError
-        If there is no such joint.
+        If a name or pattern in `joints` matches no joint.
     InputError
-        If a size or value is wrong, no joint is named, a mode of a flexible appendage is named, or
-        the robot would have no input left.
+        If one of these conditions is true:
+
+        - an argument has a wrong size or value;
+        - `joints` is empty;
+        - `joints` names a mode of a flexible appendage, which cannot jam;
+        - the jammed robot would have no inputs.
     ModelError
-        If the robot's Pinocchio model was changed after `load`.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     Examples
     --------
@@ -145,7 +153,7 @@ def jam(
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> tuple[dict[str, Any], Array]:
-    """Return the fields of `Impact` for robots at q, v that become one (13.1), and the impulses."""
+    """Join robots at (q, v) to one (13.1); return the fields of `Impact`, and the impulses."""
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))
@@ -177,7 +185,7 @@ def struck(
 
 
 def inertia_at(robot: Robot, q: Array) -> Array:
-    """Return M (nv, nv) over Pinocchio's v."""
+    """Return the joint-space inertia M (nv, nv) for Pinocchio's v."""
     M = np.triu(pin.crba(robot.model, robot.create_data(), q.copy()))
     full: Array = M + np.triu(M, 1).T
     return full
@@ -192,22 +200,24 @@ def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
 
 
 def joint_called(robot: Robot, name: str) -> Any:
-    """Return the joint of Pinocchio's model of that name."""
+    """Return the joint of Pinocchio's model with a name."""
     return robot.model.joints[robot.model.getJointId(name)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Capture(Impact):
-    """Robot with a grasped payload, and the impact of the grasp; see also `Impact`.
+    """Result of `capture`: the robot combined with its payload just after the grasp.
+
+    A `Capture` also has the attributes of `Impact`.
 
     Attributes
     ----------
     impulse : ndarray (6,)
-        Impulse on the robot about the origin of the payload's frame, in the axes of this frame:
-        linear [N s], then angular [N m s].
+        Impulse of the payload on the robot, in the axes of the payload's frame: linear [N s], then
+        angular [N m s] about the origin of this frame.
     payload : Robot
-        The grasped payload as a robot. The configuration and velocity of the payload just before
-        the impact are ``payload_q`` (nq,) and ``payload_v`` (nv,).
+        The grasped payload as a separate robot. The configuration and velocity of the payload just
+        before the impact are ``payload_q`` (nq,) and ``payload_v`` (nv,).
     prefix : str
         Name of the payload's frame in the combined robot.
 
@@ -228,7 +238,7 @@ class Capture(Impact):
 
     @property
     def told(self) -> str:
-        """Event, impulse and lost energy, in one line."""
+        """One-line summary of the event, its impulse and the lost energy."""
         force, torque = (np.linalg.norm(each) for each in np.split(self.impulse, 2))
         return (
             f"{self.event}: impulse at the grasp {force:.4g} N s and {torque:.4g} N m s, "
@@ -250,11 +260,17 @@ def capture(
 ) -> Capture:
     r"""Grasp a payload rigidly, instantly and permanently.
 
-    The joints are free during the impact, because motors give only finite torques. The velocity
-    just after the impact solves :math:`M_+ \nu_+ = G^T \mathrm{diag}(M, M_p) (\nu_-, V_p)`. G is
-    the Jacobian of the velocities of robot and payload with respect to the velocity of the
-    combined robot. The solution is the M-orthogonal projection onto the motions that the rigid
-    grasp permits. The impact conserves linear and angular momentum.
+    The joints are free during the impact, because the finite torques of motors have no effect in
+    an instant. The velocity :math:`\nu_+` just after the impact solves
+    :math:`M_+ \nu_+ = G^T \mathrm{diag}(M, M_p) (\nu_-, V_p)`. Just before the impact,
+    :math:`\nu_-` is the velocity of the robot, :math:`V_p` is the velocity of the payload, and M
+    and :math:`M_p` are their inertia matrices. :math:`M_+` is the inertia matrix of the combined
+    robot. G is the Jacobian that maps the velocity of the combined robot to the velocities of robot
+    and payload.
+
+    The solution projects the velocities just before the impact onto the motions that the rigid
+    grasp permits. The projection is orthogonal with respect to the inertia matrix. The impact
+    conserves linear and angular momentum.
 
     Parameters
     ----------
@@ -262,19 +278,20 @@ def capture(
     frame : str
         Name of the grasping frame.
     payload : pin.Inertia or Robot
-        A rigid body with its inertia in its own frame, or a robot that is grasped at its base.
-        The joints of a payload robot keep their springs and dampers and lose their motors.
+        The inertia of a rigid body in the payload's frame, or a robot that is grasped at its base.
+        If the payload is a robot, its joints keep their springs and dampers but lose their motors.
     q, v : array_like (nq,), (nv,), optional
         Configuration and velocity of the robot just before the impact; neutral and at rest by
         default.
     placement : pin.SE3, optional
         Placement of the payload's frame in the grasping frame; the identity by default.
     payload_q : array_like (nq,), optional
-        Configuration of a payload with joints, neutral by default. The base pose in `payload_q`
-        is ignored.
+        Configuration of a payload with joints; neutral by default. The base pose in `payload_q`
+        is ignored, because `placement` defines the pose.
     payload_v : array_like (6,) or (nv,), optional
-        Twist of the payload's frame in its own axes (Pinocchio's LOCAL), linear [m/s], then
-        angular [rad/s], followed by the joint rates; at rest by default.
+        Velocity of the payload; at rest by default. The first six entries are the twist of the
+        payload's frame in its own axes (Pinocchio's LOCAL): linear [m/s], then angular [rad/s].
+        The remaining entries are the joint rates of the payload.
     prefix : str
         Name of the payload's frame. The payload's joints and links are named PREFIX.NAME.
 
@@ -285,22 +302,22 @@ def capture(
     Raises
     ------
     UnknownNameError
-        If there is no such frame.
+        If the robot has no frame with the given name.
     InputError
         If one of these conditions is true:
 
-        - a size or value is wrong;
+        - an argument has a wrong size or value;
         - the payload's inertia is not physically realisable;
         - the robot already has names with this prefix;
         - robot and payload have different gravity or orbits;
         - a wheel of the payload has momentum but no inertia.
     ModelError
-        If the model of a robot was changed after the robot was made.
+        If the Pinocchio model of the robot or of the payload was modified after its creation.
 
     References
     ----------
-    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989, for free joints. The
-    impact is the perfectly inelastic collision of two bodies.
+    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989, for a robot with free
+    joints. The impact itself is the perfectly inelastic collision of two bodies.
 
     Examples
     --------
@@ -317,7 +334,7 @@ def capture(
         other = replace(alone, gravity=robot.gravity, orbit=robot.orbit)
     else:
         instance("payload", payload, Robot, "a pin.Inertia or a fflin.Robot").require_unchanged()
-        other = replace(payload)  # which may be the robot's twin, the same object
+        other = replace(payload)  # a copy, since the payload may be the same object as the robot
     for name in ("gravity", "orbit") if isinstance(payload, Robot) else ():
         own, theirs = (getattr(each, name) for each in (robot, other))
         if own != theirs:
@@ -327,7 +344,7 @@ def capture(
             )
     if other.stored_momentum:
         raise InputError(
-            "a wheel of the payload has a momentum but no inertia, so that its momentum would be "
+            "a wheel of the payload has a momentum but no inertia, so its momentum would be "
             "lost; give the wheel an inertia, and its speed in payload_v"
         )
     at = pin.SE3.Identity() if placement is None else checked_placement("placement", placement)
@@ -345,7 +362,7 @@ def capture(
 
 
 def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:
-    """Return configuration and velocity of a payload whose base is at a placement."""
+    """Return the checked configuration and velocity of a payload with its base at a placement."""
     configuration = other.neutral() if q is None else other.checked_configuration(q).copy()
     root = other.model.jointPlacements[ROOT]
     configuration[:7] = pin.SE3ToXYZQUAT(root.actInv(at))

@@ -23,28 +23,28 @@ def integrate_rows(model: pin.Model, q: Array, way: Array) -> Array:
 class Integrator:
     """Integrator with one step size for one model, of one point or of N rows of points."""
 
-    # Of the stages: their times in a step of length 1,
+    # Times of the stages in a step of length 1.
     nodes: ClassVar[tuple[float, ...]]
-    # shares in what is summed along: v of the end is v + h sum(weights a),
+    # Quadrature weights of the stages: a step ends at v + h sum(weights a).
     weights: ClassVar[tuple[float, ...]]
-    # and in the sum of a sum: a free place of the end is r + h v + h^2 sum(moments a).
+    # Weights of the double integral: a free position r ends at r + h v + h^2 sum(moments a).
     moments: ClassVar[tuple[float, ...]]
-    # Largest pole times step with which it is stable on the negative real axis.
+    # Stability limit on the negative real axis: largest |pole| h.
     reach: ClassVar[float]
-    # After each stage: 0 where the way to the next begins at the step's first place, 1 where at the
-    # second stage's.
+    # Configuration from which each displacement starts: 0 for the one at the beginning of the
+    # step, 1 for the one of the second stage.
     origins: ClassVar[tuple[int, ...]]
 
     def __init__(self, model: pin.Model, dt: float, rows: int | None = None) -> None:
         self.model, self.dt = model, dt
-        self._way, self._speed = self.shares(dt)
+        self._displacement, self._speed = self.step_weights(dt)
         self._integrate = _integrate if rows is None else integrate_rows
         # v, l1, l2, ...
         self._stages = np.zeros((*(() if rows is None else (rows,)), 1 + len(self.nodes), model.nv))
 
     @classmethod
-    def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return the weights of v and its rates l in each stage's step of q, and in the new v."""
+    def step_weights(cls, dt: float) -> tuple[Array, Array]:
+        """Return the weights of v and of the stages' accelerations l in each step of q and of v."""
         raise NotImplementedError
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
@@ -56,9 +56,11 @@ class Integrator:
             stages[..., k, :] = f(t + node * self.dt, q, v)
             done = stages[..., : k + 1, :]
             begins.append(q)
-            q = integrate(model, begins[self.origins[k - 1]], self._way[k - 1, : k + 1].dot(done))
+            q = integrate(
+                model, begins[self.origins[k - 1]], self._displacement[k - 1, : k + 1].dot(done)
+            )
             v = self._speed[k - 1, : k + 1].dot(done)
-        return integrate(model, q, self._way[-1].dot(stages)), v
+        return integrate(model, q, self._displacement[-1].dot(stages)), v
 
 
 class CommutatorFree4(Integrator):
@@ -71,10 +73,10 @@ class CommutatorFree4(Integrator):
     origins = (0, 0, 1, 0)
 
     @classmethod
-    def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return the weights of v, l1, ..., l4."""
+    def step_weights(cls, dt: float) -> tuple[Array, Array]:
+        """Return the weights of v and of the accelerations l1, ..., l4 of the stages."""
         h, half, twelfth = dt, 0.5 * dt, dt * dt / 12.0
-        way = [
+        displacement = [
             [half, 0.0, 0.0, 0.0, 0.0],
             [half, half * half, 0.0, 0.0, 0.0],
             [half, 0.0, h * half, 0.0, 0.0],
@@ -87,7 +89,7 @@ class CommutatorFree4(Integrator):
             [1.0, 0.0, 0.0, h, 0.0],
             [1.0, *(h * weight for weight in cls.weights)],
         ]
-        return np.array(way), np.array(speed)
+        return np.array(displacement), np.array(speed)
 
 
 class SemiImplicitEuler(Integrator):
@@ -98,8 +100,8 @@ class SemiImplicitEuler(Integrator):
     origins = (0,)
 
     @classmethod
-    def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return the weights of v and its rate."""
+    def step_weights(cls, dt: float) -> tuple[Array, Array]:
+        """Return the weights of v and of its derivative."""
         return np.array([[dt, dt * dt], [0.0, 0.0]]), np.array([[1.0, dt]])
 
 
@@ -110,22 +112,22 @@ INTEGRATORS: dict[str, type[Integrator]] = {
 
 
 def integrator(name: str) -> type[Integrator]:
-    """Return the integrator of a name, or raise `UnknownNameError`."""
+    """Return the integrator with a name, or raise `UnknownNameError`."""
     if not isinstance(name, str) or name not in INTEGRATORS:
         raise unknown("method", str(name), list(INTEGRATORS))
     return INTEGRATORS[name]
 
 
-# Of the commutator-free method of order four (10.3): its Gauss nodes, and how much the one and the
-# other count in the first of its two exponentials; in the second it is the other way round.
+# Commutator-free method of order four (10.3): its Gauss nodes, and their weights in the first of
+# its two exponentials. In the second exponential the weights are exchanged.
 GAUSS = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 HEAVY, LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
 
 
 def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, Array]:
-    r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) of B = `driven`.
+    r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) with B = `driven`.
 
-    Rows of matrices (.., n, n) and (.., n, k) may be given, with the times h (..) of each.
+    A, B and h may have leading axes: matrices (.., n, n) and (.., n, k), and times (..).
     """
     n, k = driven.shape[-2:]
     h = np.asarray(h)[..., None, None]
@@ -156,8 +158,9 @@ def held_derivatives(
 
 
 def held_cost(F: Array, W: Array, h: float | Array) -> Array:
-    """Return the integral of e^(F' t) W e^(F t) over [0, h]; of rows (.., n, n) for times (..)."""
-    # The exponential rounds relative to its largest block, so that W is scaled to the size of F.
+    """Return the integral of e^(F' t) W e^(F t) over [0, h]; F and h may have leading axes."""
+    # The rounding error of an exponential is relative to its largest block, so W is scaled to the
+    # size of F.
     square, h, n = F @ F, np.asarray(h)[..., None, None], F.shape[-1]
     if not (square @ F).any():
         total = np.zeros(F.shape)

@@ -14,7 +14,7 @@ from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# Unit vectors away from the body, and along the orbit's normal, in each frame.
+# Unit vectors away from the central body and along the orbit's normal, in each frame.
 _AXES = {
     "hill": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "lvlh": ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0)),
@@ -22,21 +22,21 @@ _AXES = {
 
 
 def mean_motion(robot: Robot) -> float:
-    """Return the mean motion of a robot's orbit [rad/s], 0 without an orbit."""
+    """Return the mean motion of a robot's orbit [rad/s], or 0 without an orbit."""
     return robot.orbit.mean_motion if robot.orbit else 0.0
 
 
-# Errors of the linear field that are worth a warning, and beyond which it is of no use.
+# Relative errors of the linear field above which a warning is issued, or an error is raised.
 _COARSE, _USELESS = 0.01, 0.5
 
 
 class OrbitField:
-    """Acceleration field of an orbit, for a robot whose world is the orbit's frame.
+    """Acceleration field of a circular orbit in its rotating frame.
 
-    The frame rotates with `rate` (3,) [rad/s]. At position x the gravity gradient is `tide` x per
-    mass; a point at rest in the frame has the acceleration `pull` x, n^2 (3 r r^T - z z^T) x. The
-    columns of `axes` (3, 3) are the unit vectors away from the central body, along the orbit and
-    along its normal.
+    The frame rotates with `rate` (3,) [rad/s]. At position x the gravity gradient per mass is
+    `tide` x. A point at rest in the frame has the acceleration `pull` x = n^2 (3 r r^T - z z^T) x.
+    The columns of `axes` (3, 3) are the unit vectors away from the central body, along the orbit
+    and along its normal.
     """
 
     def __init__(self, robot: Robot, frame: str) -> None:
@@ -55,7 +55,8 @@ class OrbitField:
         self._levers = np.array([skew(body.lever) for body in bodies])
         self._inertia = np.array([body.inertia for body in bodies])
         self._none = pin.Force.Zero()
-        steps = [place.translation for place in robot.model.jointPlacements.tolist()[ROOT + 1 :]]
+        placements = robot.model.jointPlacements.tolist()[ROOT + 1 :]
+        steps = [placement.translation for placement in placements]
         self._reach = sum(float(np.linalg.norm(x)) for x in (*steps, *self._lever))
 
     def base(self, q: Array) -> tuple[Array, Array]:
@@ -64,28 +65,28 @@ class OrbitField:
         return base.rotation, base.translation
 
     def require_near(self, q: Array) -> None:
-        """Warn or raise if the robot, at any joint positions, is far from the orbit's origin."""
+        """Warn or raise if the robot may extend far from the origin of the orbit frame."""
         distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
         error = 1.5 * distance / (self.robot.orbit.radius if self.robot.orbit else math.inf)
-        said = (
+        message = (
             f"'{self.robot.name}' extends to {distance / 1e3:.4g} km from the origin of its orbit "
             f"frame, where the linear gravity gradient has an error of up to {100.0 * error:.2g} %"
         )
         if error > _USELESS:
-            raise InputError(f"{said}; give it an orbit nearer to the robot")
+            raise InputError(f"{message}; choose an orbit that is nearer to the robot")
         if error > _COARSE:
-            warnings.warn(said, FflinWarning, stacklevel=7)
+            warnings.warn(message, FflinWarning, stacklevel=7)
 
     def absolute(self, q: Array, v: Array) -> Array:
-        """Return the velocity (nv,) in inertial axes from one relative to the orbital frame."""
-        R, place = self.base(q)
+        """Return the inertial velocity (nv,) for a velocity v relative to the orbital frame."""
+        R, position = self.base(q)
         found = v.copy()
-        found[PIN_LINEAR] += R.T @ (self._turning @ place)
+        found[PIN_LINEAR] += R.T @ (self._turning @ position)
         found[PIN_ANGULAR] += R.T @ self.rate
         return found
 
     def relative(self, v: Array, absolute: Array, rate: Array) -> Array:
-        """Return dv/dt (nv,) from the rate of the absolute velocity (14.2)."""
+        """Return the relative acceleration dv/dt (nv,) from the inertial acceleration (14.2)."""
         frame, own, found = absolute - v, skew(v[PIN_ANGULAR]), rate.copy()
         found[PIN_LINEAR] += own @ frame[PIN_LINEAR] - skew(frame[PIN_ANGULAR]) @ v[PIN_LINEAR]
         found[PIN_ANGULAR] += own @ frame[PIN_ANGULAR]
@@ -93,7 +94,7 @@ class OrbitField:
 
     def wrenches(self, data: pin.Data) -> list[pin.Force]:
         """Return the gravity-gradient wrench on each body, in its joint's frame."""
-        R, center = self._places(data)
+        R, center = self._bodies(data)
         back = R.swapaxes(1, 2)
         force = self._mass * (back @ (self.tide @ center))[..., 0]
         # 3 n^2 r x (I r) is the axial vector of I tide - tide I.
@@ -103,17 +104,18 @@ class OrbitField:
         return [self._none, *map(pin.Force, force, torque)]
 
     def slopes(self, data: pin.Data) -> Array:
-        """Return the derivatives (nv, nv) over q of the forces of `wrenches`, base unmoved."""
-        # Of a joint that turns by t, in its axes: those of R^T tide R are T [t]x - [t]x T.
-        model, (R, place) = self.robot.model, self._places(data)
+        """Return the derivatives (nv, nv) of the forces of `wrenches` over q, for a fixed base."""
+        # With T = R^T tide R in the axes of a body, a rotation t of the body changes T by
+        # T [t]x - [t]x T.
+        model, (R, centers) = self.robot.model, self._bodies(data)
         joints, local = range(ROOT, model.njoints), pin.ReferenceFrame.LOCAL
         J = np.array([pin.getJointJacobian(model, data, joint, local) for joint in joints])
         moved = J.copy()
         moved[:, :, PIN_LINEAR] = 0.0
         linear, turned = moved[:, PIN_LINEAR], moved[:, PIN_ANGULAR]
-        T, center = R.mT @ self.tide @ R, skew((R.mT @ place)[..., 0])
+        T, center = R.mT @ self.tide @ R, skew((R.mT @ centers)[..., 0])
         shift = linear + (center - self._levers) @ turned
-        pull = skew((R.mT @ self.tide @ place)[..., 0])
+        pull = skew((R.mT @ self.tide @ centers)[..., 0])
         force = self._mass[..., None] * (T @ shift + (pull - T @ center) @ turned)
         units, T = skew(np.eye(3)), T[:, None]
         turn = self._inertia[:, None] @ (T @ units - units @ T)
@@ -123,17 +125,20 @@ class OrbitField:
         return total
 
     def near(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q and the absolute v of a base that is not displaced, which falls as any other."""
+        """Return q and the inertial v with the base at the frame's origin and zero linear velocity.
+
+        Neither changes the motion relative to the free fall of the base.
+        """
         q, v = q.copy(), self.absolute(q, v)
         q[:3] = v[PIN_LINEAR] = 0.0
         return q, v
 
     def add_turning(self, q: Array, v: Array, by_q: Array, by_v: Array) -> None:
-        """Convert derivatives in state order at `near` to the relative rates at q and v."""
-        R, place = self.base(q)
-        fall = R.T @ (self.pull @ place - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
+        """Convert derivatives at `near` to derivatives of the relative acceleration at q and v."""
+        R, position = self.base(q)
+        fall = R.T @ (self.pull @ position - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
         spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))
-        # Of dw/dt + w x spin, and of dv/dt = c + fall - 2 spin x v - w x v.
+        # Derivatives of dw/dt + w x spin, and of dv/dt = c + fall - 2 spin x v - w x v.
         by_q[:, ANGULAR] += by_v[:, ANGULAR] @ spin
         by_q[ANGULAR, ANGULAR] += W @ spin
         by_v[ANGULAR, ANGULAR] -= spin
@@ -144,9 +149,9 @@ class OrbitField:
         by_v[LINEAR, LINEAR] -= 2.0 * spin + W
 
     def potential(self, data: pin.Data) -> float:
-        """Return what the tide and the frame's turning have of energy [J], as `wrenches` does."""
-        # -1/2 the integral of x^T G x over the masses.
-        R, center = self._places(data)
+        """Return the potential energy [J] of the gravity gradient and the frame's rotation."""
+        # -1/2 times the integral of x^T G x over the mass of the robot.
+        R, center = self._bodies(data)
         G, inertia = self.pull, self._inertia
         second = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
         flying = (self._mass[..., None] * center.swapaxes(1, 2) @ G @ center).sum()
@@ -155,56 +160,57 @@ class OrbitField:
             energy -= float(self.rate @ data.oMi[joint].rotation @ momentum)
         return energy
 
-    def _places(self, data: pin.Data) -> tuple[Array, Array]:
-        """Return attitude (k, 3, 3) and centre of mass (k, 3, 1) of each body."""
-        places = data.oMi.tolist()[ROOT:]
-        R = np.array([place.rotation for place in places])
-        return R, np.array([place.translation for place in places])[..., None] + R @ self._lever
+    def _bodies(self, data: pin.Data) -> tuple[Array, Array]:
+        """Return the attitude (k, 3, 3) and the centre of mass (k, 3, 1) of each body."""
+        placements = data.oMi.tolist()[ROOT:]
+        R = np.array([placement.rotation for placement in placements])
+        origins = np.array([placement.translation for placement in placements])
+        return R, origins[..., None] + R @ self._lever
 
 
 def field_of(robot: Robot, frame: str) -> OrbitField | None:
-    """Return the field of a robot's orbit in a frame, if it has one."""
+    """Return the field of a robot's orbit in a frame, or None without an orbit."""
     return None if robot.orbit is None else OrbitField(robot, frame)
 
 
-# What turns about the radial direction, the one along the orbit and the normal count.
-_SHARES = (2.0, -1.0, -1.0)
+# Weights of the rotations about the radial direction, the direction of flight and the normal.
+_WEIGHTS = (2.0, -1.0, -1.0)
 
 
 class GravityGradient(NamedTuple):
     """Gravity-gradient field of an orbit at one base pose, in base axes.
 
     A rotation about a unit vector s at unit rate gives a point at x the acceleration [s]x^2 x.
-    Twice this term of the radial direction minus the terms of the other two directions, times n^2,
-    is the field n^2 (3 r r^T - E) x.
+    The field n^2 (3 r r^T - I) x is the sum of such terms for the radial direction, the direction
+    of flight and the normal, with the weights 2 n^2, -n^2 and -n^2.
     """
 
-    turns: tuple[tuple[float, Array], ...]  # what each counts, and its (3,) unit vector
+    turns: tuple[tuple[float, Array], ...]  # (weight, unit vector (3,)) of each rotation
     spin: Array  # (3,) rate of the frame [rad/s]
-    fall: Array  # (3,) what accelerates the base's origin, the frame's turning included [m/s^2]
+    fall: Array  # (3,) acceleration of the base's origin in the rotating frame [m/s^2]
 
     @classmethod
     def at(cls, field: OrbitField, q: Array) -> "GravityGradient":
-        """Return that at a configuration (nq,), which must be near to the orbit's point."""
+        """Return the field at a configuration (nq,), which must be near the orbit's origin."""
         field.require_near(q)
-        R, place = field.base(q)
+        R, position = field.base(q)
         n = mean_motion(field.robot)
-        turns = zip((share * n * n for share in _SHARES), (R.T @ field.axes).T, strict=True)
-        return cls(tuple(turns), R.T @ field.rate, R.T @ (field.pull @ place))
+        turns = zip((weight * n * n for weight in _WEIGHTS), (R.T @ field.axes).T, strict=True)
+        return cls(tuple(turns), R.T @ field.rate, R.T @ (field.pull @ position))
 
     def force(self, model: pin.Model, data: pin.Data, q: Array) -> Array:
-        """Return the generalised force (nv,) on the robot, less what falls with its origin."""
+        """Return the generalised force (nv,) relative to the free fall of the base's origin."""
         total, v = np.zeros(model.nv), np.zeros(model.nv)
-        for share, v[PIN_ANGULAR] in self.turns:
-            total += share * pin.nonLinearEffects(model, data, q, v)
+        for weight, v[PIN_ANGULAR] in self.turns:
+            total += weight * pin.nonLinearEffects(model, data, q, v)
         return total
 
     def slopes(self, model: pin.Model, data: pin.Data, q: Array) -> tuple[Array, Array]:
         """Return the derivatives of `force` over the joints (nv, nv) and rotations (nv, 3)."""
         by_q, by_turn = np.zeros((model.nv, model.nv)), np.zeros((model.nv, 3))
-        v, still = np.zeros(model.nv), np.zeros(model.nv)
-        for share, v[PIN_ANGULAR] in self.turns:
-            over_q, over_v, _ = pin.computeRNEADerivatives(model, data, q, v, still)
-            by_q += share * over_q
-            by_turn += share * over_v[:, PIN_ANGULAR] @ skew(v[PIN_ANGULAR])
+        v, at_rest = np.zeros(model.nv), np.zeros(model.nv)
+        for weight, v[PIN_ANGULAR] in self.turns:
+            over_q, over_v, _ = pin.computeRNEADerivatives(model, data, q, v, at_rest)
+            by_q += weight * over_q
+            by_turn += weight * over_v[:, PIN_ANGULAR] @ skew(v[PIN_ANGULAR])
         return by_q, by_turn

@@ -1,4 +1,4 @@
-"""Outputs of a robot, prepared: names, units, and two independent evaluations."""
+"""Outputs of a robot: their names, units, and two independent evaluations."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
@@ -11,7 +11,6 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT, Carried, by_joint, find_frame
 from fflin.robot.outputs import BasePose, FullState, JointOutput, JointPositions, Output
@@ -20,12 +19,12 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Sensed(NamedTuple):
-    """Outputs and their derivatives (ny, nv) at a point; zero for outputs that are states."""
+    """Outputs and their derivatives (ny, nv) at a point; rows of outputs that are states are 0."""
 
     y: Array
-    by_q: Array  # over the tangent of q that pin.integrate moves along
+    by_q: Array  # over the tangent displacement of pin.integrate
     by_v: Array
-    by_a: Array | None  # None where no output depends on a
+    by_a: Array | None  # None if no output depends on the acceleration a
 
     def part(self, rows: slice) -> "Sensed":
         """Return views of the rows of one output."""
@@ -34,19 +33,20 @@ class Sensed(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Robot with its base moved to the origin and to rest, and the removed base motion."""
+    """Robot with its base at the origin and without linear velocity, and the removed motion."""
 
     model: pin.Model
     data: pin.Data
-    q: Array  # (nq,) with the base at the world's origin in its axes
-    v: Array  # (nv,) without the linear one of the base
-    R: Array  # rotation (3, 3) and position (3,) of the base relative to the reference
-    r_b: Array
-    v_b: Array  # velocity of the base's origin and gravity (3,), in base axes
-    g: Array
-    # Momentum (3,) of wheels that are no joints: the joint that carries it, and it in its axes.
+    q: Array  # (nq,) with the base at the world's origin and in the world's axes
+    v: Array  # (nv,) without the linear velocity of the base
+    R: Array  # rotation (3, 3) of the base relative to the reference
+    r_b: Array  # position (3,) of the base relative to the reference
+    v_b: Array  # velocity (3,) of the base's origin in base axes
+    g: Array  # gravity (3,) in base axes
+    # Angular momentum of wheels without a joint: (joint on which it is mounted, momentum (3,) in
+    # the joint's axes).
     stored: tuple[tuple[int, Array], ...]
-    spin: Array  # (3,) rate at which an orbit turns the world, in base axes
+    spin: Array  # (3,) angular velocity of the orbit frame in base axes
 
     def placement(self, frame: Carried) -> pin.SE3:
         """Return the placement of a frame on the robot."""
@@ -58,10 +58,10 @@ class World(NamedTuple):
 
     model: pin.Model
     data: pin.Data
-    reference: pin.SE3  # what positions and axes are relative to
+    reference: pin.SE3  # placement relative to which outputs are expressed
     gravity: Array
     stored: tuple[tuple[int, Array], ...]  # as in `Point`
-    spin: Array  # in its own axes
+    spin: Array  # (3,) angular velocity of the orbit frame in its own axes
 
     def placement(self, frame: Carried) -> pin.SE3:
         """Return the placement of a frame in the world."""
@@ -72,15 +72,16 @@ class World(NamedTuple):
         return frame.placement.actInv(self.data.v[frame.joint])
 
 
-# Those of the whole robot call all of Pinocchio's that they need; those of frames expect its
-# computeForwardKinematicsDerivatives: f(point, where to write them, *frames)
-Slopes: TypeAlias = Callable[..., None]
+# f(point, sensed, *frames) writes outputs and derivatives into `sensed`. Functions with frames
+# require that pin.computeForwardKinematicsDerivatives was called; functions without frames call
+# the Pinocchio functions that they need.
+Derivatives: TypeAlias = Callable[..., None]
 
-# f(world, attitudes of the frames at the point of linearisation, *frames)
+# f(world, attitudes of the frames at the point of linearisation, *frames) returns the output.
 Value: TypeAlias = Callable[..., Array]
 
 
-def _center_of_mass_slopes(at: Point, to: Sensed) -> None:
+def _center_of_mass_derivatives(at: Point, to: Sensed) -> None:
     jacobian = pin.jacobianCenterOfMass(at.model, at.data, at.q, False)
     to.y[:] = at.r_b + at.R.dot(at.data.com[0])
     to.by_q[:] = at.R.dot(jacobian)
@@ -97,12 +98,13 @@ def _center(world: World) -> Array:
     return np.asarray(sum(moments) / sum(inertia.mass for inertia, _ in bodies))
 
 
-def _momentum_slopes(at: Point, to: Sensed) -> None:
-    # Its rate, which this differentiates too, is of no interest: any acceleration will do.
+def _momentum_derivatives(at: Point, to: Sensed) -> None:
+    # The function also differentiates the rate of momentum, which is not used here. So any value
+    # may stand for the acceleration.
     by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
-    mass, still = pin.computeTotalMass(at.model), at.data.hg
-    to.y[:3] = at.R.dot(still.angular)
-    to.y[3:] = at.R.dot(still.linear + mass * at.v_b)
+    mass, h = pin.computeTotalMass(at.model), at.data.hg
+    to.y[:3] = at.R.dot(h.angular)
+    to.y[3:] = at.R.dot(h.linear + mass * at.v_b)
     for part, rows in (slice(0, 3), PIN_ANGULAR), (slice(3, 6), PIN_LINEAR):
         to.by_q[part] = at.R.dot(by_q[rows])
         to.by_v[part] = at.R.dot(by_v[rows])
@@ -124,7 +126,7 @@ def _momentum(world: World, _: object) -> Array:
     return np.concatenate((turned @ angular, turned @ linear))
 
 
-def _frame_pose_slopes(at: Point, to: Sensed, frame: Carried) -> None:
+def _frame_pose_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     placement = at.placement(frame)
     _, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     to.y[:3] = at.r_b + at.R.dot(placement.translation)
@@ -134,16 +136,17 @@ def _frame_pose_slopes(at: Point, to: Sensed, frame: Carried) -> None:
 
 def _frame_pose(world: World, before: Sequence[Array], frame: Carried) -> Array:
     placement = world.placement(frame)
-    turned = pin.log3(before[0].T @ placement.rotation)
-    return np.concatenate((world.reference.actInv(placement.translation), turned))
+    rotation = pin.log3(before[0].T @ placement.rotation)
+    return np.concatenate((world.reference.actInv(placement.translation), rotation))
 
 
-def _frame_velocity_slopes(at: Point, to: Sensed, frame: Carried) -> None:
-    _angular_slopes(at, to.part(slice(0, 3)), frame)
+def _frame_velocity_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
+    _angular_derivatives(at, to.part(slice(0, 3)), frame)
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
     R = at.R.dot(at.placement(frame).rotation)
-    # A velocity held in axes that turn turns with them: the frame's, and the base's.
+    # A velocity that is constant in rotating axes (of the frame or the base) rotates with them.
+    # The skew terms are the derivatives over these rotations.
     to.y[3:] = R.dot(velocity.linear) + at.R.dot(at.v_b)
     to.by_q[3:] = R.dot(by_q[PIN_LINEAR] - skew(velocity.linear).dot(jacobian[PIN_ANGULAR]))
     to.by_q[3:, PIN_ANGULAR] -= at.R.dot(skew(at.v_b))
@@ -156,37 +159,37 @@ def _frame_velocity(world: World, _: object, frame: Carried) -> Array:
     return np.concatenate((velocity.angular, R @ velocity.linear))
 
 
-def _relative_pose_slopes(at: Point, to: Sensed, *frames: Carried) -> None:
-    place, other = map(at.placement, frames)
-    jacobian, seeing = (
+def _relative_pose_derivatives(at: Point, to: Sensed, *frames: Carried) -> None:
+    placement, other = map(at.placement, frames)
+    jacobian, of_other = (
         pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)[1] for frame in frames
     )
-    relative = other.actInv(place)
+    relative = other.actInv(placement)
     R, p = relative.rotation, relative.translation
     to.y[:3] = p
     to.by_q[:3] = (
-        R.dot(jacobian[PIN_LINEAR]) - seeing[PIN_LINEAR] + skew(p).dot(seeing[PIN_ANGULAR])
+        R.dot(jacobian[PIN_LINEAR]) - of_other[PIN_LINEAR] + skew(p).dot(of_other[PIN_ANGULAR])
     )
-    to.by_q[3:] = jacobian[PIN_ANGULAR] - R.T.dot(seeing[PIN_ANGULAR])
-    to.by_q[:, :6] = 0.0  # the base carries both
+    to.by_q[3:] = jacobian[PIN_ANGULAR] - R.T.dot(of_other[PIN_ANGULAR])
+    to.by_q[:, :6] = 0.0  # a motion of the base moves both frames alike
 
 
 def _relative_pose(world: World, before: Sequence[Array], *frames: Carried) -> Array:
-    place, other = map(world.placement, frames)
-    turned = pin.log3((before[1].T @ before[0]).T @ other.rotation.T @ place.rotation)
-    seen = other.rotation.T @ (place.translation - other.translation)
-    return np.concatenate((seen, turned))
+    placement, other = map(world.placement, frames)
+    rotation = pin.log3((before[1].T @ before[0]).T @ other.rotation.T @ placement.rotation)
+    position = other.rotation.T @ (placement.translation - other.translation)
+    return np.concatenate((position, rotation))
 
 
-def _angular_slopes(at: Point, to: Sensed, frame: Carried) -> None:
+def _angular_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     to.y[:] = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL).angular
     to.by_q[:] = by_q[PIN_ANGULAR]
     to.by_v[:] = jacobian[PIN_ANGULAR]
 
 
-def _gyroscope_slopes(at: Point, to: Sensed, frame: Carried) -> None:
-    _angular_slopes(at, to, frame)
+def _gyroscope_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
+    _angular_derivatives(at, to, frame)
     spin = at.placement(frame).rotation.T.dot(at.spin)
     to.y[:] += spin
     to.by_q[:] += skew(spin).dot(to.by_v)  # the frame's angular Jacobian
@@ -197,15 +200,15 @@ def _gyroscope(world: World, _: object, frame: Carried) -> Array:
     return np.asarray(world.velocity(frame).angular + spin)
 
 
-def _accelerometer_slopes(at: Point, to: Sensed, frame: Carried) -> None:
-    # Pinocchio was given dv_b/dt + omega_b x v_b - g, in base axes, for the base's acceleration.
+def _accelerometer_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
+    # `Sensing.evaluate` sets the base's acceleration to dv_b/dt + omega_b x v_b - g in base axes.
     _, by_q, by_v, by_a = pin.getPointClassicAccelerationDerivatives(
         at.model, at.data, *frame, _LOCAL
     )
     to.y[:] = pin.getFrameClassicalAcceleration(at.model, at.data, *frame, _LOCAL).linear
     assert to.by_a is not None
     to.by_q[:], to.by_v[:], to.by_a[:] = by_q, by_v, by_a
-    # The terms of that sum; gravity turns against the base.
+    # Derivatives of omega_b x v_b and of -g, which is constant in world axes.
     of_base = by_a[:, PIN_LINEAR]
     to.by_q[:, PIN_ANGULAR] -= of_base.dot(skew(at.g))
     to.by_v[:, PIN_ANGULAR] -= of_base.dot(skew(at.v_b))
@@ -214,45 +217,48 @@ def _accelerometer_slopes(at: Point, to: Sensed, frame: Carried) -> None:
 def _accelerometer(world: World, _: object, frame: Carried) -> Array:
     velocity = world.velocity(frame)
     rate = frame.placement.actInv(world.data.a[frame.joint]).linear
-    felt = rate + np.cross(velocity.angular, velocity.linear)
-    return np.asarray(felt - world.placement(frame).rotation.T @ world.gravity)
+    acceleration = rate + np.cross(velocity.angular, velocity.linear)
+    return np.asarray(acceleration - world.placement(frame).rotation.T @ world.gravity)
 
 
-# What is not here is made of states.
-KINDS: dict[type[kinds.Output], tuple[Slopes, Value]] = {
-    kinds.CenterOfMass: (_center_of_mass_slopes, _center_of_mass),
-    kinds.Momentum: (_momentum_slopes, _momentum),
-    kinds.FramePose: (_frame_pose_slopes, _frame_pose),
-    kinds.FrameVelocity: (_frame_velocity_slopes, _frame_velocity),
-    kinds.RelativePose: (_relative_pose_slopes, _relative_pose),
-    kinds.Gyroscope: (_gyroscope_slopes, _gyroscope),
-    kinds.Accelerometer: (_accelerometer_slopes, _accelerometer),
+# Outputs of all other types consist of states.
+KINDS: dict[type[kinds.Output], tuple[Derivatives, Value]] = {
+    kinds.CenterOfMass: (_center_of_mass_derivatives, _center_of_mass),
+    kinds.Momentum: (_momentum_derivatives, _momentum),
+    kinds.FramePose: (_frame_pose_derivatives, _frame_pose),
+    kinds.FrameVelocity: (_frame_velocity_derivatives, _frame_velocity),
+    kinds.RelativePose: (_relative_pose_derivatives, _relative_pose),
+    kinds.Gyroscope: (_gyroscope_derivatives, _gyroscope),
+    kinds.Accelerometer: (_accelerometer_derivatives, _accelerometer),
 }
 
 
-# Rotation and position of the base relative to itself.
+# Rotation and position of a base at its reference.
 _STANDING: tuple[Array, Array] = (np.eye(3), np.zeros(3))
 
 
 class Sensing:
-    """Outputs of a robot, prepared; with `own_reference` relative to the base itself."""
+    """Outputs of a robot and their derivatives.
 
-    # Neither where the base is nor how fast it moves along changes what happens on the robot
-    # (Galilei). So Pinocchio is asked about the robot with its base at the origin, in its own axes,
-    # and without the velocity v_b of its origin; these are put on afterwards, and an orbit costs no
-    # digits. Of the base's acceleration only dv_b/dt + omega_b x v_b - g, in base axes, is felt.
+    With `own_reference`, the outputs are relative to the base's current pose.
+    """
+
+    # Position and velocity of the base do not change what happens on the robot (Galilean
+    # invariance). So Pinocchio evaluates the robot with its base at the origin and v_b = 0, and the
+    # base motion is added afterwards. This loses no digits at orbital positions and velocities.
+    # Sensors measure the base's acceleration as dv_b/dt + omega_b x v_b - g in base axes.
 
     def __init__(
         self, state: StateMap, outputs: Sequence[Output], *, own_reference: bool = False
     ) -> None:
         robot = state.robot
         self.state, self._own_reference = state, own_reference
-        # The free-flyer joint may itself stand somewhere in the world.
+        # The model may placement its free-flyer joint away from the world's origin.
         self._home = pin.SE3ToXYZQUAT(robot.model.jointPlacements[ROOT].inverse())
 
         # (output, state) for each output that is a state.
         self.states: list[tuple[int, int]] = []
-        self._kinds: list[tuple[slice, Slopes, list[Carried]]] = []
+        self._kinds: list[tuple[slice, Derivatives, list[Carried]]] = []
         signals: list[tuple[str, str]] = []
         for output in outputs:
             at = len(signals)
@@ -264,7 +270,7 @@ class Sensing:
                 indices = state_indices(state, output)
                 self.states += enumerate(indices, start=at)
                 signals += [(state.names[index], state.units[index]) for index in indices]
-        # Those of frames last: the others overwrite what these read.
+        # Outputs of frames come last, because the others overwrite the data that they read.
         self._kinds.sort(key=lambda kind: bool(kind[2]))
         self.names = tuple(name for name, _ in signals)
         self.units = tuple(unit for _, unit in signals)
@@ -277,12 +283,14 @@ class Sensing:
                 f"output {inertial[0]} needs inertial axes, but the world of '{robot.name}' "
                 "rotates with its orbit; remove this output"
             )
-        # Where one does, D is not zero.
+        # If an output depends on acceleration, D is not zero.
         self.needs_acceleration = any(output.FEELS_ACCELERATION for output in outputs)
 
     def evaluate(self, data: pin.Data, q: Array, v: Array, a: Array) -> Sensed:
-        """Return the outputs and their derivatives at valid q (nq,) and v (nv,)."""
-        # What `data` held is lost; a counts where `needs_acceleration` alone.
+        """Return the outputs and their derivatives at valid q (nq,) and v (nv,).
+
+        `data` is overwritten. The acceleration `a` is ignored unless `needs_acceleration`.
+        """
         ny, nv = len(self.names), len(v)
         by_a = np.zeros((ny, nv)) if self.needs_acceleration else None
         sensed = Sensed(np.zeros(ny), np.zeros((ny, nv)), np.zeros((ny, nv)), by_a)
@@ -292,21 +300,23 @@ class Sensing:
         derived = False
         for rows, slopes, frames in self._kinds:
             if frames and not derived:
-                felt: tuple[Array, ...] = ()
+                acceleration: tuple[Array, ...] = ()
                 if self.needs_acceleration:
                     rate = a.copy()
                     rate[PIN_LINEAR] += skew(v[PIN_ANGULAR]).dot(at.v_b) - at.g
-                    felt = (rate,)
-                pin.computeForwardKinematicsDerivatives(at.model, at.data, at.q, at.v, *felt)
+                    acceleration = (rate,)
+                pin.computeForwardKinematicsDerivatives(
+                    at.model, at.data, at.q, at.v, *acceleration
+                )
                 derived = True
             slopes(at, sensed.part(rows), *frames)
         return sensed
 
     def _point(self, data: pin.Data, q: Array, v: Array) -> Point:
         state, robot = self.state, self.state.robot
-        still_q, still_v = q.copy(), v.copy()
-        still_q[:7] = self._home
-        still_v[PIN_LINEAR] = 0.0
+        centred_q, centred_v = q.copy(), v.copy()
+        centred_q[:7] = self._home
+        centred_v[PIN_LINEAR] = 0.0
         R, r_b = _STANDING
         if not self._own_reference:
             R, r_b = state.rotation(q), state.positions(q)
@@ -314,8 +324,8 @@ class Sensing:
         return Point(
             model=robot.model,
             data=data,
-            q=still_q,
-            v=still_v,
+            q=centred_q,
+            v=centred_v,
             R=R,
             r_b=r_b,
             v_b=v[PIN_LINEAR],
@@ -326,11 +336,14 @@ class Sensing:
 
 
 class Measuring:
-    """Outputs y by elementary kinematics, to check C and D; rotations are relative to q."""
+    """Outputs y by elementary kinematics, to check C and D.
+
+    Rotations of frames are relative to their attitude at the configuration q.
+    """
 
     def __init__(self, state: StateMap, q: Array) -> None:
         self.state = state
-        robot, field = state.robot, field_of(state.robot, state.frame)
+        robot, field = state.robot, state.field
         self._world = world = World(
             model=robot.model,
             data=robot.create_data(),
@@ -359,7 +372,7 @@ class Measuring:
 
 
 def state_indices(state: StateMap, output: Output) -> list[int]:
-    """Return the indices of the states that an output is made of."""
+    """Return the indices of the states of which an output consists."""
     robot, groups = state.robot, state.groups
     if isinstance(output, FullState):
         return list(range(state.nx))

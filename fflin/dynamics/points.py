@@ -11,25 +11,24 @@ from fflin.base.names import by_name, input_keys, rates_by_name
 from fflin.base.validation import Array, instance, numbers, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.robot.fields import combined
 from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, by_joint
 from fflin.robot.robot import Robot
 
-LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
+LARGEST_SPEED = 1e50  # [rad/s|m/s], so that squares and their sums do not overflow
 
 
 def configuration(
     robot: Robot, joints: Mapping[str, float] | None = None, base: pin.SE3 | None = None
 ) -> Array:
-    """Return a Pinocchio configuration, from joint values by name and a base placement.
+    """Return the Pinocchio configuration for joint values given by name and a base placement.
 
     Parameters
     ----------
     robot : Robot
     joints : mapping, optional
-        {joint: value [rad|m]} of independent joints; all other joints are at their neutral
-        positions. A name may be a pattern, ``hinge_*``.
+        Values of independent joints by name, {joint: value [rad|m]}. All other joints are at their
+        neutral positions. A name may be a pattern such as ``hinge_*``.
     base : pin.SE3, optional
         Placement of the base in the world; the identity by default.
 
@@ -40,7 +39,7 @@ def configuration(
     Raises
     ------
     UnknownNameError
-        If there is no such joint.
+        If a name or pattern in `joints` matches no joint.
     InputError
         If a value is not a finite number, or a named joint is a mimic joint.
 
@@ -65,7 +64,7 @@ def configuration(
 
 
 def require_slow(what: str, v: Array) -> None:
-    """Raise `InputError` if the square of a velocity overflows."""
+    """Raise `InputError` if a velocity exceeds `LARGEST_SPEED`."""
     if not np.abs(v).max(initial=0.0) < LARGEST_SPEED:
         raise InputError(
             f"{what} has an entry of {np.abs(v).max():.3g}, expected less than {LARGEST_SPEED:g} "
@@ -79,8 +78,17 @@ def base_of(state: Mapping[str, Any]) -> pin.SE3:
     return pin.SE3(rotation, np.array(state.get("position", np.zeros(3))))
 
 
+def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a state whose parts, joints and rates are replaced by the entries of another state."""
+    both = {**state, **other}
+    for part in ("joints", "velocity"):
+        if part in both:
+            both[part] = {**state.get(part, {}), **other.get(part, {})}
+    return both
+
+
 def start_of(robot: Robot) -> tuple[Array, Array]:
-    """Return the configuration (nq,) and velocity (nv,) at which a robot starts."""
+    """Return the initial configuration (nq,) and velocity (nv,) of a robot."""
     start = combined(robot.point, robot.start)
     q = configuration(robot, start.get("joints"), base_of(start))
     return q, velocity(robot, start.get("velocity", {}))
@@ -93,7 +101,7 @@ def point_of(
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:
-            raise InputError("x0 is given together with q0 or v0; give x0 alone, or q0 and v0")
+            raise InputError("x0 is given together with q0 or v0; give either x0, or q0 and v0")
         return state.to_pinocchio(x0)
     if q0 is None and v0 is None:
         return default()
@@ -102,15 +110,18 @@ def point_of(
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
-    """Return a Pinocchio velocity, from joint rates and base velocities by name.
+    """Return the Pinocchio velocity for joint rates and base velocities given by name.
 
     Parameters
     ----------
     robot : Robot
     values : mapping
-        {name: rate}, with joint names [rad/s|m/s], and omega_b.x, .y, .z [rad/s] and v_b.x, .y, .z
-        [m/s] of the base in base axes. All other rates are zero. A name may be a pattern,
-        ``hinge_*``, or a group, ``qdot_m``.
+        Rates by name, {name: rate}; all other rates are zero. A name is one of
+
+        - a joint [rad/s|m/s];
+        - a component of the base velocity in base axes: omega_b.x, .y, .z [rad/s] or v_b.x, .y, .z
+          [m/s];
+        - a pattern such as ``hinge_*``, or a group such as ``qdot_m``.
 
     Returns
     -------
@@ -119,7 +130,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     Raises
     ------
     UnknownNameError
-        If there is no such joint or component.
+        If a name or pattern in `values` matches no joint and no velocity component.
     InputError
         If a value is not a finite number.
 
@@ -133,19 +144,20 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     state = StateMap(robot)
     for name, _ in named_wheels(robot.inputs):
         if name in checked and name not in robot.joint_names:
-            robot.joint(name)  # says why it has no speed
+            robot.joint(name)  # its error says why the joint has no velocity
     rates = rates_by_name(robot.joint_names, checked)
     return state.spread(np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]]))
 
 
 def effort(robot: Robot, values: Mapping[str, float]) -> Array:
-    """Return an input vector u, from values by name.
+    """Return the input vector u for values given by name.
 
     Parameters
     ----------
     robot : Robot
     values : mapping
-        {name of an input, group or pattern, such as ``tau_m``: value}; all other inputs are zero.
+        Values by name, {name: value}; all other inputs are zero. A name is an input, a group such
+        as ``tau_m``, or a pattern.
 
     Returns
     -------
@@ -154,7 +166,7 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     Raises
     ------
     UnknownNameError
-        If there is no such input.
+        If a name or pattern in `values` matches no input.
     InputError
         If a value is not a finite number.
 

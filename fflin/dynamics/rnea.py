@@ -11,33 +11,30 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR
-from fflin.dynamics.orbital import GravityGradient, field_of
+from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.state import StateMap
-from fflin.robot.joints import Joint
 from fflin.robot.mass_properties import coordinate_names
-from fflin.robot.robot import Robot
 
-# The coupling of a coordinate, M_ii (M^-1)_ii, is 1 where it is decoupled and grows as it loses
-# inertia of its own; times the rounding unit it is the relative error of (M^-1)_ii. Where the sum
-# over all coordinates is beyond the first figure, fewer than nine digits of M^-1 are left; beyond
-# the second, fewer than two. A sum below the number of coordinates comes from pivots that are
-# round-off.
+# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate, and grows
+# as the inertia of i alone vanishes. Coupling times machine epsilon is the relative error of
+# (M^-1)_ii. If the sum of all couplings exceeds _WARNING_COUPLING, M^-1 has fewer than nine correct
+# digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a sum below the
+# number of coordinates shows that pivots are round-off.
 _EPS = float(np.finfo(float).eps)
 _WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
-# The same with the moments about the base's origin, where Pinocchio's articulated bodies are
-# added up, bounds their rounding; up to here they are taken, beyond it a factor of M.
+# Pinocchio's articulated-body inverse sums inertias about the base's origin. The couplings with
+# M_ii replaced by `inertia_bounds` bound its rounding errors. If their sum exceeds this limit, a
+# Cholesky factor of M is used instead.
 _QUICK_COUPLING = 1e-11 / _EPS
 
-STROKE = 1.0  # [m] that a sliding joint is taken to be out at most, for those moments
+STROKE = 1.0  # [m] largest displacement of a prismatic joint for which `inertia_bounds` holds
 
-# From this size on LAPACK is quicker than a sparse factor.
+# Above this size LAPACK is faster than a sparse factor.
 _DENSE_SIZE = 64
 
-# Relative rounding error that numbers of a URDF leave of an exact symmetry.
-_ASYMMETRY = 1e-12
 
-# Bound once: the look-up of a name in a module costs as much as a small matrix.
+# Bound once, because looking up a name in a module takes as long as factorising a small matrix.
 _crba, _decompose, _invert_factor, _compute_inverse = (
     pin.crba,
     pin.cholesky.decompose,
@@ -49,24 +46,24 @@ _crba, _decompose, _invert_factor, _compute_inverse = (
 class Inertia:
     """M^-1 at a configuration, in base axes: angular, linear, joints."""
 
-    # Between this and `least_coupling` the sum of M_ii (M^-1)_ii lies where M^-1 is good.
+    # M^-1 is accurate if the sum of couplings lies between `least_coupling` and this value.
     warning_coupling = _WARNING_COUPLING
 
     def __init__(self, state: StateMap, data: pin.Data) -> None:
         robot = state.robot
         self._state, self._model, self._data = state, robot.model, data
-        # Views, since Pinocchio overwrites in place what they show.
+        # Views of an array that Pinocchio overwrites in place.
         self._inverse = data.Minv
         self._inverse_diagonal = self._inverse.diagonal()
-        # By a dense factor where v is no permutation of nu.
+        # If v is not a permutation of nu (mimic joints, modes), M is factorised as a dense matrix.
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
         self._slides = [
             joint.idx_q for joint in robot.joints if joint.prismatic and joint.kind != "modal"
         ]
-        # The base at the world's origin: M does not depend on where it is, but Pinocchio works in
-        # world axes and would lose digits to a base far away.
+        # M does not depend on the base's pose. The base is placed at the origin because Pinocchio
+        # works in world axes, and would lose digits if the base were far away.
         self._still = pin.neutral(robot.model)
         self.least_coupling = 0.999 * (6 + robot.n)
 
@@ -74,16 +71,16 @@ class Inertia:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
         still = self._still
         still[7:] = q[7:]
-        # By articulated bodies only where that is asked for: their rounding, small as it is, takes
-        # from a slope M^-1 K the exactness of what M^-1 leaves alone. Else by a Cholesky factor,
-        # whose rounding no scaling of M changes.
+        # Articulated bodies are used only if `quick`: their small rounding errors would appear in
+        # entries of M^-1 K that are exactly zero. The rounding of a Cholesky factor does not
+        # depend on the scaling of M.
         bounds = self._bounds if quick else None
         if bounds is not None and (
             not self._slides or np.abs(still.take(self._slides)).max() <= STROKE
         ):
             _compute_inverse(self._model, self._data, still)
             self._state.project(self._inverse, out)
-            # Written so that NaN, from a pivot that is zero, fails too.
+            # A zero pivot gives NaN, for which this comparison is false.
             if self.least_coupling < bounds.dot(self._inverse_diagonal) < _QUICK_COUPLING:
                 return
         upper = _crba(self._model, self._data, still)
@@ -96,12 +93,12 @@ class Inertia:
             inverse = _invert_factor(self._model, self._data)
             self._state.project(inverse, out)
             coupling = upper.diagonal().dot(inverse.diagonal())
-        # Written so that NaN, from a pivot that is zero, fails too.
+        # A zero pivot gives NaN, which this condition also reports.
         if not self.least_coupling < coupling < _WARNING_COUPLING:
             self._judge(coupling, self._state.project(upper.T))
 
     def _judge(self, coupling: float, M: Array) -> None:
-        """Refuse a singular M, or warn of an ill-conditioned M, by coordinate names."""
+        """Raise an error for a singular M, or warn of an ill-conditioned M, naming coordinates."""
         name, scale = self._state.robot.name, np.sqrt(np.maximum(M.diagonal(), 0.0))
         scale[scale == 0.0] = 1.0
         lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # or NaN
@@ -110,14 +107,14 @@ class Inertia:
         involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
         if lost:
             raise SingularInertiaError(
-                f"the mass matrix of '{name}' is singular at this configuration: a motion of "
-                f"{involved} moves no mass; choose another configuration, give the links an "
-                "inertia, or lock one of the joints"
+                f"the mass matrix of '{name}' is singular at this configuration, because a "
+                f"motion of {involved} moves no mass; choose another configuration, give the "
+                "links an inertia, or lock a joint"
             )
         warnings.warn(
-            f"the mass matrix of '{name}' is ill-conditioned, so that A and B have a relative "
-            f"error of about {coupling * _EPS:.0e}: {involved} move almost no mass relative to "
-            "each other; check the inertias of the links",
+            f"the mass matrix of '{name}' is ill-conditioned, so A and B have a relative error "
+            f"of about {coupling * _EPS:.0e}. A joint motion of {involved} moves almost no mass; "
+            "check the inertias of the links",
             FflinWarning,
             stacklevel=6,
         )
@@ -133,25 +130,26 @@ def _invert_dense(M: Array, out: Array) -> None:
 
 
 def inertia_bounds(model: pin.Model) -> Array | None:
-    """Bound what each coordinate of a free flyer moves: its mass, or its moment."""
-    # A body's moment about the base's origin is at most its largest principal moment and its mass
-    # times the square of the way to it, from joint to joint, sliding ones being within `STROKE`.
+    """Return upper bounds of the mass or moment of inertia that each coordinate moves."""
+    # The moment of inertia of a body about the base's origin is at most the sum of two terms: its
+    # largest principal moment, and its mass times the squared length of the path to it. The path
+    # runs from joint to joint, with prismatic joints within `STROKE`.
     joints = model.joints.tolist()
     slides = [joint.shortname().startswith("JointModelP") for joint in joints]
     if not all(joint.shortname()[:11] in ("JointModelR", "JointModelP") for joint in joints[2:]):
         return None
     inertias, parents = model.inertias.tolist(), model.parents.tolist()
-    places = model.jointPlacements.tolist()
-    ways = [0.0] * len(joints)
+    placements = model.jointPlacements.tolist()
+    distances = [0.0] * len(joints)
     for index in range(2, len(joints)):
-        step = float(np.linalg.norm(places[index].translation)) + STROKE * slides[index]
-        ways[index] = ways[parents[index]] + step
+        step = float(np.linalg.norm(placements[index].translation)) + STROKE * slides[index]
+        distances[index] = distances[parents[index]] + step
     masses = [item.mass for item in inertias]
     moments = [
-        # The largest sum of a row is no less than the largest principal moment.
-        item.mass * (way + float(np.linalg.norm(item.lever))) ** 2
+        # The largest row sum of an inertia matrix is a bound of its largest principal moment.
+        item.mass * (distance + float(np.linalg.norm(item.lever))) ** 2
         + float(np.abs(item.inertia).sum(axis=0).max())
-        for item, way in zip(inertias, ways, strict=True)
+        for item, distance in zip(inertias, distances, strict=True)
     ]
     bounds: Array = np.empty(model.nv)
     for index in range(len(joints) - 1, 1, -1):
@@ -162,53 +160,20 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     return bounds
 
 
-def rotor_names(robot: Robot) -> tuple[str, ...]:
-    """Return the names of rotors: symmetric joints that carry no other joint."""
-    model = robot.model
-    index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
-    named = set(robot.used_frames)
-    # What carries another joint, leads one, has a spring, or has something fixed on it.
-    busy = set(model.parents.tolist())
-    busy |= {index_of[follower.leader.name] for follower in robot.followers}
-    busy |= {index_of[name] for name, stiffness in robot.stiffness.items() if stiffness}
-    if named:
-        busy |= {frame.parentJoint for frame in model.frames if frame.name in named}
-    free = (joint for joint in robot.joints if index_of[joint.name] not in busy)
-    return tuple(joint.name for joint in free if _is_symmetric(robot, joint, index_of[joint.name]))
-
-
-def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
-    """Return whether the body of a joint is symmetric about the joint axis."""
-    if joint.prismatic:
-        return False
-    pin_joint = robot.model.joints[index]
-    data = pin_joint.createData()
-    pin_joint.calc(data, robot.neutral())
-    linear, axis = np.split(np.asarray(data.S).ravel(), 2)
-    if linear.any():  # a screw
-        return False
-    body, turn = robot.model.inertias[index], skew(axis)
-    inertia = body.inertia
-    uneven = float(np.abs(turn @ inertia - inertia @ turn).max())
-    largest = float(np.abs(inertia).max())
-    offset = body.mass * float(np.square(turn @ body.lever).sum())
-    return uneven <= _ASYMMETRY * largest and offset <= _ASYMMETRY**2 * largest
-
-
 class AccelerationDerivatives(NamedTuple):
     """Accelerations of the base origin and the joints, in base axes, and their derivatives.
 
-    At one point, or with leading axes at many.
+    The arrays have leading axes if there are several points.
     """
 
     c: Array  # (.., 6 + n) of (3.1): without gravity and omega x v_b
-    slopes: Array  # (.., 6 + n, 12 + 2 n) over the state's displacements in base axes, see below
-    by_u: Array  # D_u (.., 6 + n, nu) of (3.3), u held in base axes
+    slopes: Array  # (.., 6 + n, 12 + 2 n) over displacements of the state in base axes
+    by_u: Array  # D_u (.., 6 + n, nu) of (3.3), u in base axes
     gravity: Array  # (.., 3) in base axes
 
     @property
     def by_turn(self) -> Array:
-        """Slopes (.., 6 + n, 3) over a turn of the base: in an orbit (14.5), else zero."""
+        """Derivatives (.., 6 + n, 3) over a rotation of the base: zero except in orbit (14.5)."""
         return self.slopes[..., :3]
 
     @property
@@ -226,8 +191,9 @@ class Gyroscopic(NamedTuple):
     r"""Gyroscopic torques :math:`-\omega \times h` of stored momentum, and their derivatives."""
 
     wrenches: pin.StdVec_Force  # on every joint, in its frame
-    force: Array  # what they are as a generalised force (nv,)
-    # Its slopes (nv, nv); over q with the Jacobian held, for RNEA's with the wrenches has the rest.
+    force: Array  # generalised force (nv,) of the gyroscopic torques
+    # Derivatives (nv, nv) of `force`. `by_q` holds the Jacobian constant, because RNEA's
+    # derivatives with `wrenches` include its change.
     by_q: Array
     by_v: Array
 
@@ -242,16 +208,16 @@ class Accelerations:
         self._inertia = Inertia(state, data)
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
-        # Derivatives of M a + b - B u - springs over the same as those of the accelerations. The
-        # first six columns, over attitude and position of the base, stay zero without an orbit.
+        # Derivatives of M a + b - B u - springs over the displacements of the state. The first six
+        # columns, for attitude and position of the base, are zero without an orbit.
         self._force_slopes = np.zeros((self._nv, 2 * self._nv))
         self._by_turn, self._by_q_m = self._force_slopes[:, :3], self._force_slopes[:, 6 : self._nv]
         self._by_nu = self._force_slopes[:, self._nv :]
-        # Views of the diagonals on which the derivatives of springs and dampers stand.
+        # Views of the diagonals to which stiffness and damping are added.
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
-        self._field = field_of(robot, state.frame)
+        self._field = state.field
         self._still = np.zeros(robot.nq), np.zeros(robot.nv)
 
     def invert(self, q: Array, out: Array) -> None:
@@ -261,15 +227,16 @@ class Accelerations:
     def rates(
         self, q: Array, v: Array, nu: Array, q_m: Array, u: Array, slopes: Array, by_u: Array
     ) -> AccelerationDerivatives:
-        """Return the rates at q, v and u in base axes, v being `nu` and q_m in state order.
+        """Return the accelerations and their derivatives at q, v and u in base axes.
 
-        Their slopes and by_u are the C-contiguous arrays of their shapes that are given.
+        `nu` and `q_m` are v and the joint positions in state order. The derivatives are written
+        into the C-contiguous arrays `slopes` and `by_u`.
         """
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
-        # Without the base's position and linear velocity: nothing here depends on them, and
-        # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
-        # accelerates the base origin and nothing against it (equivalence).
+        # The base's position and linear velocity are left out: c does not depend on them, and
+        # Pinocchio's derivatives would lose digits to large values. Gravity is left out as well,
+        # because it accelerates all parts of the robot alike (equivalence principle).
         q_still, v_still = self._still
         q_still[3:], v_still[3:] = q[3:], v[3:]
         if tide:
@@ -290,8 +257,8 @@ class Accelerations:
             force[6:] += self._springs.force(q_m, nu[6:])
         c = inverse.dot(force)
 
-        # Derivatives of M a + b - B u - springs (3.3), (7.1). Wrenches are constant in the frames
-        # of their links, so that RNEA's derivatives include -d(B u)/dq.
+        # Derivatives of M a + b - B u - springs (3.3), (7.1). The wrenches are constant in the
+        # frames of their links, so RNEA's derivatives include -d(B u)/dq.
         wrenches = gyroscopic.wrenches if gyroscopic else actuation.wrenches(u)
         external = () if wrenches is None else (wrenches,)
         by_q, by_v, _ = pin.computeRNEADerivatives(
@@ -315,9 +282,10 @@ class Accelerations:
         return AccelerationDerivatives(c, slopes, by_u, tide.fall if tide else state.gravity(q))
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
-        """Return the torques of stored momentum; the wrenches include the inputs'."""
+        """Return the gyroscopic torques; their `wrenches` include the wrenches of the inputs."""
         model, data, nv = self._model, self._data, len(v)
-        # With the angular Jacobian J of a link in its axes, h x omega is J^T [h]x J v (6.3).
+        # With the angular Jacobian J of a link in its axes, the torque h x omega is the
+        # generalised force J^T [h]x J v (6.3).
         wrenches = self._actuation.wrenches(u)
         if wrenches is None:
             wrenches = pin.StdVec_Force(model.njoints, pin.Force.Zero())

@@ -11,7 +11,7 @@ from fflin.base.errors import ChartError, InputError
 from fflin.base.validation import Array, instance, placement, vector
 from fflin.dynamics import coordinates as names
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, Chart, Frame
-from fflin.dynamics.orbital import field_of
+from fflin.dynamics.orbital import OrbitField
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
@@ -19,24 +19,25 @@ from fflin.robot.robot import Robot
 class StateMap:
     r"""Map between Pinocchio's (q, v) and the state of the linear model.
 
-    The state is :math:`X = (q_b, r_b, q_m, \omega_b, v_b, \dot q_m)` of dimension 12 + 2n. Let
-    :math:`{}^{ref}M_b = {}^oM_{ref}^{-1}\,{}^oM_b` be the base placement relative to the reference.
-    r_b is the translation of this placement. q_b is the vector part of its quaternion, with the
-    sign for which the scalar part is at least 0.
+    The state is :math:`X = (q_b, r_b, q_m, \omega_b, v_b, \dot q_m)` of dimension 12 + 2n. The base
+    placement relative to the reference is :math:`{}^{ref}M_b = {}^oM_{ref}^{-1}\,{}^oM_b`. Its
+    translation is r_b, and the vector part of its unit quaternion is q_b. Of the two quaternions
+    of an attitude, the one with a scalar part of at least 0 is used.
 
     Parameters
     ----------
     robot : Robot
     reference : pin.SE3, optional
-        Placement oMref to which attitude and position are relative; the identity by default.
+        Placement oMref relative to which the attitude and position of the base are measured; the
+        identity by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
-        Axes of the base velocities omega_b and v_b, both at the base origin:
+        Axes of the angular velocity omega_b of the base and of the velocity v_b of its origin:
 
         - hybrid (default): omega_b in base axes, v_b = d r_b/dt in reference axes;
-        - local: both in base axes;
-        - world: both in reference axes;
-        - lvlh (default in orbit) or hill, only for a robot in orbit: the world of Pinocchio is
-          the orbital frame. The axes of omega_b and v_b are as in hybrid.
+        - local: omega_b and v_b in base axes;
+        - world: omega_b and v_b in reference axes;
+        - lvlh (default in orbit) or hill: the same axes as hybrid, for a robot in orbit only.
+          Pinocchio's world is then the orbital frame, with the axes lvlh or hill.
 
     Attributes
     ----------
@@ -47,27 +48,28 @@ class StateMap:
     groups : Groups
         Slices of q_b, r_b, q_m, omega_b, v_b, qdot_m in the state.
     axes : tuple of bool
-        Whether omega_b and v_b are in reference axes.
+        Whether omega_b is in reference axes, and whether v_b is in reference axes.
     in_reference : tuple of slice
-        Rows of a velocity or wrench (6 + n) that are in reference axes.
+        Slices of nu = (omega_b, v_b, qdot_m), or of generalised forces in the same order, whose
+        components are in reference axes.
     S : ndarray (nv, 6 + n) or None
-        Matrix of v = S nu if the robot has mimic joints or modes. None means that v is a
-        permutation of nu.
+        Matrix S of v = S nu, with nu = (omega_b, v_b, qdot_m) in base axes, if the robot has mimic
+        joints or modes. Otherwise S is None, because v is only a permutation of nu.
     unbounded : ndarray of int
         Indices of the continuous joints among the n joints.
     origin_quaternion : ndarray (4,)
         Attitude of `origin` as a quaternion x, y, z, w.
     orbit : tuple of ndarray (3,), (3, 3), or None
-        For a robot in orbit: the angular velocity of the reference frame, and the matrix from the
-        position of a point at rest in this frame to its acceleration. The vector and the matrix
-        are in the axes of the reference frame.
+        For a robot in orbit, a vector and a matrix in the axes of the reference frame. The vector
+        is the angular velocity of this frame. The matrix maps the position of a point at rest in
+        this frame to the acceleration of the point. None without an orbit.
 
     Raises
     ------
     InputError
         If the frame is unknown or the reference is not a pin.SE3.
     ModelError
-        If the robot's Pinocchio model was changed after `load`.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     Examples
     --------
@@ -91,6 +93,8 @@ class StateMap:
         self.frame = names.frame_of(robot, frame)
         self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
+        # Acceleration field of the robot's orbit, or None.
+        self.field = OrbitField(robot, self.frame) if robot.orbit else None
         self.nx = 12 + 2 * n
         self.groups = names.Groups(
             q_b=slice(0, 3),
@@ -102,16 +106,16 @@ class StateMap:
         )
         self.names, self.units = zip(*names.state_units(robot).items(), strict=True)
         joints = robot.joints
-        # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
+        # Index in Pinocchio's v of each velocity of the state.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
-        # And back; what a joint that mimics another has is written after.
+        # The inverse map. Entries of mimic joints are written afterwards (`spread`).
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
-        # Entry of v for a unit of each velocity of the state: 1, but for modal amplitudes.
+        # Pinocchio's v per unit of each velocity of the state: 1 except for modal amplitudes.
         self._scale = np.array([1.0] * 6 + [joint.scale for joint in joints])
         self._scaled = bool((self._scale != 1.0).any())
-        # v = S nu; where no joint mimics another and none is scaled S is the permutation above.
+        # S of v = S nu; None if S is the permutation `_order` (no mimic joints and no scaling).
         self.S: Array | None = None
         if robot.followers or self._scaled:
             self.S = np.column_stack([self.spread(e) for e in np.eye(6 + n)])
@@ -121,25 +125,25 @@ class StateMap:
         self._sin = self._cos + 1
         root = robot.model.jointPlacements[ROOT].rotation
         self._gravity, self._pulled = root.T @ np.array(robot.gravity), any(robot.gravity)
-        # Whether anything accelerates the base's origin against the reference.
+        # Whether gravity or an orbit accelerates the base's origin relative to the reference.
         self.falls = self._pulled or robot.orbit is not None
         self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
 
     def about(self, reference: pin.SE3) -> "StateMap":
-        """Return a map with another reference placement and the same velocity frame."""
+        """Return a copy of the map with another reference placement and the same `frame`."""
         other = copy(self)
         other._refer(reference)
         return other
 
     def _refer(self, oMref: pin.SE3) -> None:
         self._reference = oMref
-        # The free-flyer joint may itself stand somewhere in the world. Composed as quaternions:
-        # their entries survive to the last digit near a turn of pi.
+        # The model may place its free-flyer joint away from the world's origin. Rotations are
+        # composed as quaternions, which stay accurate to machine precision near 180 deg.
         offset = pin.SE3ToXYZQUAT(oMref.actInv(self.robot.model.jointPlacements[ROOT]))
         self._position, self.origin_quaternion = offset[:3], offset[3:]
         self._rotation = turning.rotation_matrix(self.origin_quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
-        field, R = field_of(self.robot, self.frame), oMref.rotation
+        field, R = self.field, oMref.rotation
         self.orbit = (R.T @ field.rate, R.T @ field.pull @ R) if field else None
 
     @property
@@ -149,16 +153,18 @@ class StateMap:
 
     @property
     def origin(self) -> pin.SE3:
-        """Placement of the base relative to the reference at q[:7] = 0, 0, 0, 0, 0, 0, 1."""
+        """Base placement relative to the reference if q[:7] is 0, 0, 0, 0, 0, 0, 1."""
         return pin.XYZQUATToSE3(np.concatenate((self._position, self.origin_quaternion)))
 
     def chart(self, q: Array) -> Chart:
-        """Return the attitude chart at a valid configuration (nq,); see `charts` for rows.
+        """Return the attitude chart at a valid configuration q (nq,).
+
+        `charts` returns the charts at several configurations.
 
         Raises
         ------
         ChartError
-            If the base is rotated by pi from the reference.
+            If the base is rotated by 180 deg from the reference.
         """
         chart = Chart.of(turning.quaternion_product(self.origin_quaternion, q[3:7]))
         if chart.q0 < SMALLEST_Q0:
@@ -169,19 +175,19 @@ class StateMap:
         return chart
 
     def charts(self, q: Array) -> Chart:
-        """Return the charts at valid configurations (.., nq), for any base attitude."""
+        """Return the attitude charts at valid q (.., nq), without the check against 180 deg."""
         return Chart.of(q[..., 3:7] @ turning.product_matrix(self.origin_quaternion).T)
 
     def rotation(self, q: Array) -> Array:
-        """Return the rotation matrix (3, 3) of refMb at a valid configuration.
+        """Return the rotation matrix (3, 3) of the base relative to the reference, at a valid q.
 
-        The attitude may also be 180 deg from the reference, where the chart is singular.
+        Unlike the chart, the rotation matrix is regular at an attitude 180 deg from the reference.
         """
         turned: Array = pin.XYZQUATToSE3(q[:7]).rotation
         return turned if self._aligned else self._rotation.dot(turned)
 
     def gravity(self, q: Array) -> Array:
-        """Return the robot's gravity (.., 3) [m/s^2] in base axes at valid q (.., nq)."""
+        """Return gravity (.., 3) [m/s^2] in base axes at valid configurations q (.., nq)."""
         if not self._pulled:
             return self._gravity
         turned = turning.rotation_matrix if q.ndim == 1 else turning.rotation_matrices
@@ -189,7 +195,10 @@ class StateMap:
         return rotated
 
     def scalar(self, q: Array) -> float:
-        """Return the quaternion's scalar part q0 at a valid q, with the sign of q0 in q."""
+        """Return the scalar part q0 of the base quaternion relative to the reference.
+
+        The sign of q0 changes with the sign of the quaternion in the valid configuration q (nq,).
+        """
         return float(turning.quaternion_product(self.origin_quaternion, q[3:7])[3])
 
     def to_state(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
@@ -200,11 +209,12 @@ class StateMap:
         q : array_like (nq,)
             Configuration.
         v : array_like (nv,)
-            Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
+            Velocity in Pinocchio's order: linear and angular velocity of the base in base axes,
+            then joint rates.
         near : array_like (nx,), optional
-            State near which the angles of continuous joints are unwrapped: each angle is shifted
-            by a multiple of 2 pi to be closest to its value in `near`. By default, angles are in
-            (-pi, pi].
+            State for unwrapping the angles of continuous joints: each angle is shifted by the
+            multiple of 2 pi that brings it closest to its value in `near`. By default, the angles
+            are in (-pi, pi].
 
         Returns
         -------
@@ -213,9 +223,9 @@ class StateMap:
         Raises
         ------
         ChartError
-            If the base is rotated by pi from the reference.
+            If the base is rotated by 180 deg from the reference.
         InputError
-            If a size is wrong or an entry is not finite.
+            If an argument has a wrong size or an entry that is not finite.
         """
         q = self.robot.checked_configuration(q)
         v = self.robot.checked_velocity(v)
@@ -224,13 +234,13 @@ class StateMap:
         return self.read(q, v, near=near)
 
     def read(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
-        """Return the state of `to_state` for arguments known to be valid."""
+        """Return the same state as `to_state`, without checking the arguments."""
         q_m, nu = self.joint_positions(q), self.velocities(v)
         x = self.compose(self.chart(q), self.positions(q), q_m, nu)
         return x if near is None else names.unwound(self, x, near)
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
-        """Return the state (.., nx) from its parts, with velocities nu (.., 6 + n) in base axes."""
+        """Assemble the state (.., nx) from parts; velocities nu (.., 6 + n) are in base axes."""
         in_frame = nu
         if not chart.standing:
             in_frame = self.to_frame(chart, nu[..., None])[..., 0]
@@ -251,9 +261,10 @@ class StateMap:
         Raises
         ------
         ChartError
-            If the norm of q_b is 1 (a rotation by pi) or exceeds 1 (no attitude).
+            If the norm of q_b is 1 (a rotation by 180 deg), or exceeds 1 and therefore describes no
+            attitude.
         InputError
-            If the size is wrong or an entry is not finite.
+            If x has a wrong size or an entry that is not finite.
         """
         _, q, v = self.points(vector("x", x, self.nx, "a state (12 + 2n)")[None])
         return q[0], v[0]
@@ -296,36 +307,45 @@ class StateMap:
         return v
 
     def lift(self, forces: Array) -> Array:
-        """Return tau (nv, ...) from generalised forces (6 + n, ...) in base axes."""
+        """Return Pinocchio's tau (nv, ...) from generalised forces (6 + n, ...) in base axes."""
         tau = np.zeros((self.robot.nv, *forces.shape[1:]))
         tau[self._order] = (forces.T / self._scale).T
         return tau
 
     def forces(self, tau: Array) -> Array:
-        """Return the generalised forces S^T tau (6 + n, ...) in base axes, from tau (nv, ...)."""
+        """Return generalised forces S^T tau (6 + n, ...) in base axes from tau (nv, ...)."""
         return tau.take(self._order, axis=0) if self.S is None else self.S.T @ tau
 
     def columns(self, matrix: Array) -> Array:
-        """Return ``matrix S``: columns (..., nv) converted from Pinocchio's v to state order."""
+        """Return ``matrix @ S``: convert columns (..., nv) from Pinocchio's v to state order."""
         return matrix.take(self._order, axis=1) if self.S is None else matrix @ self.S
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
-        """Return ``S^T matrix S`` (7.3): a matrix (nv, nv) converted from v to state order."""
+        """Return ``S.T @ matrix @ S``: convert a matrix (nv, nv) from Pinocchio's v to state order.
+
+        See (7.3) of docs/derivation.md.
+        """
         if self.S is not None:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
         return matrix.take(self._flat, out=out, mode="clip")
 
     def to_frame(self, chart: Chart, vectors: Array) -> Array:
-        """Transform velocities or wrenches (.., 6 + n, k) from base to frame axes: F of (4.6)."""
+        """Transform velocities or wrenches (.., 6 + n, k) from base axes to the axes of `frame`.
+
+        The transformation matrix is F in (4.6) of docs/derivation.md.
+        """
         return chart.to_reference(self.in_reference, vectors)
 
     def to_base(self, chart: Chart, vectors: Array) -> Array:
-        """Transform velocities or wrenches (.., 6 + n, k) from frame to base axes: F^T."""
+        """Transform velocities or wrenches (.., 6 + n, k) from the axes of `frame` to base axes.
+
+        The transformation matrix is the transpose of F in (4.6) of docs/derivation.md.
+        """
         return chart.to_base(self.in_reference, vectors)
 
     def joint_positions(self, q: Array) -> Array:
-        """Return q_m (.., n) [rad|m|kg^0.5 m] at valid configurations (.., nq)."""
+        """Return joint positions q_m (.., n) [rad|m|kg^0.5 m] at valid configurations (.., nq)."""
         angles = q.take(self._idx_q, axis=-1)
         if self._scaled:
             angles = angles / self._scale[6:]
@@ -335,7 +355,7 @@ class StateMap:
         return angles
 
     def joints_apart(self, before: Array, q: Array) -> Array:
-        """Return the change of q_m (n,) from `before` to q, two valid configurations (nq,)."""
+        """Return the change of q_m (n,) between the valid configurations `before` and `q` (nq,)."""
         apart = (q.take(self._idx_q) - before.take(self._idx_q)) / self._scale[6:]
         if self._cos.size:
             s, c, s_0, c_0 = (x.take(at) for x in (q, before) for at in (self._sin, self._cos))

@@ -32,38 +32,41 @@ _INVALID = 2  # status of a step
 
 
 class CLaw:
-    """Policy that compiles the C code of `write_c` and calls it.
+    """Policy that compiles C code written by `write_c` and calls it.
 
-    The C compiler of the system (``cc``) makes a shared library of the code in a temporary folder.
+    The C compiler of the system (``cc``) compiles the code to a shared library in a temporary
+    folder.
 
     Parameters
     ----------
     folder : path
         Folder that `write_c` wrote.
     name : str, optional
-        The `name` given to `write_c`; necessary only if the folder contains several laws.
+        The `name` given to `write_c`; required only if the folder contains several control laws.
     compiler : str
-        Command of the C compiler.
+        Command that runs the C compiler.
 
     Attributes
     ----------
     name : str
-        Name of the code, see `write_c`.
+        The `name` given to `write_c`, with which all names in the C code begin.
     dt : float
-        Sampling time [s]; 0 for a law that is not sampled.
+        Sampling time [s] of the control law; 0 in continuous time.
     frame : str
-        Axes of the inputs, as in `LinearModel`.
+        Axes of the inputs on the base, as in `LinearModel`.
     origin : pin.SE3 or None
-        Reference of the state and of the axes of the inputs.
+        Placement relative to which the state and the inputs on the base are measured.
 
     Raises
     ------
     FileError
-        If the folder does not contain the files of one law, or the files were edited.
+        If the folder contains no law, contains several laws and `name` is omitted, or contains
+        edited files.
     MissingPackageError
         If there is no C compiler.
     InputError
-        If the code cannot be compiled, or was written from a design without a model.
+        If the code cannot be compiled, or was written from a `Compensator`, which contains no
+        model.
 
     Examples
     --------
@@ -87,8 +90,8 @@ class CLaw:
         ]
         if len(found) != 1:
             raise FileError(
-                f"{source}: contains {len(found)} pairs of .json and .c, expected one pair that "
-                "fflin.write_c wrote; if there are several laws, choose one with name="
+                f"{source}: contains {len(found)} pairs of .json and .c files, expected one pair "
+                "that fflin.write_c wrote; if there are several pairs, choose one with name="
             )
         [self.name] = found
         about, header, code = (source / f"{self.name}.{end}" for end in ("json", "h", "c"))
@@ -121,12 +124,14 @@ class CLaw:
         return f"CLaw('{self.name}', {about['kind']}, {about['real']}, dt={self.dt:g} s)"
 
     def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot, with a separate memory for each call.
+        """Return the function policy(t, q, v) -> u for a robot.
+
+        Each call of `bind` returns a policy with a separate controller memory.
 
         Raises
         ------
         InputError
-            If states, inputs or outputs of the robot differ from those of the C code.
+            If the robot and the C code have different states, inputs or outputs.
         """
         made = f"the C code '{self.name}' was made from the {self._about['title']}"
         state = StateMap(robot, reference=self.origin, frame=self.frame)
@@ -144,7 +149,7 @@ class CLaw:
 
     def _state_policy(self, robot: Robot) -> Policy:
         world, n, real = StateMap(robot, frame=self.frame), robot.n, self._real
-        # In C an array has one entry at least.
+        # C has no empty arrays, so an array for joints has at least one entry.
         given, u = (real * (13 + 2 * max(n, 1)))(), (real * len(self._about["u0"]))()
         at = [*range(7 + n), *range(7 + max(n, 1), 13 + n + max(n, 1))]
         samples = self._about["kind"] == "samples"
@@ -159,7 +164,7 @@ class CLaw:
         return policy
 
     def output_step(self, z: Array, y: Array, t: float) -> tuple[Array, Array]:
-        """Return u and the next controller state z of one step with the outputs y."""
+        """Return u and the next controller state from the controller state z and outputs y."""
         real = self._real
         memory = (real * max(len(z), 1))(*z.tolist())
         u = (real * len(self._about["u0"]))()
@@ -175,7 +180,7 @@ class CLaw:
 
 
 class _OutputLoop(Loop):
-    """Loop whose controller is the C code."""
+    """Control loop that calls the C code as its controller."""
 
     def __init__(self, law: CLaw, state: StateMap) -> None:
         about = law._about
@@ -185,7 +190,10 @@ class _OutputLoop(Loop):
         self._law, self._u0 = law, np.array(about["u0"])
 
     def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
-        """Return the command of a sample; an accelerometer measures under this command."""
+        """Return the command of a sample.
+
+        Outputs are measured twice, since an accelerometer must measure under this command.
+        """
         by = self.at(t)
         u, _ = self._law.output_step(self.estimate, measure(by, self._u0), t)
         u, self.estimate = self._law.output_step(self.estimate, measure(by, u), t)
@@ -193,7 +201,7 @@ class _OutputLoop(Loop):
 
 
 def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
-    """Return the shared library of a source file."""
+    """Compile a source file, and return its shared library."""
     if not isinstance(compiler, str) or "\0" in compiler:
         raise InputError(f"compiler is {compiler!r}, expected the name of a C compiler, such as cc")
     command = shutil.which(compiler)
@@ -216,4 +224,4 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
         try:
             return ctypes.CDLL(str(library))
         except OSError as error:
-            raise InputError(f"'{compiler}' made no library of {source}: {error}") from None
+            raise InputError(f"'{compiler}' made no library from {source}: {error}") from None

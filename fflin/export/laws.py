@@ -34,10 +34,9 @@ CASES = 200
 
 
 class Case(NamedTuple):
-    """Test case: arguments of a step and its results, and the sizes that rounding is relative to.
+    """Test case: arguments `given` of a step, its results `out`, and the scale of rounding errors.
 
-    The bound of the error of `out` is the unit roundoff times `scale`, times the number of
-    operations.
+    The error of `out` is at most the unit roundoff times `scale` times the number of operations.
     """
 
     sample: int
@@ -90,7 +89,7 @@ class StateLaw(Law):
         return self.state.nx + 32.0 + 8.0 * sum(cells)
 
     def cases(self) -> list[Case]:
-        """Return random states and singular ones, with the inputs that the policy computes."""
+        """Return test cases at random and near-singular states, with the inputs of the policy."""
         random = np.random.default_rng(0)
         return [self._case(random, k % len(self.x0), k) for k in range(CASES)]
 
@@ -122,7 +121,7 @@ class StateLaw(Law):
         given = measured(world, q, v)
         given[7 : 7 + n] += 2.0 * np.pi * turns
         u = np.asarray(self.policy(row * self.dt, q, v))
-        # Sizes of the terms that each state is made of.
+        # Magnitudes of the terms whose sum is a state.
         omega, v = given[7 + n : 10 + n], given[10 + n : 13 + n]
         pose = [1.0] * 3 + [float(norm(given[4:7]) + norm(about[:3]))] * 3
         rates = np.repeat((norm(omega), norm(v)), 3)
@@ -151,7 +150,7 @@ class OutputLaw(Law):
         return float(len(self.terms.A) + len(self.names) + 16)
 
     def cases(self) -> list[Case]:
-        """Return random states of the controller and outputs, with u and the next z."""
+        """Return test cases at random controller states and outputs, with u and the next z."""
         random, by, found = np.random.default_rng(0), self.terms, list[Case]()
         (nz, ny), turning = by.B.shape, np.flatnonzero(self.continuous)
         for _ in range(CASES):
@@ -195,8 +194,8 @@ _KINDS = (
 )
 
 
-def law_of(given: Any, robot: Any, limits: Any) -> StateLaw | OutputLaw:
-    """Return the tables of a policy or design; `limits` as in `simulate`."""
+def law_of(given: object, robot: object, limits: object) -> StateLaw | OutputLaw:
+    """Convert a policy or design to the tables of a law; `limits` are as in `simulate`."""
     if not isinstance(given, _KINDS) or isinstance(given, TrajectoryOutputFeedback):
         raise InputError(
             f"law has type {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
@@ -208,8 +207,8 @@ def law_of(given: Any, robot: Any, limits: Any) -> StateLaw | OutputLaw:
         return _output_law(given, lin, robot, limits)
     if robot is None:
         raise InputError(
-            f"the robot of this {type(given).__name__} is not known, so that its continuous joints "
-            "are not known; give the robot with robot= (--robot)"
+            f"the robot of this {type(given).__name__} is not known, and the C code depends on "
+            "its continuous joints; give the robot with robot= (--robot)"
         )
     if isinstance(given, GainSchedule):
         given = TrajectoryFeedback(given.trajectory(robot), given)
@@ -251,7 +250,7 @@ def _robot_of(given: Any, lin: LinearModel | None) -> Robot | None:
 
 
 def _model_of(gain: Gain, robot: Robot) -> LinearModel:
-    """Return the model about the point of a gain from a file, relative to its reference."""
+    """Linearise the robot at the point and reference of a gain that was read from a file."""
     if not gain.placement.size:
         raise InputError(
             "the file of the gain does not contain the reference pose, because the file was "
@@ -260,42 +259,42 @@ def _model_of(gain: Gain, robot: Robot) -> LinearModel:
     if gain.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
             f"the gain was designed for another '{gain.robot}' than the given '{robot.name}': "
-            "their masses or URDFs differ; give robot= (--robot), the robot of the design, or "
-            "design the gain again"
+            "their masses or URDFs differ; give the robot of the design with robot= (--robot), "
+            "or design the gain again"
         )
     frame: Any = gain.frame
     state = StateMap(robot, frame=frame, reference=pin.XYZQUATToSE3(gain.placement))
     if gain.state_names != state.names:
         raise InputError(
-            f"the states of the gain differ from those of '{robot.name}'; give robot= (--robot), "
-            "the robot that the gain was designed for"
+            f"the states of the gain differ from those of '{robot.name}'; give the robot of the "
+            "design with robot= (--robot)"
         )
     q, v = state.to_pinocchio(gain.x0)
     return linearize(robot, q, v, gain.u0, frame=frame, reference=state.reference)
 
 
 def _common(
-    given: Any,
+    given: object,
     robot: Robot | None,
-    limits: Any,
+    limits: object,
     names: tuple[str, ...],
     units: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Return the fields of a law that belong to its inputs; without `limits` they are infinite."""
+    """Return the fields common to all laws; without `limits`, the input limits are infinite."""
     low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     if limits is not None:
         own = [x for _, group in named_inputs(robot.inputs if robot else ()) for x in group]
         if robot is None or tuple(own) != names:
             raise InputError(
-                "limits need the robot with the inputs of the law; give robot= (--robot), the "
-                "robot that the law was designed for"
+                "limits need the robot with the inputs of the law; give the robot of the design "
+                "with robot= (--robot)"
             )
         low, high = input_limits(robot, chosen_limits(robot, limits)[0])
     common = {"title": type(given).__name__, "robot": robot, "low": low, "high": high}
     return {**common, "input_names": names, "input_units": units}
 
 
-def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: Any) -> StateLaw:
+def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: object) -> StateLaw:
     if not policy.schedule.dt:
         raise InputError(
             "the gains are continuous in time, expected sampled gains; design sampled gains with "
@@ -303,7 +302,7 @@ def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: Any) -> Stat
         )
     dt, state = policy.schedule.dt, policy.state_map(robot)
     world = StateMap(robot, frame="local")
-    # One row for each sample, and the last for all times after the end.
+    # One row for each sample; the last row applies after the end of the trajectory.
     last = int(np.ceil(policy.over / dt * (1.0 - 1e-12)))
     while last * dt <= policy.over:
         last += 1
@@ -343,8 +342,8 @@ def _output_law(
         units = [lin.input_units, lin.output_units]
     if not given.dt and len(terms.A):
         raise InputError(
-            "the controller is continuous, expected a sampled one; use "
-            "LinearController.sampled(dt), or design it for lin.discretize(dt)"
+            "the controller is continuous, expected a sampled controller; use "
+            "LinearController.sampled(dt), or design the controller for lin.discretize(dt)"
         )
     return OutputLaw(
         **_common(given, robot, limits, inputs, units[0]),
@@ -359,7 +358,7 @@ def _output_law(
 
 
 def _units_of(robot: Robot | None, *names: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Return the units of inputs and outputs of a robot, by name; "unknown" for others."""
+    """Return the units of named inputs and outputs of a robot, "unknown" for other names."""
     known: dict[str, str] = {}
     if robot is not None:
         state = StateMap(robot)

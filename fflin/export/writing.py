@@ -24,51 +24,52 @@ from fflin.robot.robot import Robot
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
 _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
 
-# Greatest error of a double relative to the sizes of the terms.
+# Largest rounding error in double precision, relative to the magnitudes of the terms.
 _DOUBLE_ERROR = 1e-14
 
 
 def write_c(
-    law: Any,
+    law: object,
     folder: str | Path,
     *,
     robot: Robot | None = None,
-    limits: Any = None,
+    limits: object = None,
     name: str = "controller",
     real: str = "double",
 ) -> Path:
-    r"""Write a control law as C99, with a test program.
+    r"""Write a control law as C99 code, with a test program.
 
-    The folder then contains ``NAME.h``, ``NAME.c``, the test program ``NAME_test.c`` and
-    ``NAME.json``, which `CLaw` reads. The code needs no library except ``sqrt``. The code
-    allocates no memory and has no global variables. The header describes each entry of the
-    arguments.
+    The function writes the code to ``NAME.h`` and ``NAME.c``, the test program to ``NAME_test.c``,
+    and a description that `CLaw` reads to ``NAME.json``. The code calls no library function except
+    ``sqrt``, allocates no memory and has no global variables. The header describes each entry of
+    the arguments.
 
-    - For a state feedback, the arguments of ``NAME_step`` are the measured attitude, position,
-      joint angles and velocities. ``NAME_step`` computes the state as `StateMap` does, and from
-      the state the
-      inputs.
-    - For an output feedback, the arguments of ``NAME_step`` are the outputs y and a memory that
-      the caller owns.
-    - For gains along a trajectory, the number of the sample is another argument of ``NAME_step``.
+    The code's function ``NAME_step`` computes the inputs of one sample:
+
+    - For a state feedback, the arguments are the measured attitude, position, joint angles and
+      velocities. ``NAME_step`` computes the state in the same way as `StateMap`, then the inputs
+      from the state.
+    - For an output feedback, the arguments are the outputs y, and the controller memory, which the
+      caller allocates.
+    - For gains along a trajectory, the sample number is an additional argument.
 
     Parameters
     ----------
     law : Gain, StateFeedback, ScheduledFeedback, OutputFeedback, LinearController or GainSchedule
-        Or a `Compensator` or `TrajectoryFeedback`. Controllers and gains along a trajectory must be
-        sampled.
+        Control law; a `Compensator` or `TrajectoryFeedback` is also accepted. Controllers and gains
+        along a trajectory must be in discrete time.
     folder : path
-        Folder for the files; a missing folder is created. Existing files of the same name are
+        Folder for the files; created if it does not exist. Existing files with the same names are
         replaced only if they were written for the same type of law and the same robot.
     robot : Robot, optional
-        Robot of the law. The robot is necessary only for a law from a file whose robot name is
-        not known to `load`.
+        Robot that the law controls. Give the robot only if the law was read from a file and `load`
+        does not know the robot's name in this file.
     limits : "urdf", float, mapping or list, optional
-        Limits of the inputs as in `simulate`. By default the inputs are not limited.
+        Limits at which the inputs saturate, as in `simulate`; none by default.
     name : str
-        Prefix of all names in C, and of the files.
+        Prefix of the file names and of all names in the C code.
     real : {"double", "float"}
-        Type of the numbers.
+        Floating-point type of the C code.
 
     Returns
     -------
@@ -78,8 +79,12 @@ def write_c(
     Raises
     ------
     InputError
-        If the law cannot be written in C, its robot is not known, other files have the same
-        names, or an argument is invalid.
+        If one of these conditions is true:
+
+        - the law cannot be written in C;
+        - the robot of the law is not known;
+        - existing files with the same names were not written for the same law and robot;
+        - an argument is invalid.
     FileError
         If a file cannot be written.
 
@@ -115,7 +120,7 @@ def write_c(
     return target
 
 
-def digest_of(about: dict[str, Any], header: bytes, source: bytes) -> str:
+def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
     """Return the digest that ties the description of a law to its code."""
     parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
     return content_digest(parts)
@@ -130,7 +135,7 @@ def _title(path: Path) -> str | None:
 
 
 class _Texts:
-    """The files of a law, filled into the templates of this folder."""
+    """Files of a law, made from the templates of this folder."""
 
     def __init__(self, law: StateLaw | OutputLaw, name: str, real: str) -> None:
         self.law, self.name, self.real, self.cases = law, name, real, law.cases()
@@ -161,7 +166,7 @@ class _Texts:
         self.words |= self._state(law) if isinstance(law, StateLaw) else self._output(law)
 
     def files(self) -> dict[str, str]:
-        """Return {file name: content}."""
+        """Return the files as {file name: content}."""
         self.words["interface"] = self._filled(f"{self.kind}_interface.h")
         self.words["limiting"] = self._filled("limiting.c").rstrip()
         self.words |= self._vectors()
@@ -195,7 +200,7 @@ class _Texts:
         return Template(text).substitute(self.words)
 
     def _vectors(self) -> dict[str, str]:
-        """Return the words of the test program."""
+        """Return the entries of the test program's template."""
         law, rows, nu = self.law, [], len(self.law.low)
         for case in self.cases:
             out = case.out.copy()
@@ -261,8 +266,8 @@ class _Texts:
             "continuous": _whole(law.continuous),
         }
 
-    def array(self, values: Any) -> str:
-        """Return an initialiser of an array."""
+    def array(self, values: object) -> str:
+        """Return the C initialiser of an array."""
         values = np.asarray(values)
         if values.ndim > 1:
             return "{\n" + ",\n".join(map(self.array, values)) + "}"
@@ -270,7 +275,9 @@ class _Texts:
             with np.errstate(over="ignore"):
                 narrow = values.astype(np.float32)
             if (np.isfinite(values) & ~np.isfinite(narrow)).any():
-                raise InputError("the law has numbers too large for a float; take real='double'")
+                raise InputError(
+                    "the law has numbers that are too large for a float; use real='double'"
+                )
             values = narrow.astype(float)
         end = "F" if self.real == "float" else ""
         shown = ", ".join(f"{x!r}{end}" for x in values.tolist())
@@ -278,7 +285,7 @@ class _Texts:
 
 
 def _at_least_one(matrix: Array) -> Array:
-    """Return a matrix with a zero row or column where it has none, as C has no empty arrays."""
+    """Add a zero row or column to a matrix without rows or columns: C has no empty arrays."""
     rows, columns = matrix.shape
     return np.pad(matrix, ((0, int(not rows)), (0, int(not columns))))
 
@@ -288,12 +295,12 @@ def _whole(values: Iterable[Any]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text that is valid in a comment and in a string of C."""
+    """Replace the characters of a text that may be invalid in comments and strings of C."""
     return re.sub(r"[^\w .,+^()\[\]/-]", "_", text, flags=re.ASCII)
 
 
 def _listed(array: str, names: Sequence[str], units: Sequence[str]) -> str:
-    """Return lines of a comment: index, name and unit of each entry of an array."""
+    """Return the lines of a C comment with index, name and unit of each entry of an array."""
     return "\n".join(
         f" *   {array}[{k}]  {_plain(name)} [{_plain(unit) or '-'}]"
         for k, (name, unit) in enumerate(zip(names, units, strict=True))

@@ -1,4 +1,4 @@
-"""Eight points to an instruction, compiled by numba where it is installed.
+"""Kernel: dynamics and simulation of eight robots at once, compiled by numba if it is installed.
 
 Imports `base`, `robot` and `dynamics`.
 """

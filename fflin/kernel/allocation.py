@@ -1,8 +1,8 @@
-"""Allocation: the commands of one set of inputs, realised by another set within its limits.
+"""Control allocation: distribute the commands of one set of inputs to another set with limits.
 
-The least squares within bounds are found by an active set method, which begins with all thrusts at
-zero. The problem is strictly convex, so that the order in which inputs meet their bounds does not
-matter.
+An active set method, which starts at zero thrust, solves the bounded least squares problem. The
+problem is strictly convex, so the solution does not depend on the order in which inputs reach
+their bounds.
 
 References
 ----------
@@ -35,7 +35,7 @@ from fflin.kernel.lanes import (
 )
 from fflin.kernel.rnea import write_columns
 
-# Weight of the inputs themselves: of all inputs with the same effect it selects the smallest.
+# Weight of the magnitudes of the inputs: it selects the smallest of the inputs with equal effect.
 LEAST = 1e-7
 _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 
@@ -43,22 +43,26 @@ _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 class LeastSquares(
     namedtuple("LeastSquares", "least most columns given A Q R b y wanted x s low high state order")
 ):
-    """Solve for x (k,) between `least` and `most` (k,) so that columns @ x is nearest to a force.
+    """Problem: find x (k,) between `least` and `most` (k,) with columns @ x nearest to a force.
 
-    `columns` has the k columns of an input's unit force, one after the other, and then the force.
-    What follows is work space: the `given` columns of a lane; `A`, the same divided by their norm;
-    the orthogonal factors `Q` and `R` of the columns of free inputs, with the rows of `LEAST`
-    below, in the `order` in which the inputs became free; the remainder `b`, and `y` for its
-    components; the force `wanted` of length 1; the solution `s` without bounds; the scaled bounds
-    `low` and `high`; and the `state` of each input.
+    `columns` holds the k columns of generalised force per unit input, one after the other, and then
+    the force. The other fields are work space:
+
+    - `given`: the columns and the force of one lane, and `A`: the columns divided by their norm.
+    - `Q`, `R`: QR factors of the columns of the free inputs, with the rows of `LEAST` below them,
+      in the `order` in which the inputs became free.
+    - `b`: the residual, and `y`: its components along `Q`.
+    - `wanted`: the force, scaled to length 1.
+    - `s`: the solution without bounds, and `low`, `high`: the scaled bounds.
+    - `state`: whether each input is free, or at which bound.
     """
 
 
 class Allocation(namedtuple("Allocation", "asking giving point work problem")):
-    """The robot whose inputs are commanded, and the robot whose inputs realise the command.
+    """Allocation of commands for one robot's inputs (`asking`) to another robot's (`giving`).
 
-    The `point` has q and the inputs of either; `work` is work space. There is no allocation where
-    `problem` has no inputs.
+    `point` holds q and the inputs of one of the two robots at a time. `work` is work space.
+    Commands are not allocated if `problem` has no inputs.
     """
 
 
@@ -74,7 +78,7 @@ ALLOCATION = Struct(
 
 
 def least_squares(least, most, size):
-    """Return a problem with bounds (k,) and forces (size,), whose arrays hold numbers."""
+    """Return a problem with bounds (k,) and forces (size,); its arrays are not laned."""
     count = len(least)
     return empty(LEAST_SQUARES)._replace(
         least=least,
@@ -98,7 +102,10 @@ def least_squares(least, most, size):
 
 @inlined
 def half_solve(work, tree, x, first):
-    """Turn a force at x into D^-1/2 L^-T f, whose square is that of its accelerations by M."""
+    """Replace the force f at x by D^-1/2 L^-T f.
+
+    The squared norm of the result is f^T M^-1 f, the squared norm of the acceleration in M.
+    """
     for k in range(len(tree.row) - 1, -1, -1):
         value, row = load(x, first + k), tree.row[k]
         for t in range(tree.depth[k]):
@@ -109,7 +116,7 @@ def half_solve(work, tree, x, first):
 
 @inlined
 def allocate(allocation, point, commanded):
-    """Write the inputs of a command, or the inputs that realise it where there is an allocation."""
+    """Write a command as inputs, allocated to other inputs if there is an allocation problem."""
     if len(allocation.problem.least) == 0:
         vec.copy(commanded, 0, point.u, 0, len(point.u))
     else:
@@ -118,7 +125,7 @@ def allocate(allocation, point, commanded):
 
 @called
 def _realise(allocation, point, commanded):
-    """Write the inputs whose accelerations are nearest to those of a command."""
+    """Write the inputs whose accelerations are nearest to the accelerations of a command."""
     work, asking, giving = allocation.work, allocation.asking, allocation.giving
     own, tree, problem = allocation.point, asking.tree, allocation.problem
     size, count, columns = len(tree.row), len(problem.least), problem.columns
@@ -140,7 +147,7 @@ def _realise(allocation, point, commanded):
 
 @inlined
 def _write_all(work, giving, own, columns):
-    """Write the generalised force of a unit of each input, one after the other."""
+    """Write the generalised force per unit of each input, one input after the other."""
     tree, layout, loads = giving.tree, giving.layout, giving.loads
     size, carried = len(tree.row), len(loads.body)
     for entry in range(len(giving.row) * size):
@@ -162,7 +169,7 @@ def _write_all(work, giving, own, columns):
 
 @called
 def solve(problem, size, lane):
-    """Write the solution of a lane into x; it is NaN where the force is."""
+    """Write the solution of one lane into x; x is NaN if the force is NaN."""
     x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
     least, most, count, given = problem.least, problem.most, len(problem.least), problem.given
     write_scaled(problem.columns, lane, 1.0, given)
@@ -184,7 +191,8 @@ def solve(problem, size, lane):
         write_scaled(given, 0, 1.0 / unit, A)
         write_scaled(given[last:], 0, 1.0 / force, wanted)
         free, kept = _solve_scaled(problem, size, free, 0)
-        # The rounding of what cannot be given would drown the rows of LEAST: it is removed.
+        # Remove the part of the force that the inputs cannot produce: its rounding error would
+        # exceed the rows of LEAST.
         wanted[:] = 0.0
         for j in range(count):
             if x[j] != 0.0:
@@ -196,10 +204,10 @@ def solve(problem, size, lane):
 
 @called
 def _solve_scaled(problem, size, free, kept):
-    """Write the solution of what is wanted into x, starting from x and the state of its entries.
+    """Solve for the force `wanted`, starting from x and the `state` of the inputs.
 
-    The first `free` inputs in `order` are free, and the factor has the columns of the first `kept`.
-    Return both for the next call.
+    The first `free` inputs in `order` are free. The factor contains the columns of the first
+    `kept` of them. Return `free` and `kept` for the next call.
     """
     x, s, low, high = problem.x, problem.s, problem.low, problem.high
     state, order, count, newest = problem.state, problem.order, len(problem.x), -1
@@ -225,7 +233,7 @@ def _solve_scaled(problem, size, free, kept):
             if j != newest or step > 0.0:
                 newest = -1
                 continue
-            # It leaves its bound the wrong way because of rounding alone: try another.
+            # Rounding errors moved the released input beyond its bound: try another input.
             state[j] += _TRIED
             _fit(problem, size, free, kept)
             kept = free
@@ -245,9 +253,9 @@ def _solve_scaled(problem, size, free, kept):
 
 @called
 def _fit(problem, size, free, kept):
-    """Write the least squares of the free inputs into s, and the remaining force into b.
+    """Write the least squares solution for the free inputs into s, and the residual into b.
 
-    By an orthogonal factor, to which the columns of inputs from `kept` on are added in their order.
+    The columns of the free inputs from `kept` on are added to the QR factor first.
     """
     s, Q, R, b, order, y = problem.s, problem.Q, problem.R, problem.b, problem.order, problem.y
     count = len(s)
@@ -264,7 +272,7 @@ def _fit(problem, size, free, kept):
 
 @inlined
 def _subtract_bound(problem, size):
-    """Write the wanted force minus the force of the inputs at bounds into b."""
+    """Write `wanted` minus the force of the inputs at their bounds into b."""
     x, b, state = problem.x, problem.b, problem.state
     b[:] = 0.0
     write_scaled(problem.wanted, 0, 1.0, b[:size])
@@ -276,7 +284,7 @@ def _subtract_bound(problem, size):
 
 @inlined
 def _orthogonalise(problem, size, at):
-    """Write the part of a free input's column that is orthogonal to those before, of length 1."""
+    """Add a free input's column to the QR factor, orthogonal to the columns before it."""
     Q, R, count, j = problem.Q, problem.R, len(problem.least), problem.order[at]
     rows = size + count
     column = Q[at * rows : (at + 1) * rows]
@@ -291,7 +299,7 @@ def _orthogonalise(problem, size, at):
 
 @called
 def _steepest(problem, size):
-    """Return the untried input at a bound that is best to release; -1 if there is none."""
+    """Return the untried input whose release from its bound helps most, or -1 without one."""
     best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
     row_products(problem.A, size, b, slopes)
     for j in range(len(state)):
@@ -305,7 +313,7 @@ def _steepest(problem, size):
 
 
 def nearest(A, b, least, most):
-    """Return u (k,) within its bounds (k,) that makes A u nearest to b, the smallest of these."""
+    """Return the smallest u (k,) within its bounds (k,) for which A u is nearest to b."""
     numbers, size = [0.0] * len(least), len(b)
     # The entries of a list are read faster than the entries of an array.
     problem = least_squares(least.tolist(), most.tolist(), size)._replace(

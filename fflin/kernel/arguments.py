@@ -1,9 +1,9 @@
-"""Nested named tuples of arrays as one array of words, which numba code reads field by field.
+"""Kernel arguments: nested named tuples of arrays, stored as one array of 64-bit words.
 
-numba compiles a function for each set of argument types, and hands a named tuple over array by
-array. Here the argument of a call is one array of 64-bit words, and a `Struct` is a pointer into it
-whose fields are read where they are needed: the types are the same whatever the arrays hold, and a
-call within the compiled code takes one pointer. The words must not change during a call.
+numba compiles a function for each set of argument types, and passes a named tuple array by array.
+Here a call has one argument, an array of words. A `Struct` is a pointer into the array, and its
+fields are read when they are needed. So the argument types are always the same, and a call within
+compiled code passes one pointer. The words must not change during a call.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fflin.kernel.tree import work_space
 
 
 class Kind(NamedTuple):
-    """The kind of a field: a number of some type, or a C-contiguous array with so many axes."""
+    """Type of a field: a number (`axes` = 0) or a C-contiguous array with `axes` axes."""
 
     dtype: Any
     axes: int = 0
@@ -28,14 +28,14 @@ class Kind(NamedTuple):
 
 WHOLE, REAL, FLAG = Kind(np.intp), Kind(np.float64), Kind(np.bool_)
 INDICES, REALS, FLAGS = Kind(np.intp, 1), Kind(np.float64, 1), Kind(np.bool_, 1)
-# Doubles in lanes.
+# Array of doubles whose second axis is the lane.
 LANED = Kind(np.float64, 2)
 
 _NOTHING = work_space(0)
 
 
 class Struct:
-    """Return the type of a named tuple of kernel arguments with one kind for most fields."""
+    """Type of a named tuple of kernel arguments: `kind` for all fields except `others`."""
 
     def __init__(self, made: Any, kind: Any = REALS, name: str = "", /, **others: Any) -> None:
         self.made = made
@@ -54,19 +54,19 @@ def _size(kind: Any) -> int:
 
 
 class Opener(NamedTuple):
-    """Takes an array of words for a struct in compiled code."""
+    """Function that compiled code uses to interpret an array of words as a struct."""
 
     kind: Struct
 
     def __call__(self, words: Any) -> Any:
-        """Return the named tuple itself, which uncompiled functions take in place of words."""
+        """Return the argument unchanged: uncompiled functions take the named tuple itself."""
         return words
 
 
 def laid_out(value: Any, kind: Any, fresh: Callable[[Array, Array], None] | None = None) -> Any:
-    """Return a named tuple with arrays and numbers as its struct has them, in lanes where it says.
+    """Convert the fields of a named tuple to the kinds of its struct.
 
-    `fresh` is called with each array in lanes and a column of its values.
+    `fresh` is called with each laned array and the column of its values.
     """
     if isinstance(kind, Struct):
         if value is empty(kind):
@@ -88,7 +88,7 @@ def laid_out(value: Any, kind: Any, fresh: Callable[[Array, Array], None] | None
 
 @cache
 def empty(kind: Any) -> Any:
-    """Return the value of a kind whose arrays are empty and whose numbers are 0, laid out."""
+    """Return a value of a kind with empty arrays and with numbers equal to 0."""
     if isinstance(kind, Struct):
         return kind.made._make(map(empty, kind.kinds.values()))
     if kind == LANED:
@@ -97,7 +97,7 @@ def empty(kind: Any) -> Any:
 
 
 def words_of(value: Any, kind: Any) -> NDArray[np.int64]:
-    """Return the words of a named tuple whose arrays are laid out, and must outlive them."""
+    """Return the words of a named tuple from `laid_out`; its arrays must outlive the words."""
     return np.array(_words(value, kind), dtype=np.int64)
 
 

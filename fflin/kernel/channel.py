@@ -1,6 +1,6 @@
 """Actuator channel: limits, sample and hold, delay, pulses and wheel speeds.
 
-Both engines call these functions, see `control.channel`.
+The Python engine and the compiled engine both call these functions; see `control.channel`.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from fflin.kernel.lanes import chosen, inlined, load, peek, poke, store, whole, 
 class Wheels(
     namedtuple("Wheels", "at row least_torque most_torque least_speed most_speed stiffness")
 ):
-    r"""Wheels (k,) that turn no faster than their limits: :math:`u \le J (w_{max} - w) / dt`.
+    r"""Wheels (k,) with speed limits: :math:`u \le J (w_{max} - w) / dt`.
 
-    Of each the index of its input (`at`) and of its speed in nu (`row`), the limits of its torque
-    [N m] and speed [rad/s], and the stiffness J / dt. Within a step of dt a torque u changes the
-    speed w by u dt / J, where J is what it turns against the rest of the robot, both free. A torque
-    limit that the motor cannot exceed applies as well.
+    Fields of each wheel: the index of its input (`at`), the index of its speed in nu (`row`), the
+    limits of its torque [N m] and speed [rad/s], and the stiffness J / dt. Within a step of dt, a
+    torque u changes the speed w by u dt / J. J is the effective inertia between the wheel and the
+    rest of the free robot. The torque limits of the motor apply as well.
     """
 
 
 class Pulses(namedtuple("Pulses", "at on_off most least quantum left level end time")):
     """Pulsed thrusters (k,) that realise the command of each sample by an impulse.
 
-    Of each the index of its input (`at`), whether it is on-off, its largest thrust [N], its least
-    impulse [N s] and the impulse of one step (`quantum`). The impulse that is commanded but not
-    fired is `left` for the next sample. `level` acts until the step `end`; `time` [s] is the
-    sample time.
+    Fields of each thruster: the index of its input (`at`), whether it is on-off, its largest thrust
+    [N], its least impulse [N s] and the impulse of one step (`quantum`). The commanded impulse that
+    was not fired is `left` for the next sample. The thrust `level` acts until the step `end`.
+    `time` [s] is the sample time.
     """
 
 
 class Channel(
     namedtuple("Channel", "low high held pending slots sample delay fresh wheels pulses")
 ):
-    """Limits (nu,) of commands, and those on their way: `pending` has (slots, nu) of samples.
+    """Limits (nu,) of commands, and the delayed commands `pending` (slots, nu), one per sample.
 
-    `delay` (1,) is in steps; `fresh` (1,) says whether a command begins to act.
+    `delay` (1,) is in steps. `fresh` (1,) is 1 if a command begins to act, else 0.
     """
 
 
@@ -69,7 +69,7 @@ def clipped(value, low, high):
 
 @inlined
 def limit(channel, u):
-    """Cut inputs to their limits."""
+    """Saturate inputs at their limits."""
     for index in range(len(channel.low)):
         value = clipped(load(u, index), load(channel.low, index), load(channel.high, index))
         store(u, index, value)
@@ -83,7 +83,10 @@ def is_asked(channel, step):
 
 @inlined
 def transmit(channel, step, nu, u):
-    """Replace u, a new command wherever the policy is asked, by the inputs that act in a step."""
+    """Replace the command u by the inputs that act in a step.
+
+    u is a new command only in steps in which the policy is evaluated (`is_asked`).
+    """
     if is_asked(channel, step):
         limit(channel, u)
         if channel.sample > 0:
@@ -97,7 +100,7 @@ def transmit(channel, step, nu, u):
 
 @inlined
 def _arrive(channel, step, u):
-    """Write the command that has arrived last, or its pulses, into the inputs of a step."""
+    """Write the latest command after the delay, or its pulses, into the inputs of a step."""
     count, any_fresh = len(channel.low), False
     for lane in range(width(channel.delay)):
         since = step - int(peek(channel.delay, 0, lane))
@@ -134,7 +137,7 @@ def _begin_pulses(channel, step, u):
         else:
             level = clipped(wanted / pulses.time, 0.0, most)
             length, fired = float(sample) + 0.0 * wanted, level * pulses.time
-        # An impulse that misses the least one by rounding is the least one.
+        # An impulse that is below the least impulse only by rounding is fired.
         fires = chosen(0.0, fired, chosen(fired, (1.0 - 1e-9) * least, 0.0, 1.0), 0.0)
         left, end = wanted - fires * fired, float(step) + fires * length
         store(pulses.left, index, chosen(0.5, fresh, left, load(pulses.left, index)))
@@ -144,7 +147,7 @@ def _begin_pulses(channel, step, u):
 
 @inlined
 def _limit_wheel_speeds(channel, nu, u):
-    """Limit torques that would exceed a wheel's speed limit within a step, to zero at most."""
+    """Reduce torques, at most to zero, that would exceed a wheel's speed limit in the step."""
     wheels = channel.wheels
     for index in range(len(wheels.at)):
         least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)

@@ -1,4 +1,4 @@
-"""The compiled kernel: its functions, and whether compiling is worthwhile."""
+"""The compiled kernel: its functions, their stored machine code, and the available cores."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from typing import Any
 
 from fflin.base.errors import unknown
 
-# Files in which Linux tells a container's quota of computing time and its period [us], of version 2
-# and of version 1 of its control groups.
+# Linux files with a container's quota of computing time and its period [us], in version 2 and in
+# version 1 of control groups.
 _QUOTAS = (
     ("/sys/fs/cgroup/cpu.max",),
     ("/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_period_us"),
@@ -27,12 +27,12 @@ _QUOTAS = (
 
 ENGINES = ("python", "compiled")
 
-# In the names of numba's files.
+# Part of the names of numba's cache files.
 VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 
-# Wait for another process's compilation for so long [s] before saying so, and at most.
+# Time [s] to wait for another process's compilation before logging it, and the longest wait [s].
 _SILENCE, _LONGEST_WAIT = 2.0, 600.0
-_INTERVAL = 1.0  # [s] between the seconds that a terminal shows during a compilation
+_INTERVAL = 1.0  # [s] between updates of the time that a terminal shows during a compilation
 
 _log = logging.getLogger("fflin")
 _TURN, _COMPILING = Lock(), RLock()
@@ -54,20 +54,20 @@ def available_cores() -> int:
 
 
 def numba_is_there() -> bool:
-    """Whether the kernel can be compiled."""
+    """Return whether numba is installed."""
     return find_spec("numba") is not None
 
 
 def checked_engine(engine: Any) -> str | None:
-    """Return the name of an engine, or None, or raise `UnknownNameError`."""
+    """Return an engine's name or None unchanged; raise `UnknownNameError` for anything else."""
     if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
         raise unknown("engine", str(engine), list(ENGINES))
     return engine
 
 
 def kernel(module: str, name: str, what: str = "the batch kernel") -> Any:
-    """Return a function of the kernel, compiled at the first call ever and kept on disk."""
-    with _TURN:  # threads come here together
+    """Return a function of the kernel, whose machine code is stored on disk at its first call."""
+    with _TURN:  # several threads may call at once
         return _prepared(module, name, what)
 
 
@@ -81,7 +81,7 @@ def _prepared(module: str, name: str, what: str) -> Any:
         older = set(_entries(folder, module, name)) - set(_kept(folder, module, name))
         for entry in older:
             entry.unlink(missing_ok=True)
-    if not isinstance(compiled.compile, partial):  # a lock within itself would wait for itself
+    if not isinstance(compiled.compile, partial):  # wrapped twice, the lock would block itself
         compiled.compile = partial(_compile_alone, compiled.compile, folder, module, name, what)
     return compiled
 
@@ -90,10 +90,14 @@ def _compile_alone(
     compile: Callable[[Any], Any], folder: Path, module: str, name: str, what: str, signature: Any
 ) -> Any:
     """Compile for a signature, or load the code that another process has compiled meanwhile."""
-    # Threads wait for one another here, and so never for a lock that this process holds.
+    # Threads wait at _COMPILING, so they never wait for a file lock of their own process.
     with _COMPILING, _between_processes(folder / f"{module}.{name}.lock"):
         if not _kept(folder, module, name):
-            _log.warning("fflin: compiling %s once; the code is stored in %s", what, folder)
+            _log.warning(
+                "fflin: compiling %s; this happens only once, because the code is stored in %s",
+                what,
+                folder,
+            )
             with _seconds_shown(what):
                 return compile(signature)
         return compile(signature)
@@ -101,7 +105,7 @@ def _compile_alone(
 
 @contextmanager
 def _seconds_shown(what: str) -> Iterator[None]:
-    """Count the seconds of a compilation on a terminal."""
+    """Show the elapsed seconds of a compilation on a terminal."""
     if sys.stderr is None or not sys.stderr.isatty():
         yield
         return
@@ -109,8 +113,8 @@ def _seconds_shown(what: str) -> Iterator[None]:
 
     def count() -> None:
         while not done.wait(_INTERVAL):
-            said = f"\rcompiling {what}: {time.monotonic() - begun:.0f} s "
-            print(said, end="", file=sys.stderr, flush=True)
+            line = f"\rcompiling {what}: {time.monotonic() - begun:.0f} s "
+            print(line, end="", file=sys.stderr, flush=True)
 
     thread = Thread(target=count, daemon=True)
     thread.start()
@@ -124,10 +128,10 @@ def _seconds_shown(what: str) -> Iterator[None]:
 
 @contextmanager
 def _between_processes(path: Path) -> Iterator[None]:
-    """Hold the lock of a function's machine code; the system frees it if the process dies.
+    """Hold the file lock of a function's machine code; the system frees it if the process dies.
 
-    Without the package, in a folder that cannot be written, or after a long wait it goes on without
-    the lock: at worst two processes compile the same.
+    The lock is skipped without the package filelock, in a folder that cannot be written, or after a
+    long wait. At worst, two processes then compile the same function.
     """
     try:
         from filelock import FileLock, Timeout
@@ -139,7 +143,9 @@ def _between_processes(path: Path) -> Iterator[None]:
         try:
             lock.acquire(timeout=_SILENCE)
         except Timeout:
-            _log.warning("fflin: waiting for another process, which compiles in %s", path.parent)
+            _log.warning(
+                "fflin: waiting for another process that compiles the code in %s", path.parent
+            )
             lock.acquire(timeout=_LONGEST_WAIT)
     try:
         yield
@@ -148,7 +154,7 @@ def _between_processes(path: Path) -> Iterator[None]:
 
 
 def is_kept(module: str, name: str) -> bool:
-    """Whether the machine code of a function is on disk, for the sources as they are."""
+    """Return whether the machine code of a function for the current sources is on disk."""
     chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
     return any(_kept(folder, module, name) for folder in folders)
@@ -156,14 +162,14 @@ def is_kept(module: str, name: str) -> bool:
 
 def _kept(folder: Path, module: str, name: str) -> list[Path]:
     """Return a function's stored machine code if no source is newer."""
-    # numba compares with the function's own file, not with those of the functions that it calls.
+    # numba compares only with the function's own file, not with the files of called functions.
     source = max(file.stat().st_mtime for file in _sources())
     entries = _entries(folder, module, name)
     return [entry for entry in entries if entry.stat().st_mtime >= source]
 
 
 def _entries(folder: Path, module: str, name: str) -> list[Path]:
-    """Return what there is of a function for this version of Python."""
+    """Return the index files of a function's machine code for this version of Python."""
     return list(folder.glob(f"{module}.{name}-*.{VERSION}*.nbi"))
 
 

@@ -1,9 +1,9 @@
-r"""M^-1, accelerations and their derivatives at many points, eight to an instruction.
+r"""M^-1, accelerations and their derivatives at many points, with eight points per instruction.
 
-RNEA is differentiated in closed form: with the spatial axis S of a joint, the velocity v and
-acceleration a of what carries it, and Psi' = v x S, Psi'' = a x S + v x Psi', the derivatives of
-the joint forces tau with respect to the positions q and velocities q' are, for a joint j inwards
-of i,
+RNEA is differentiated in closed form. Let S be the spatial axis of a joint, v and a the velocity
+and acceleration of its parent, Psi' = v x S and Psi'' = a x S + v x Psi'. If joint j is on the path
+from the base to joint i, the derivatives of the joint forces tau with respect to the positions q
+and velocities q' are
 
 .. math::
     \partial\tau_j/\partial q_i &= S_j^T (2 B_i \Psi'_i + I_i \Psi''_i + S_i \times^* f_i) \\
@@ -11,9 +11,10 @@ of i,
     \partial\tau_i/\partial q_j &= (2 B_i^T S_i)^T \Psi'_j + (I_i S_i)^T \Psi''_j \\
     \partial\tau_i/\partial q'_j &= (2 B_i^T S_i)^T S_j + 2 (I_i S_i)^T \Psi'_j
 
-where I, B and f are inertia, Coriolis matrix and force of all that joint i carries. 2 B takes a
-turn w to the force 2 w x p and the moment 2 (tr G - G) w + w x h, with the momentum p, the first
-moments of momentum G = sum m v r^T about the joint, and stored momentum h.
+where I, B and f are inertia, Coriolis matrix and force of the subtree of joint i. For an angular
+velocity w, 2 B w is the force 2 w x p and the moment 2 (tr G - G) w + w x h. Here p is the momentum
+of the subtree, G = sum m v r^T its first moments of momentum about the joint, and h its stored
+momentum.
 
 References
 ----------
@@ -57,7 +58,7 @@ from fflin.kernel.tree import INERTIA, LANES, PLACE, Tree, layout_of, loads_of, 
 
 @inlined
 def _coriolis(work, at, w):
-    """Return 2 B w, moment and force, of the bodies that a joint carries."""
+    """Return the moment and force 2 B w of a joint's subtree."""
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     moment = vec.minus(vec.times(w, trace), vec.product(G, w))
@@ -68,7 +69,7 @@ def _coriolis(work, at, w):
 
 @inlined
 def _coriolis_transposed(work, at, along):
-    """Return 2 B^T s of a motion vector s, which is a moment."""
+    """Return the moment of 2 B^T s for a motion vector s; the force of 2 B^T s is zero."""
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     w = along[0]
@@ -80,8 +81,8 @@ def _coriolis_transposed(work, at, along):
 
 
 @inlined
-def _passive_slopes(work, tree, layout, loads):
-    """Write those of springs and dampers, and zeros."""
+def _passive_derivatives(work, tree, layout, loads):
+    """Write the derivatives of springs and dampers, and zeros in all other entries."""
     size = len(tree.row)
     n, width = size - 6, 2 * size
     for entry in range(size * width):
@@ -94,15 +95,15 @@ def _passive_slopes(work, tree, layout, loads):
 
 @inlined
 def _add_column(work, at, width, force):
-    """Add a moment and force to the rows of the base in a column."""
+    """Add a moment and force to the base rows of a column."""
     for index in range(3):
         vec.add(work, at + index * width, force[0][index])
         vec.add(work, at + (3 + index) * width, force[1][index])
 
 
 @inlined
-def _joint_slopes(work, tree, layout):
-    """Add those over each joint, and those of each joint's force over omega_b."""
+def _joint_derivatives(work, tree, layout):
+    """Add the derivatives over each joint, and of each joint's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
     spin = vec.get3(work, layout.motion)
     for body in range(len(tree.parent) - 1, 0, -1):
@@ -150,8 +151,8 @@ def _joint_slopes(work, tree, layout):
 
 
 @inlined
-def _base_slopes(work, tree, layout):
-    """Write those of the base's force over omega_b."""
+def _base_derivatives(work, tree, layout):
+    """Write the derivatives of the base's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
     zero, one = 0.0, 1.0
     spin = vec.get3(work, layout.motion)
@@ -170,22 +171,22 @@ def _base_slopes(work, tree, layout):
 
 @inlined
 def differentiate(work, tree, layout, loads):
-    """Write the slopes of M c + bias less the forces over the state, rows of 12 + 2 n."""
-    _passive_slopes(work, tree, layout, loads)
-    _joint_slopes(work, tree, layout)
-    _base_slopes(work, tree, layout)
+    """Write the derivatives of M c + bias - forces over the state, in rows of 12 + 2 n."""
+    _passive_derivatives(work, tree, layout, loads)
+    _joint_derivatives(work, tree, layout)
+    _base_derivatives(work, tree, layout)
 
 
 @inlined
 def _invert(work, robot):
-    """Write M^-1, and the sum of couplings that shows its accuracy."""
+    """Write M^-1 and the sum of its couplings, which measures its accuracy."""
     inertia.invert_factor(work, robot.tree)
     inertia.multiply(work, robot.tree, robot.judged)
 
 
 @inlined
 def _push(work, robot):
-    """Write the slopes over the inputs, columns of M^-1 or sums of them."""
+    """Write the derivatives over the inputs: columns of M^-1 or combinations of columns."""
     size, count, carried = len(robot.tree.row), len(robot.row), len(robot.loads.input)
     square, by_u = robot.tree.square, robot.by_u
     for row in range(size):
@@ -203,12 +204,12 @@ def _push(work, robot):
 
 @inlined
 def _solve(work, robot):
-    """Write -M^-1 times the slopes of the forces, six columns at a time."""
+    """Write -M^-1 times the derivatives of the forces, six columns at a time."""
     tree, layout, size = robot.tree, robot.layout, len(robot.tree.row)
     width = 2 * size
     zero = splat(work, 0.0)
     none = (zero, zero, zero), (zero, zero, zero)
-    # The first six columns, of the base's turn and shift, are zeros.
+    # The first six columns, over the base's rotation and translation, are zero.
     for row in range(size):
         vec.put6(work, robot.slopes + row * width, none)
     for column in range(width % 6 or 6, width, 6):
@@ -226,12 +227,12 @@ def _solve(work, robot):
 
 @compiled
 def derive(robot, points, out, lanes, work, moves):
-    """Write what `RowAccelerations` returns of as many points as there are lanes at least."""
+    """Write the results of `RowAccelerations` at eight or more points."""
     q, nu, force, u = points
     c, A, by_u, judged = out
     tree, layout, loads, size = robot.tree, robot.layout, robot.loads, len(robot.tree.row)
     for block in range(0, len(q), LANES):
-        # The last block begins early enough to fill the lanes; some points are done twice.
+        # The last block overlaps the block before, so that all lanes are filled.
         first = min(block, len(q) - LANES)
         inertia.pack(q, first, lanes.q)
         outwards(work, tree, lanes.q)
@@ -269,24 +270,25 @@ def derive(robot, points, out, lanes, work, moves):
 
 Mask: TypeAlias = NDArray[np.bool_]
 
-_FARTHEST = 1e6  # [rad], up to which the kernel's sines and cosines are exact to rounding
+_FARTHEST = 1e6  # [rad] largest angle for which `vectors.cosine_and_sine` is accurate
 
 
 class Packed(namedtuple("Packed", "q nu force u")):
-    """Eight points, lane beside lane."""
+    """Arrays of eight points; their second axis is the lane."""
 
 
 class Derived(namedtuple("Derived", "tree layout loads row slopes by_u judged size")):
-    """A robot as `derive` reads it, and where its results begin in the work space; its size.
+    """Arguments of `derive`: a robot, the offsets of its results in the work space, and its size.
 
-    `row` is the coordinate that each input pushes, -1 for one that is carried.
+    `row` is the coordinate that each input drives, -1 for a body-fixed wrench.
     """
 
 
 class RowAccelerations:
-    """Accelerations of rows of points, their slopes and M^-1, by the compiled kernel.
+    """Accelerations at rows of points, their derivatives and M^-1, by the compiled kernel.
 
-    Every point is judged by the sum of the couplings M_ii (M^-1)_ii; see `Inertia`.
+    The sum of the couplings M_ii (M^-1)_ii (`judged`) measures the accuracy at each point; see
+    `Inertia`.
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
@@ -304,17 +306,17 @@ class RowAccelerations:
         self._least_coupling = 0.999 * nv
 
     def write_inverse(self, q: Array, by_u: Array) -> Array:
-        """Write the slopes over u (N, 6 + n, nu); return what is judged (N,)."""
+        """Write the derivatives over u (N, 6 + n, nu); return the sums of couplings (N,)."""
         none = np.empty((0, 0))
         return self._derive((q, none, none, none), none, none, by_u, moves=False)
 
     def write(
         self, q: Array, nu: Array, q_m: Array, u: Array, A: Array, by_u: Array
     ) -> tuple[Array, Array]:
-        """Write the derivatives of accelerations; return c (N, 6 + n) and what is judged (N,).
+        """Write the derivatives of accelerations; return c (N, 6 + n) and sums of couplings (N,).
 
-        The slopes of `AccelerationDerivatives` are the lower halves of A (N, nx, nx). Both arrays
-        are C-contiguous; nu and u are in base axes.
+        The lower half of each A (N, nx, nx) gets the derivatives over the state. A and by_u are
+        C-contiguous; nu and u are in base axes.
         """
         force = u @ self._actuation.fixed.T
         force[:, 6:] += self.state.robot.springs.force(q_m, nu[:, 6:])
@@ -323,8 +325,8 @@ class RowAccelerations:
         return c, self._derive((q, nu, force, u), c, flat, by_u, moves=True)
 
     def sound(self, q: Array, judged: Array) -> Mask:
-        """Return where (N,) M is far from singular and the kernel's sines are exact."""
-        # NaN, from a pivot that is zero, compares false.
+        """Return whether (N,) M is well-conditioned and all angles are below 1e6 rad."""
+        # A zero pivot gives NaN, for which the comparisons are false.
         q_m = q[:, 7:]
         good = (self._least_coupling < judged) & (judged < Inertia.warning_coupling)
         if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:
@@ -347,5 +349,8 @@ class RowAccelerations:
 
 
 def _writable(rows: Array) -> Array:
-    """Return rows that may be written, copied if need be: numba compiles for either kind."""
+    """Return rows as a writable array, copied if necessary.
+
+    numba would compile a second function for read-only arrays.
+    """
     return np.require(rows, np.float64, ("C", "W"))

@@ -1,13 +1,13 @@
-r"""Forward dynamics with all that acts on a robot, and its first integrals.
+r"""Forward dynamics of a robot with its inputs, springs and gravity, and its first integrals.
 
-Accelerations are by CRBA's M, the bias forces of RNEA and a factor of M. All stands in base axes
-and the base neither is anywhere nor moves along, as no acceleration but those of (3.1) depends on
-either. Momentum and centre of mass follow from the external impulse,
+Accelerations follow from the M of CRBA, the bias forces of RNEA and a factor of M. All vectors are
+in base axes. Position and linear velocity of the base are left out, because the accelerations c of
+(3.1) do not depend on them. Momentum and centre of mass follow from the external impulse,
 
 .. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
 
-(11.2) of docs/derivation.md, as `simulation.plant` has it; momentum is linear, then angular
-about where the base's origin was at the start, and places are seen from there.
+(11.2) of docs/derivation.md, as in `simulation.plant`. H is linear momentum, then angular momentum
+about the initial position of the base's origin. Positions are relative to this point.
 """
 
 from __future__ import annotations
@@ -30,29 +30,34 @@ class Mechanics(
         "tree layout loads gravity index circling scale springy rest row held triads origin faults",
     )
 ):
-    """A robot as the loop reads it; each array of doubles may have a second axis of eight lanes.
+    """Robot parameters of the loop; each array of doubles may have a second axis of eight lanes.
 
-    Gravity (3,); of each joint its entry of q (`index`), whether that is the cosine of an angle,
-    the entry for a unit of q_m (`scale`, 1 except for modal amplitudes), whether it has a spring or
-    damper, and where the spring is at rest; the coordinate that each input drives (`row`), -1 for
-    one that is carried; the first of three inputs each that are a vector on the base in reference
-    axes (`held`), and in any (`triads`); the placement (7,) of the world's origin seen from the
-    reference; and the errors of the inputs.
+    - `gravity` (3,).
+    - Fields of each joint: its entry of q (`index`); whether this entry is the cosine of an angle
+      (`circling`); the change of the entry per unit of q_m (`scale`, 1 except for modal
+      amplitudes); whether the joint has a spring or damper (`springy`); and the position at which
+      the spring is relaxed (`rest`).
+    - `row`: the coordinate that each input drives, -1 for a body-fixed wrench.
+    - `held`: the first of each three inputs that form a vector on the base in reference axes;
+      `triads`: the same for vectors in any axes.
+    - `origin` (7,): placement of the world's origin relative to the reference.
+    - `faults`: the `ActuatorFaults`.
     """
 
 
 class ActuatorFaults(namedtuple("ActuatorFaults", "gain bias until turn")):
     """Actuator faults: the input is gain u + bias (nu,) for a command u, and 0 after `until` [s].
 
-    `turn` has the columns (9,) along which the three inputs of each vector on the base act.
+    `turn` has the columns of a matrix (9,) for each vector on the base: the directions in which its
+    three inputs really act.
     """
 
 
 class Point(namedtuple("Point", "q nu u pushing wrench")):
-    """Point of a robot: q (nq,) and nu (6 + n,) in base axes, and the inputs (nu,).
+    """Point of a robot: q (nq,), nu (6 + n,) in base axes, and inputs (nu,).
 
-    `u` is as it is commanded, `pushing` in base axes; `wrench` (6,) is what the inputs of the last
-    acceleration are at the base's origin, moment and force.
+    `u` are the commanded inputs, and `pushing` the acting inputs in base axes. `wrench` (6,) is the
+    moment and force of the inputs on the base's origin at the last evaluation of accelerations.
     """
 
 
@@ -70,7 +75,7 @@ TREE = Struct(
 LAYOUT = Struct(Layout, WHOLE)
 LOADS = Struct(Loads, LANED, body=INDICES, input=INDICES, stored_body=INDICES)
 ACTUATOR_FAULTS, POINT = Struct(ActuatorFaults, LANED), Struct(Point, LANED)
-# One that is the same for all lanes.
+# A point that is common to all lanes.
 COMMON_POINT = Struct(Point, REALS, "CommonPoint")
 MECHANICS = Struct(
     Mechanics,
@@ -86,14 +91,14 @@ MECHANICS = Struct(
 
 @called
 def configure(work, robot, q):
-    """Write the places of all bodies and the packed M at a configuration."""
+    """Write the poses of all bodies and the packed M at a configuration."""
     outwards(work, robot.tree, q)
     inwards(work, robot.tree)
 
 
 @inlined
 def joint_position(robot, q, joint):
-    """Return a joint's angle, in (-pi, pi] where it turns without end, length or amplitude."""
+    """Return the position of a joint; the angle of a continuous joint is in (-pi, pi]."""
     at = robot.index[joint]
     value = load(q, at)
     if robot.circling[joint]:
@@ -109,7 +114,7 @@ def seen(robot, q):
 
 @inlined
 def apply_faults(faults, triads, t, u, given):
-    """Write the inputs of faulty actuators for a command u at a time."""
+    """Write the inputs that faulty actuators produce for a command u at a time."""
     for index in range(len(faults.gain)):
         value = load(faults.gain, index) * load(u, index) + load(faults.bias, index)
         store(given, index, chosen(t, load(faults.until, index), value, 0.0))
@@ -120,7 +125,7 @@ def apply_faults(faults, triads, t, u, given):
 
 @inlined
 def turn_held(robot, point):
-    """Rotate reference-frame inputs to base axes."""
+    """Rotate reference-frame wrenches to base axes."""
     pushing = point.pushing
     for index in range(len(robot.held)):
         at = robot.held[index]
@@ -130,7 +135,7 @@ def turn_held(robot, point):
 
 @inlined
 def push(work, robot, pushing):
-    """Write the generalised force of inputs in base axes where c will be."""
+    """Write the generalised force of inputs in base axes at the offset of c."""
     tree, layout, loads = robot.tree, robot.layout, robot.loads
     force, size, count = layout.c, len(tree.row), len(loads.body)
     for index in range(size):
@@ -147,9 +152,9 @@ def push(work, robot, pushing):
 
 @called
 def accelerate(work, robot, point, rates, to):
-    """Write the rates of nu at a point that is configured into `rates` from `to` on.
+    """Write d(nu)/dt into `rates` from the index `to` on; `configure` must have computed M.
 
-    Its M is overwritten by its factor.
+    M is overwritten by its factor.
     """
     tree, layout, loads, nu = robot.tree, robot.layout, robot.loads, point.nu
     force, size = layout.c, len(tree.row)
@@ -169,23 +174,25 @@ def accelerate(work, robot, point, rates, to):
     factorise(work, tree)
     solve(work, tree, force)
     vec.copy(work, force, rates, to, size)
-    # What falls and what turns takes the base's origin along.
+    # dv_b/dt also contains gravity and -omega_b x v_b.
     fall = vec.across(vec.axes_of(point.q), vec.get3(robot.gravity, 0))
     fall = vec.minus(fall, vec.cross(vec.get3(nu, 0), vec.get3(nu, 3)))
     vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
 
 
-# Where these begin in the sums: impulse and shift of the centre of mass, so far and of the step.
+# Offsets in the sums: impulse and displacement of the centre of mass, up to the step and within it.
 IMPULSE, SHIFT, STEP_IMPULSE, STEP_SHIFT = 0, 6, 9, 15
 SUMS = 18
 
 
 class MomentumReference(namedtuple("MomentumReference", "start weight per_mass sums")):
-    """Reference of the conserved quantities; arrays of doubles may have a second axis of lanes.
+    """Reference of momentum and centre of mass; arrays of doubles may have a second axis of lanes.
 
-    `start` (12,): momentum, centre of mass, and the point that both are seen from; weight (3,); and
-    `sums` (18,): the impulse (6,), and the shift (3,) of the centre of mass beyond the one of its
-    initial velocity, so far and of the step.
+    - `start` (12,): initial momentum (6,) and centre of mass (3,), and the point (3,) to which both
+      are relative.
+    - `weight` (3,): mass times gravity.
+    - `sums` (18,): impulse (6,), and displacement (3,) of the centre of mass in addition to the one
+      by its initial velocity; first up to the current step, then within it.
     """
 
 
@@ -194,21 +201,24 @@ MOMENTUM_REFERENCE = Struct(MomentumReference, LANED)
 
 @inlined
 def begin_step(reference):
-    """Write that nothing has pushed yet in a step."""
+    """Set the sums of a step to zero."""
     for entry in range(STEP_IMPULSE, SUMS):
         store(reference.sums, entry, 0.0)
 
 
 @inlined
 def add_wrench(work, robot, reference, point, weight, moment):
-    """Add to the sums of a step what pushed at a stage, which counts by its weight and moment."""
+    """Add the external wrench at a stage to the sums of a step.
+
+    `weight` is the stage's weight in an integral, `moment` its weight in a double integral.
+    """
     axes = vec.axes_of(point.q)
     moments, force = vec.get6(point.wrench, 0)
-    place = vec.minus(vec.get3(point.q, 0), vec.get3(reference.start, 9))
+    position = vec.minus(vec.get3(point.q, 0), vec.get3(reference.start, 9))
     lever = vec.product(axes, vec.get3(work, robot.tree.inertias + 1))
     force, falls = vec.product(axes, force), vec.get3(reference.weight, 0)
-    # Of the weight m g at the centre of mass c, the lever being m c.
-    torque = vec.plus(vec.product(axes, moments), vec.cross(place, vec.plus(force, falls)))
+    # Moment of the weight m g at the centre of mass c, where `lever` is m c.
+    torque = vec.plus(vec.product(axes, moments), vec.cross(position, vec.plus(force, falls)))
     torque = vec.plus(torque, vec.cross(vec.times(lever, load(reference.per_mass, 0)), falls))
     force = vec.plus(force, falls)
     vec.add3(reference.sums, STEP_IMPULSE, vec.times(force, weight))
@@ -218,7 +228,7 @@ def add_wrench(work, robot, reference, point, weight, moment):
 
 @inlined
 def end_step(reference, h):
-    """Go on by a step of h [s]."""
+    """Add the sums of a finished step of h [s] to the sums up to now."""
     per_mass = load(reference.per_mass, 0)
     shift = vec.times(vec.get3(reference.sums, IMPULSE), h)
     vec.add3(
@@ -231,7 +241,7 @@ def end_step(reference, h):
 
 @inlined
 def kept_at(reference, t):
-    """Return the momentum, linear and angular, and where the centre of mass is."""
+    """Return the reference of linear and angular momentum and of the centre of mass."""
     momentum = vec.plus6(vec.get6(reference.start, 0), vec.get6(reference.sums, IMPULSE))
     flown = vec.times(vec.get3(reference.start, 0), t * load(reference.per_mass, 0))
     shift = vec.plus(vec.get3(reference.start, 6), vec.get3(reference.sums, SHIFT))
@@ -244,26 +254,26 @@ def start_at(work, robot, reference, point):
     axes, tree = vec.axes_of(point.q), robot.tree
     lever = vec.get3(work, tree.inertias + 1)
     nothing = vec.minus(lever, lever)
-    angular, linear = _lack(work, robot, point.nu, (nothing, nothing))
-    place = vec.minus(vec.get3(point.q, 0), vec.get3(reference.start, 9))
+    angular, linear = _momentum_error(work, robot, point.nu, (nothing, nothing))
+    position = vec.minus(vec.get3(point.q, 0), vec.get3(reference.start, 9))
     linear = vec.times(vec.product(axes, linear), -1.0)
-    angular = vec.minus(vec.cross(place, linear), vec.product(axes, angular))
+    angular = vec.minus(vec.cross(position, linear), vec.product(axes, angular))
     vec.put3(reference.start, 0, linear)
     vec.put3(reference.start, 3, angular)
     lever = vec.times(vec.product(axes, lever), load(reference.per_mass, 0))
-    vec.put3(reference.start, 6, vec.plus(place, lever))
+    vec.put3(reference.start, 6, vec.plus(position, lever))
 
 
 @inlined
-def _lack(work, robot, nu, momentum):
-    """Return what a momentum in base axes, angular and linear, is more than that of a velocity."""
+def _momentum_error(work, robot, nu, momentum):
+    """Return a momentum in base axes, angular and linear, minus the momentum at velocity nu."""
     tree = robot.tree
-    # The base's rows of M nu: its block of a rigid body, and the first six entries of each row.
-    lack = vec.minus6(momentum, spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0)))
+    # The base rows of M nu: the base's rigid-body block, and the first six entries of each row.
+    error = vec.minus6(momentum, spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0)))
     for index in range(6, len(tree.row)):
         row = vec.get6(work, tree.packed + tree.row[index])
-        lack = vec.minus6(lack, vec.times6(row, load(nu, index)))
-    angular, linear = lack
+        error = vec.minus6(error, vec.times6(row, load(nu, index)))
+    angular, linear = error
     for index in range(len(robot.loads.stored_body)):
         angular = vec.minus(angular, stored_momentum(work, tree, robot.loads, index))
     return angular, linear
@@ -271,21 +281,22 @@ def _lack(work, robot, nu, momentum):
 
 @inlined
 def impose(work, robot, reference, point, t):
-    """Shift the base and set its velocity so that both are kept; M must be the point's.
+    """Set the base's position and velocity so that momentum and centre of mass equal the reference.
 
-    The velocity is corrected by what the momentum lacks, so that rounding is of second order.
+    M must be evaluated at the point. The velocity is corrected by the deviation of the momentum, so
+    the rounding errors of the solution are relative to this small correction.
     """
     tree, nu = robot.tree, point.nu
     axes = vec.axes_of(point.q)
     m, lever = load(work, tree.inertias), vec.get3(work, tree.inertias + 1)
     per_mass = 1.0 / m
     (linear, angular), center = kept_at(reference, t)
-    place = vec.minus(center, vec.times(vec.product(axes, lever), per_mass))
-    vec.put3(point.q, 0, vec.plus(place, vec.get3(reference.start, 9)))
-    angular = vec.across(axes, vec.minus(angular, vec.cross(place, linear)))
+    position = vec.minus(center, vec.times(vec.product(axes, lever), per_mass))
+    vec.put3(point.q, 0, vec.plus(position, vec.get3(reference.start, 9)))
+    angular = vec.across(axes, vec.minus(angular, vec.cross(position, linear)))
     linear = vec.across(axes, linear)
-    angular, linear = _lack(work, robot, nu, (angular, linear))
-    # The same block solved, by the inertia about the centre of mass.
+    angular, linear = _momentum_error(work, robot, nu, (angular, linear))
+    # Solve with the base's rigid-body block, by the inertia about the centre of mass.
     xx, xy, xz = vec.get3(work, tree.inertias + 4)
     yy, yz, zz = vec.get3(work, tree.inertias + 7)
     d = vec.times(lever, per_mass)

@@ -1,9 +1,10 @@
 """The joint-space inertia M by composite rigid bodies, its sparse factors, and its inverse.
 
-All vectors are in base axes, so that none is rotated from joint to joint; moments are about the
-joints, since about the base origin those of a light tool at the end of a long arm would lose their
-digits. Row i of the packed M holds what is not zero left of the diagonal: the coordinates on the
-path from the base to i, of which those of any coordinate on the path are the beginning.
+All vectors are in base axes, so no vector is rotated from joint to joint. Moments are about the
+joints: about the base origin, the inertia of a light tool at the end of a long arm would lose
+digits. Row i of the packed M holds the nonzero entries up to the diagonal. Their columns are the
+coordinates on the path from the base to i. The path of every coordinate on it is the beginning of
+this path.
 
 References
 ----------
@@ -19,7 +20,7 @@ from fflin.kernel.tree import INERTIA, LANES, PLACE
 
 @inlined
 def _place(work, at, parent, fixed, first, cosine, sine, shift):
-    """Write the place of a body into `work` at `at`, that of its parent being at `parent`."""
+    """Write the pose of a body into `work` at `at`; the pose of its parent is at `parent`."""
     axes = vec.get_columns(work, parent)
     x = vec.product(axes, vec.get3(fixed, first))
     y = vec.product(axes, vec.get3(fixed, first + 3))
@@ -33,7 +34,7 @@ def _place(work, at, parent, fixed, first, cosine, sine, shift):
 
 @inlined
 def _inertia(work, at, place, bodies, first):
-    """Write a body's inertia about its joint: m, m c, and R I R^T by way of the columns of R I."""
+    """Write a body's inertia about its joint in base axes: m, m c, and R I R^T."""
     axes = vec.get_columns(work, place)
     store(work, at, load(bodies, first))
     vec.put3(work, at + 1, vec.product(axes, vec.get3(bodies, first + 1)))
@@ -69,7 +70,7 @@ def _carry(work, at, above, place):
 
 @inlined
 def spatial_inertia_times(work, at, motion):
-    """Return inertia times a motion vector, moment and force."""
+    """Return a spatial inertia times a motion vector, as moment and force."""
     m, h = load(work, at), vec.get3(work, at + 1)
     xx, xy, xz = vec.get3(work, at + 4)
     yy, yz, zz = vec.get3(work, at + 7)
@@ -80,7 +81,7 @@ def spatial_inertia_times(work, at, motion):
 
 @inlined
 def outwards(work, tree, q):
-    """Write the places of all bodies and their own inertias, outwards."""
+    """Write the poses and the inertias of all bodies, from the base outwards."""
     places, own = tree.places, tree.own
     one, zero = splat(work, 1.0), splat(work, 0.0)
     vec.put3(work, places, (1.0, 0.0, 0.0))
@@ -104,7 +105,7 @@ def outwards(work, tree, q):
 
 @inlined
 def inwards(work, tree):
-    """Write the packed M and the composite inertias, inwards."""
+    """Write the packed M and the composite inertias, from the tips inwards."""
     bodies = len(tree.parent)
     places, inertias, packed = tree.places, tree.inertias, tree.packed
     zero = splat(work, 0.0)
@@ -128,14 +129,14 @@ def inwards(work, tree):
             value = value + tree.slides[above] * vec.dot(z, force)
             vec.add(work, packed + tree.target[pair], tree.share[pair] * value)
             pair += 1
-            # The moment about the parent's joint.
+            # Move the moment to the parent's joint.
             moment = vec.plus(moment, vec.cross(vec.get3(work, place + 9), force))
             above = tree.parent[above]
         start, share = packed + tree.target[pair], tree.share[pair]
         pair += 1
         vec.add3(work, start, vec.times(moment, share))
         vec.add3(work, start + 3, vec.times(force, share))
-    # The base's block (I, [m c]x, m), packed as the rows of a chain of six coordinates.
+    # The base's rigid-body block (I, [m c]x, m), packed as rows of a chain of six coordinates.
     m = load(work, inertias)
     hx, hy, hz = vec.get3(work, inertias + 1)
     xx, xy, xz = vec.get3(work, inertias + 4)
@@ -151,7 +152,7 @@ def inwards(work, tree):
 
 @inlined
 def factorise(work, tree):
-    """Turn the packed M into L, of unit diagonal, and 1 / D where `scaled` is, M = L^T D L."""
+    """Factorise M = L^T D L: replace the packed M by the unit L, and write 1 / D at `scaled`."""
     packed, scaled = tree.packed, tree.scaled
     for k in range(len(tree.row) - 1, -1, -1):
         row, depth = packed + tree.row[k], tree.depth[k]
@@ -169,7 +170,7 @@ def factorise(work, tree):
 
 @inlined
 def solve(work, tree, x):
-    """Turn a force at x into the acceleration M^-1 f, by the factor."""
+    """Replace a force f at x by the acceleration M^-1 f; M must be factorised."""
     packed, size = tree.packed, len(tree.row)
     for k in range(size - 1, -1, -1):
         value, row = load(work, x + k), tree.row[k]
@@ -187,7 +188,7 @@ def solve(work, tree, x):
 
 @inlined
 def keep_diagonal(work, tree):
-    """Write the diagonal of the packed M aside, which its factor overwrites."""
+    """Copy the diagonal of the packed M, because `factorise` overwrites it."""
     for k in range(len(tree.row)):
         value = load(work, tree.packed + tree.row[k] + tree.depth[k])
         store(work, tree.diagonal + k, value)
@@ -195,7 +196,7 @@ def keep_diagonal(work, tree):
 
 @inlined
 def invert_factor(work, tree):
-    """Turn L into U = L^-1, and write V = L^-1 D^-1."""
+    """Replace L by U = L^-1, and write V = L^-1 D^-1."""
     packed, scaled = tree.packed, tree.scaled
     zero = splat(work, 0.0)
     for k in range(len(tree.row)):
@@ -213,7 +214,7 @@ def invert_factor(work, tree):
 
 @inlined
 def multiply(work, tree, judged):
-    """Write M^-1 = U D^-1 U^T, and at `judged` the sum of M_ii (M^-1)_ii."""
+    """Write M^-1 = U D^-1 U^T, and write the sum of M_ii (M^-1)_ii at `judged`."""
     packed, scaled, square = tree.packed, tree.scaled, tree.square
     size = len(tree.row)
     coupling = splat(work, 0.0)
@@ -233,7 +234,7 @@ def multiply(work, tree, judged):
 
 @inlined
 def pack(rows, first, lanes):
-    """Write the rows of eight points lane beside lane."""
+    """Copy the rows of eight points into an array (entries, lanes)."""
     for entry in range(len(lanes)):
         for lane in range(LANES):
             lanes[entry, lane] = rows[first + lane, entry]
@@ -241,7 +242,7 @@ def pack(rows, first, lanes):
 
 @inlined
 def unpack(work, start, entries, out, first, offset):
-    """Write entries that stand lane beside lane to the rows of eight points, from a column on."""
+    """Copy entries of a laned array to the rows of eight points, starting at column `offset`."""
     for entry in range(entries):
         for lane in range(LANES):
             out[first + lane, offset + entry] = work[start + entry, lane]

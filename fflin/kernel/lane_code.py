@@ -1,11 +1,11 @@
-"""Machine code of the operations of `kernel.lanes`, for one number or for eight side by side.
+"""Machine code of the operations of `kernel.lanes`, for one number or for eight at once.
 
-An array of one axis holds numbers, and an array of two axes, the second of eight, holds lanes: one
-robot each, and one instruction for all eight. A double counts for every lane. Thus a function that
-reads as for one number is compiled for either.
+An array with one axis holds numbers. An array with a second axis of eight holds lanes: one robot
+per lane, and one instruction for all eight. A double is valid for every lane. So a function that is
+written for one number can be compiled for eight.
 
-LLVM does not vectorise loops over several arrays that may overlap, but it does so for this type.
-Where a machine has narrower registers, LLVM splits the eight over several.
+LLVM does not vectorise loops over arrays that may overlap, but it does vectorise this type. If the
+registers of a machine are narrower, LLVM splits the eight numbers over several registers.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _BYTES = 8  # alignment of a double
 
 
 class Lanes(numba.types.Type):
-    """The type of eight doubles side by side."""
+    """numba type of eight doubles in one vector."""
 
     def __init__(self) -> None:
         super().__init__(name="Lanes")
@@ -52,7 +52,7 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def _spread(builder: Any, value: Any) -> Any:
-    """Return a double in all lanes; lanes as they are."""
+    """Copy a double to all lanes; return lanes unchanged."""
     if value.type == _VECTOR:
         return value
     nothing = ir.Constant(_VECTOR, ir.Undefined)
@@ -61,14 +61,14 @@ def _spread(builder: Any, value: Any) -> Any:
 
 
 def _alike(builder: Any, values: Any) -> list[Any]:
-    """Return numbers as lanes where one of them is."""
+    """Convert all values to lanes if one of them is lanes."""
     if any(value.type == _VECTOR for value in values):
         return [_spread(builder, value) for value in values]
     return list(values)
 
 
 def _together(*kinds: Any) -> Any:
-    """Return the type that such numbers make, or None where one is no number."""
+    """Return the common type of numbers, or None if one of them is not a number."""
     if any(kind not in _NUMBERS for kind in kinds):
         return None
     return lanes if lanes in kinds else double
@@ -114,7 +114,7 @@ def _held(array: Any) -> Any:
 
 
 def _flat_place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
-    """Return where a double of a contiguous array is, all of its axes taken for one."""
+    """Return the address of a double at an index of a flattened contiguous array."""
     return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
 
 
@@ -131,7 +131,7 @@ def _write(builder: Any, value: Any, place: Any) -> None:
 
 @intrinsic
 def load(typing: Any, array: Any, index: Any) -> Any:
-    """Read the number or the lanes at an index of a contiguous array."""
+    """Read an entry of a contiguous array: one number, or one number per lane."""
 
     def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
         value = builder.load(_place(context, builder, array, *arguments))
@@ -158,7 +158,7 @@ def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def splat(typing: Any, array: Any, value: Any) -> Any:
-    """Return a number as an array holds them, alone or in all lanes."""
+    """Convert a number to the entry type of an array: one number, or the number in all lanes."""
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         return _spread(builder, arguments[1]) if _held(array) == lanes else arguments[1]
@@ -186,7 +186,7 @@ floor, whole, root = _rounding("floor"), _rounding("rint"), _rounding("sqrt")
 
 
 def _one(builder: Any, kind: Any, index: Any, lane: Any) -> Any:
-    """Return which double of all a lane at an index is; a number is its only one."""
+    """Return the flat index of a lane at an index; an array without lanes has one per entry."""
     if _held(kind) == double:
         return index
     return builder.add(builder.mul(index, ir.Constant(index.type, LANES)), lane)
@@ -219,7 +219,7 @@ def poke(typing: Any, array: Any, index: Any, lane: Any, value: Any) -> Any:
 
 @intrinsic
 def chosen(typing: Any, left: Any, right: Any, less: Any, other: Any) -> Any:
-    """Return `less` where left < right, and `other` elsewhere and where one is no number."""
+    """Return `less` if left < right, else `other`, lane by lane; a comparison with NaN is false."""
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         left, right, less, other = _alike(builder, arguments)
@@ -246,7 +246,7 @@ def below(typing: Any, value: Any, bound: Any) -> Any:
 
 @intrinsic
 def angle(typing: Any, sine: Any, cosine: Any) -> Any:
-    """Return the angle of a sine and a cosine, in (-pi, pi]."""
+    """Return the angle in (-pi, pi] from its sine and cosine."""
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         kind = ir.FunctionType(_DOUBLE, [_DOUBLE, _DOUBLE])
@@ -263,7 +263,7 @@ def angle(typing: Any, sine: Any, cosine: Any) -> Any:
     return _together(sine, cosine)(sine, cosine), generate
 
 
-# By the function of `kernel.lanes` that each one stands for.
+# {function of `kernel.lanes`: operation that replaces it in compiled code}.
 OPERATIONS = {
     getattr(uncompiled, operation): globals()[operation]
     for operation in (

@@ -1,9 +1,9 @@
-"""The operations and decorators of which the kernel's functions are written.
+"""The operations and decorators with which the kernel's functions are written.
 
-A function of the kernel is a Python function. Called as it stands, with arrays or lists of one
-axis, it computes with one number at a time; the simulation in Python calls it so, and a debugger
-works in it. `kernel.lane_code` compiles the same function, also for arrays of two axes with eight
-lanes side by side, where each operation has its machine code.
+A function of the kernel is a Python function. Called directly, with arrays or lists of one axis, it
+computes one number at a time. The Python engine calls it like this, and a debugger can step through
+it. `kernel.machine_code` compiles the same function, also for arrays with a second axis of eight
+lanes. In compiled code, the operations of `kernel.lane_code` replace the operations below.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# How each function of the kernel is compiled.
+# {function of the kernel: name of the decorator that says how it is compiled}.
 HOW: dict[Callable[..., Any], str] = {}
-# The loop that is compiled in place of an operation of NumPy.
+# {operation by NumPy: loop that is compiled in its place}.
 LOOPS: dict[Callable[..., Any], Callable[..., Any]] = {}
 
 
@@ -31,16 +31,16 @@ def _decorator(how: str) -> Callable[[F], F]:
 
 
 inlined = _decorator("inlined")
-# Called where it is seldom needed: inlined functions take longest to compile.
+# For functions that are called seldom, since inlined functions take longest to compile.
 called = _decorator("called")
-# Called from Python; its machine code is kept on disk.
+# For functions called from Python; their machine code is stored on disk.
 compiled = _decorator("compiled")
 
 floor, whole, root, angle = np.floor, np.rint, np.sqrt, math.atan2
 
 
 def load(array: Any, index: int) -> Any:
-    """Return the number or the lanes at an index."""
+    """Return an entry of an array: one number, or one number per lane."""
     return array[index]
 
 
@@ -50,7 +50,7 @@ def store(array: Any, index: int, value: Any) -> None:
 
 
 def splat(array: Any, value: float) -> Any:
-    """Return a number as an array holds them, alone or in all lanes."""
+    """Convert a number to the entry type of an array: one number, or the number in all lanes."""
     return value
 
 
@@ -65,7 +65,7 @@ def poke(array: Any, index: int, lane: int, value: float) -> None:
 
 
 def chosen(left: Any, right: Any, less: Any, other: Any) -> Any:
-    """Return `less` where left < right, and `other` elsewhere and where one is NaN."""
+    """Return `less` if left < right, else `other`, lane by lane; a comparison with NaN is false."""
     return less if left < right else other
 
 
@@ -76,7 +76,7 @@ def below(value: Any, bound: Any) -> Any:
 
 @inlined
 def width(array: Any) -> Any:
-    """Return how many lanes an array has; none where it is empty."""
+    """Return the number of lanes of an array, 0 if the array is empty."""
     return array.size // max(len(array), 1)
 
 
@@ -85,13 +85,13 @@ def row_product(a: Any, first: int, b: Any, second: int, count: int) -> Any:
     return a[first : first + count].dot(b[second : second + count])
 
 
-def add_row(a: Any, first: int, share: float, b: Any, second: int, count: int) -> None:
-    """Add `share` times `count` entries of an array of numbers to entries of another."""
-    a[first : first + count] += share * b[second : second + count]
+def add_row(a: Any, first: int, factor: float, b: Any, second: int, count: int) -> None:
+    """Add `factor` times `count` entries of b, from `second` on, to entries of a."""
+    a[first : first + count] += factor * b[second : second + count]
 
 
 def row_products(a: Any, size: int, b: Any, out: Any) -> None:
-    """Write the scalar product of each `size` entries of an array with the first of another."""
+    """Write the scalar product of each row of `size` entries of a with the first entries of b."""
     np.dot(a.reshape(len(out), size), b[:size], out)
 
 
@@ -100,15 +100,15 @@ def remove_components(Q: Any, size: int, count: int, x: Any, found: Any, first: 
     basis = Q[: count * size].reshape(count, size)
     components = basis.dot(x)
     x -= components.dot(basis)
-    # Once more: the first time leaves a share of what it removes to rounding.
+    # Orthogonalise twice: after the first pass, rounding errors leave part of the components.
     rest = basis.dot(x)
     x -= rest.dot(basis)
     np.add(components, rest, found[first : first + count])
 
 
-def write_scaled(source: Any, lane: int, share: float, target: Any) -> None:
-    """Write `share` times the first entries of a lane of an array into an array of numbers."""
-    target[:] = share * source[: len(target)]
+def write_scaled(source: Any, lane: int, factor: float, target: Any) -> None:
+    """Write `factor` times the first entries of one lane of `source` into `target`."""
+    target[:] = factor * source[: len(target)]
 
 
 @called
@@ -133,7 +133,7 @@ def _row_products(a: Any, size: int, b: Any, out: Any) -> None:
 
 @called
 def _remove_components(Q: Any, size: int, count: int, x: Any, found: Any, first: int) -> None:
-    # One after the other: as exact as Householder's factor, if x is its last column.
+    # Modified Gram-Schmidt. With x as the last column it is as accurate as Householder's method.
     for index in range(count):
         share = _row_product(Q, index * size, x, 0, size)
         _add_row(x, 0, -share, Q, index * size, size)

@@ -30,26 +30,30 @@ from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
 
 
 class Method(namedtuple("Method", "h origin shift speed nodes weights moments")):
-    """Steps of h [s], s stages each, by what its displacements and velocities are made of.
+    """Integration method: steps of h [s] with s stages.
 
-    Row by row: shares of v and the stages' accelerations in the displacement after each stage, and
-    the second one after the last (`shift`), and in the velocity there (`speed`). A displacement
-    begins at the configuration of the first stage, or of the second stage if `origin` is 1. `nodes`
-    [s] are the stages' times, `weights` and `moments` their shares in sums along, with h and h^2.
+    - `shift`: rows with the weights of v and of the stages' accelerations in the displacement after
+      each stage. The last row is a second displacement after the last stage.
+    - `speed`: rows with the same weights for the velocity after each stage.
+    - `origin`: 0 if a displacement starts at the configuration of the first stage, 1 if it starts
+      at the second stage.
+    - `nodes` [s]: times of the stages.
+    - `weights`, `moments`: weights of the stages in an integral and in a double integral over the
+      step, including h and h^2.
     """
 
 
 class StopConditions(namedtuple("StopConditions", "squares sign")):
     """Stop condition: squared rate bounds (6 + n,), and the sign (1,) of q0 in the chart.
 
-    The sign is 0 if there is no chart. The engine in Python has the rates in the order of v (nv,).
+    The sign is 0 if there is no chart. In the Python engine, rates are in the order of v (nv,).
     """
 
 
 class Stages(namedtuple("Stages", "rates along first second u")):
-    """Work space: v and the accelerations of the stages, displacements, and two stages' q.
+    """Work space: v and the accelerations of the stages, a displacement, and q at two stages.
 
-    `u` (nu,) is what acted as the last step began.
+    `u` (nu,) are the inputs at the beginning of the last step.
     """
 
 
@@ -90,7 +94,7 @@ def _combine(shares, row, rates, out):
 
 @inlined
 def _record(rows, row, point, reference, t):
-    """Write a row: q, nu, u, and momentum and centre of mass as they are to be."""
+    """Write a row: q, nu, u, and the reference of momentum and centre of mass."""
     at = row * (len(point.q) + len(point.nu) + len(point.u) + 9)
     for values in (point.q, point.nu, point.u):
         vec.copy(values, 0, rows, at, len(values))
@@ -102,7 +106,7 @@ def _record(rows, row, point, reference, t):
 
 @inlined
 def goes_on(stop, origin, q, rates):
-    """Whether all rates are finite and within bounds, and the base is in the chart of an origin."""
+    """Return whether all rates are within finite bounds and the base is within the chart."""
     vector, scalar = vec.get3(origin, 3), load(origin, 6)
     scalar = scalar * load(q, 6) - vec.dot(vector, vec.get3(q, 3))
     good = below(-(load(stop.sign, 0) * scalar), 1e-300)
@@ -114,7 +118,7 @@ def goes_on(stop, origin, q, rates):
 
 @inlined
 def _act(work, channel, law, robot, point, step, stage, t):
-    """Write the inputs at a stage, as they are commanded and in base axes."""
+    """Write the commanded inputs at a stage, and the acting inputs in base axes."""
     if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
         if is_asked(channel, step):
             command(work, robot, law, point, t, step // max(channel.sample, 1), stage)
@@ -126,7 +130,7 @@ def _act(work, channel, law, robot, point, step, stage, t):
 
 @inlined
 def _move(robot, method, stages, point, stage):
-    """Go from a stage, whose acceleration is there, to the next one, or to the end of the step."""
+    """Move the point from a stage with known acceleration to the next, or to the step's end."""
     rates, along = stages.rates, stages.along
     if stage == 1:
         vec.copy(point.q, 0, stages.second, 0, len(point.q))
@@ -141,13 +145,13 @@ def _move(robot, method, stages, point, stage):
 
 @compiled
 def advance(words, clock, last, every, rows, work):
-    """Advance eight runs up to a step, or to a step that meets a stop condition.
+    """Advance eight runs to the step `last`, or until a stop condition is met.
 
-    `words` are of `Arguments`. The point, the momentum reference and the memory of policy and
-    channel are updated; clock (1,) is the number of steps done of `last`. At the first step the
-    momentum and the centre of mass of the start are written into the momentum reference. Every
-    `every` steps, if that is not 0, a row gets q, nu, u, and the momentum (6,) and centre of mass
-    (3,) of the reference. `work` has `Layout.size` entries.
+    `words` represent `Arguments`. The point, the momentum reference, and the memory of policy and
+    channel are updated. clock (1,) is the number of finished steps. At the first step, the initial
+    momentum and centre of mass are written into the momentum reference. If `every` is not 0, each
+    `every` steps a row is written: q, nu, u, and the reference of momentum (6,) and centre of mass
+    (3,). `work` has `Layout.size` entries.
     """
     of = _opened(words)
     robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
@@ -189,20 +193,23 @@ class RunStatistics(
     namedtuple(
         "RunStatistics",
         "robot law path x_ref q_ref nu_ref kind settled tolerance steps at "
-        "sizes largest_x largest_u largest outside errors inputs",
+        "sizes largest_x largest_u largest outside errors inputs states",
     )
 ):
-    """Reference of the errors of eight runs, and their statistics so far.
+    """Statistics of the errors of eight runs, and the reference of these errors.
 
-    The `law` reads states. Errors are from the state `x_ref` (nx,), whose attitude the point of
-    `path` has, or from the rows `q_ref` and `nu_ref` of a moving reference. `kind` (nx,) is 0 for a
-    state without a kind, and -1 for a state whose error is not kept. An error has settled if it is
-    below the fraction `settled` of its largest value, or below `tolerance` (kinds,). At `steps`
-    (times,) errors and inputs are kept. `at` is work space. The fields after it are in lanes.
+    - `law` computes states.
+    - Errors are relative to the state `x_ref` (nx,), whose attitude is in the point of `path`. With
+      a moving reference, they are relative to the rows `q_ref` and `nu_ref`.
+    - `kind` (nx,) is the kind of each state: 0 without a kind, -1 if its error is not recorded.
+    - An error has settled when it stays below the fraction `settled` of its largest value, or below
+      `tolerance` (kinds,).
+    - At the `steps` (times,), the errors of kinds and states, and the inputs, are recorded.
+    - `at` is work space. The fields after `at` are laned.
     """
 
 
-_IN_LANES = "sizes largest_x largest_u largest outside errors inputs"
+_IN_LANES = "sizes largest_x largest_u largest outside errors inputs states"
 RUN_STATISTICS = Struct(
     RunStatistics,
     robot=MECHANICS,
@@ -223,13 +230,13 @@ def _size(value):
 
 @inlined
 def _grow(stats, index, value):
-    """Write the larger of an entry and a number."""
+    """Replace an entry by a number if the number is larger."""
     store(stats, index, chosen(load(stats, index), value, value, load(stats, index)))
 
 
 @inlined
 def _compare(stats, step):
-    """Write the errors at a step, and the size of each kind."""
+    """Write the errors at a step, and the largest magnitude of each kind."""
     at, there, sizes, e = stats.at, stats.path.point, stats.sizes, stats.path.e
     if len(stats.q_ref) > 0:
         vec.copy(stats.q_ref, step * len(there.q), there.q, 0, len(there.q))
@@ -255,13 +262,13 @@ def _compare(stats, step):
 
 @compiled
 def take(words, rows, first, count):
-    """Update the statistics with `count` rows of `advance`, the first one of step `first`.
+    """Update the statistics with `count` rows of `advance`; the first row is the step `first`.
 
-    `words` are of `RunStatistics`.
+    `words` represent `RunStatistics`.
     """
     stats = _opened_statistics(words)
     at, sizes, kept = stats.at, stats.sizes, 0
-    width, inputs = len(at.q) + len(at.nu), len(stats.largest_u)
+    width, inputs, e = len(at.q) + len(at.nu), len(stats.largest_u), stats.path.e
     while kept < len(stats.steps) and stats.steps[kept] < first:
         kept += 1
     for row in range(count):
@@ -281,6 +288,7 @@ def take(words, rows, first, count):
         if kept < len(stats.steps) and stats.steps[kept] == step:
             vec.copy(sizes, 0, stats.errors, kept * len(sizes), len(sizes))
             vec.copy(rows, begin + width, stats.inputs, kept * inputs, inputs)
+            vec.copy(e, 0, stats.states, kept * len(e), len(e))
             kept += 1
     if count > 0:
         read_state(stats.robot, stats.law, at, 0)

@@ -1,9 +1,9 @@
 """Compilation of the kernel's functions by numba, with the functions that they call.
 
-`translated` makes a numba function of a function of the kernel. numba optimises each function and
-makes machine code of it, with all that it calls, before the function that calls it: what is ten
-calls deep is compiled ten times. Here a part, called by other compiled functions alone, is kept as
-LLVM has it, and compiled once with the function that is called from Python.
+`translated` converts a function of the kernel to a numba function. By default, numba generates
+machine code for each function together with all functions that it calls. A function ten calls deep
+would be compiled ten times. Here a part (a function called only by compiled functions) remains LLVM
+code. It is compiled once, with the function that is called from Python.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _WORD, _DOUBLE = ir.IntType(64), ir.DoubleType()
 
 
 class _NoEnvironments:
-    """A code generator; functions without machine code have no environment to be written."""
+    """Code generator that sets no environments, because parts have no machine code."""
 
     def __init__(self, codegen: Any) -> None:
         self._codegen = codegen
@@ -44,11 +44,11 @@ class _NoEnvironments:
         return getattr(self._codegen, name)
 
     def set_env(self, *_: Any) -> None:
-        """Write nothing."""
+        """Ignore the environment."""
 
 
 class PartLibrary(CPUCodeLibrary):
-    """Source code of a part, and the other parts that it calls."""
+    """LLVM code of a part, and the other parts that it calls."""
 
     def __init__(self, codegen: Any, name: str) -> None:
         super().__init__(codegen, name)
@@ -60,17 +60,17 @@ class PartLibrary(CPUCodeLibrary):
         return _NoEnvironments(self._codegen)
 
     def finalize(self) -> None:
-        """Take no more code; optimise none."""
+        """Close the library without optimising its code."""
         self._raise_if_finalized()
         self._finalized = True
 
     def add_linking_library(self, library: Any) -> None:
-        """Note that a function of another library is called."""
+        """Record a library whose functions are called."""
         super().add_linking_library(library)
         self._reload_init.update(library._reload_init)
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Return 0: there is no machine code."""
+        """Return 0, because a part has no machine code."""
         self._ensure_finalized()
         return 0
 
@@ -82,11 +82,11 @@ class PartLibrary(CPUCodeLibrary):
                     library._called(found)
 
     def _own_module(self) -> Any:
-        """Return the source code without the code of called functions."""
+        """Return the LLVM code without the code of called functions."""
         return super()._get_module_for_linking()
 
     def _get_module_for_linking(self) -> Any:
-        """Return the code with that of all parts it calls, each once."""
+        """Return the LLVM code with one copy of each called part."""
         if self._whole is None:
             found: dict[Any, None] = {self: None}
             self._called(found)
@@ -99,7 +99,7 @@ class PartLibrary(CPUCodeLibrary):
 
 
 class PartCompiler(Compiler):
-    """The pipeline of a part."""
+    """numba's compiler pipeline for a part."""
 
     def __init__(self, typingctx: Any, targetctx: Any, library: Any, *rest: Any) -> None:
         super().__init__(typingctx, targetctx, library, *rest)
@@ -147,7 +147,7 @@ def _field(context: Any, builder: Any, kind: Any, words: Any, name: str) -> Any:
 
     def word(place: int) -> Any:
         value = builder.load(at(place))
-        # No store of a double makes it another, so it need not be read again.
+        # The words are constant during a call, so LLVM may reuse a value that it has read.
         value.set_metadata("invariant.load", builder.module.add_metadata([]))
         return value
 
@@ -173,7 +173,7 @@ def _field(context: Any, builder: Any, kind: Any, words: Any, name: str) -> Any:
 
 
 def opener(kind: Struct) -> Any:
-    """Return the numba function that takes an array of words for a struct."""
+    """Return the numba function that interprets an array of words as a struct."""
 
     @intrinsic
     def opened(typing: Any, words: Any) -> Any:
@@ -185,9 +185,9 @@ def opener(kind: Struct) -> Any:
     return opened
 
 
-# A product and a sum may become one fused instruction, which rounds once; a quotient by zero is
-# infinite; and no references to arrays are counted, which takes three quarters of the time else,
-# and makes no function able to allocate.
+# A product and a sum may become one fused instruction, which rounds once. A division by zero gives
+# infinity. Array references are not counted, which would take three quarters of the time. So
+# kernel functions cannot allocate arrays.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
 _PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
@@ -200,7 +200,7 @@ _DECORATORS = {
 
 @cache
 def translated(function: Any) -> Any:
-    """Return the numba function of a function of the kernel, which calls numba functions alone."""
+    """Convert a function of the kernel, and the functions that it calls, to numba functions."""
     names = {"__name__": function.__module__, **function.__globals__}
     for name in function.__code__.co_names:
         if name in names:
@@ -212,7 +212,7 @@ def translated(function: Any) -> Any:
 
 
 def _counterpart(value: Any) -> Any:
-    """Return what stands in compiled code for a global value of the kernel's modules."""
+    """Return the replacement of a global value of the kernel's modules in compiled code."""
     if isinstance(value, Opener):
         return opener(value.kind)
     if isinstance(value, ModuleType) and value.__name__.startswith("fflin.kernel."):

@@ -1,6 +1,6 @@
-"""Policies of the loop: state feedback, output feedback by a filter, trajectory feedback.
+"""Policies of the loop: state feedback, output feedback by a filter, and trajectory feedback.
 
-The trajectory and its gains are the same for all lanes.
+All lanes have the same trajectory and the same gains of trajectory feedback.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from fflin.kernel.lanes import (
 from fflin.kernel.rnea import move_bodies
 from fflin.kernel.tree import MOTION, PLACE
 
-_NEAR = 1e-9  # a time this near to a knot, relative to the interval, is the knot's
+_NEAR = 1e-9  # times within this fraction of an interval from a knot are taken as the knot
 
 
 class Path(
@@ -37,15 +37,16 @@ class Path(
         "Path", "t q u shift speed hold ahead ends held over last starts K order along e point"
     )
 ):
-    """A trajectory and its gains, piece by piece.
+    """A trajectory and its gains as piecewise polynomials.
 
-    At the knots t (N,) [s] q and u, row by row, and once more, with nu and K, where the run `ends`
-    later, which is when t > `over` [s].
-    Between knots, `shift` is a cubic (4, 6 + n) in the elapsed fraction of the interval. It gives
-    the displacement from the knot, and `speed` is the same of nu; u is linear or on `hold`, taken
-    `ahead` [s] of the time, and the three inputs from each of `held` on are in world axes. K has
-    `order` coefficients in the time since each of `starts`, and stays after `last` [s]. `along`
-    (6 + n,), the error e (nx,) and the `point` that is followed are work space.
+    - `q`, `u`: rows at the knots t (N,) [s]. If the trajectory `ends` before the run, a further row
+      of q, u, nu and K applies at times t > `over` [s].
+    - `shift`: cubics (4, 6 + n) in the elapsed fraction of each interval for the displacement from
+      the knot; `speed`: cubics for nu.
+    - u is linear between knots, or constant if `hold` is true. It is evaluated `ahead` [s] of the
+      time. The three inputs from each index in `held` on are in world axes.
+    - `K`: `order` coefficients in the time since the latest of `starts`; constant after `last` [s].
+    - `along` (6 + n,), the error `e` (nx,) and the followed `point` are work space.
     """
 
 
@@ -71,7 +72,7 @@ def _cubic(coefficients, k, s, out):
 
 @inlined
 def _latest(knots, time):
-    """Return the last knot that is not after a time; the first where all are."""
+    """Return the index of the last knot at or before a time, 0 if the time is before all knots."""
     low, high = 0, len(knots)
     while high - low > 1:
         middle = (low + high) // 2
@@ -84,7 +85,7 @@ def _latest(knots, time):
 
 @inlined
 def _placed(knots, time):
-    """Return which interval a time is in, and the share of it that is over."""
+    """Return the index of the interval that contains a time, and the elapsed fraction of it."""
     last = len(knots) - 2
     k = min(_latest(knots, time), last)
     s = (time - knots[k]) / (knots[k + 1] - knots[k])
@@ -95,7 +96,10 @@ def _placed(knots, time):
 
 @inlined
 def _follow(robot, path, t):
-    """Write the followed trajectory at a time, u in base axes; return whether it has ended."""
+    """Write the point of the trajectory at a time, with u in base axes.
+
+    Return whether the trajectory has ended.
+    """
     point, last, knots = path.point, len(path.t) - 2, path.t
     time, after = knots[0] + max(t, 0.0), path.ends and t > path.over
     k, s = _placed(knots, time)
@@ -123,7 +127,7 @@ def _follow(robot, path, t):
 
 @inlined
 def error(robot, path, point):
-    """Write the error relative to the followed trajectory, in its axes."""
+    """Write the error from the followed point, in the axes of that point."""
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
     (x, y, z), w = vec.attitude(there.q)
     vector, scalar = vec.quaternion_times(((-x, -y, -z), w), vec.attitude(q))
@@ -175,33 +179,39 @@ class Law(
 ):
     """A policy; each array of doubles may have a second axis of eight lanes.
 
-    By its kind NOTHING, LINEAR: u by a `filter` of y, or by the gains of a `grid` that has joints,
-    or TRACK: u = u* - K e along `path`. y (ny,) is what is `measured` of the state and the
-    gyroscopes after it, x, and of rows (slots, ny) what is `added` to it, sample by sample and
-    round.
-    `turned` says whether omega_b and v_b of the state stand in reference axes; row by row, sample
-    by sample and the last to the end, `origin` (7,) is the world's origin seen from where x is 0
-    and `near` (n,) which turn is taken of joints that go round. `u` is what is commanded, to be
-    shared out by `allocation` where that has any inputs.
+    - `kind`: NOTHING; LINEAR, where u comes from y by `filter`, or by the gains of `grid` if it has
+      joints; or TRACK, where u = u* - K e along `path`.
+    - `x`: the state, followed by the gyroscope outputs (`gyros`).
+    - `y` (ny,): the entries `measured` of x, plus a row of `added` (slots, ny). Each sample uses
+      the next row, and the rows repeat.
+    - `turned`: whether omega_b and v_b of the state are in reference axes.
+    - `origin` (rows, 7): placement of the world's origin relative to the pose at which x is 0.
+      `near` (rows, n): positions that decide which turn of a continuous joint is used. Both have
+      one row per sample; the last row stays valid to the end.
+    - `u`: the command, which `allocation` distributes if it has inputs.
     """
 
 
 class Grid(namedtuple("Grid", "joint first values stride K offset at")):
-    """Joints (k,) between whose `values` from `first` (k + 1,) on u = offset - K y is interpolated.
+    """Grid of feedback laws u = offset - K y, interpolated over the positions of k joints.
 
-    A step along each of them goes on by `stride` of the gains. `at` (k,) is work space.
+    The grid values of joint i are ``values[first[i]:first[i + 1]]``. From one grid value of joint i
+    to the next, the index of the gain in `K` grows by ``stride[i]``. `at` (k,) is work space.
     """
 
 
 class Gyros(namedtuple("Gyros", "body axes")):
-    """Bodies with a gyroscope (k,), and the columns (9 k,) of its axes in the body's."""
+    """Bodies (k,) with a gyroscope, and the columns (9 k,) of its axes in body axes."""
 
 
 class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
-    """Row by row as `Law.origin`: u = u0 + C z + D dy, then A z + B dy of dy = y - y0.
+    """Linear controller u = u0 + C z + D dy with dy = y - y0; rows as in `Law.origin`.
 
-    z (nz,) is the state, which has jumped before. That is the next one, with `rates` (nz,) as work
-    space; or its rate, of the stages (1 + s, nz) that stand there behind z as the step began.
+    z (nz,) is the controller state, to which `jump` is added before each evaluation.
+
+    - In discrete time, A z + B dy is the next state, and `rates` (nz,) is work space.
+    - In continuous time, A z + B dy is dz/dt. `rates` (1 + s, nz) stores z at the beginning of the
+      step, and then dz/dt at each of the s stages.
     """
 
 
@@ -224,14 +234,14 @@ LAW = Struct(
 
 @called
 def read_state(robot, law, point, row):
-    """Write the state in the chart."""
+    """Write the state of the linear model into `law.x`."""
     x, q, nu, n = law.x, point.q, point.nu, len(robot.index)
-    place, turn = vec.get3(law.origin, 7 * row), vec.get3(law.origin, 7 * row + 3)
+    position, turn = vec.get3(law.origin, 7 * row), vec.get3(law.origin, 7 * row + 3)
     turn = turn, load(law.origin, 7 * row + 6)
     vector, scalar = vec.quaternion_times(turn, (vec.get3(q, 3), load(q, 6)))
     sign = chosen(scalar, 0.0, -1.0, 1.0)
     vec.put3(x, 0, vec.times(vector, sign))
-    vec.put3(x, 3, vec.plus(place, vec.product(vec.columns_of(turn), vec.get3(q, 0))))
+    vec.put3(x, 3, vec.plus(position, vec.product(vec.columns_of(turn), vec.get3(q, 0))))
     for joint in range(n):
         value = joint_position(robot, q, joint)
         if robot.circling[joint]:
@@ -249,7 +259,7 @@ def read_state(robot, law, point, row):
 
 @inlined
 def _turn_gyros(work, robot, gyros, nu, x, first):
-    """Write the gyroscope outputs, starting at an entry."""
+    """Write the gyroscope outputs into x, starting at the index `first`."""
     move_bodies(work, robot.tree, robot.layout, nu)
     for index in range(len(gyros.body)):
         body = gyros.body[index]
@@ -260,7 +270,7 @@ def _turn_gyros(work, robot, gyros, nu, x, first):
 
 @inlined
 def _measure(work, robot, law, point, count):
-    """Write the outputs, with the noise of a sample added."""
+    """Write the outputs y of a sample, including its noise."""
     outputs = len(law.measured)
     if len(law.gyros.body) > 0:
         _turn_gyros(work, robot, law.gyros, point.nu, law.x, 2 * len(point.nu))
@@ -280,7 +290,7 @@ def _times(matrix, row, x):
 
 @inlined
 def command(work, robot, law, point, t, count, stage):
-    """Write the commands of a policy at a sample of that number or at a stage of a step."""
+    """Write the commands of a policy at sample number `count` and a stage of a step."""
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
         return
@@ -295,7 +305,7 @@ def command(work, robot, law, point, t, count, stage):
 
 @inlined
 def _feed_back_between(robot, law, point):
-    """Write the commands of gains interpolated on a grid, lane by lane."""
+    """Write the commands by interpolating the feedback laws of a grid, lane by lane."""
     grid, y, u = law.grid, law.y, law.u
     inputs, size = len(u), len(y)
     for axis in range(len(grid.joint)):
@@ -304,19 +314,19 @@ def _feed_back_between(robot, law, point):
         store(u, index, 0.0)
     for lane in range(width(u)):
         for corner in range(1 << len(grid.joint)):
-            share, cell = _corner(grid, corner, lane)
-            for row in range(inputs if share > 0.0 else 0):
+            weight, cell = _corner(grid, corner, lane)
+            for row in range(inputs if weight > 0.0 else 0):
                 at = cell * inputs + row
                 total = peek(grid.offset, at, lane)
                 for column in range(size):
                     total -= peek(grid.K, at * size + column, lane) * peek(y, column, lane)
-                poke(u, row, lane, peek(u, row, lane) + share * total)
+                poke(u, row, lane, peek(u, row, lane) + weight * total)
 
 
 @inlined
 def _corner(grid, corner, lane):
-    """Return the share of a corner of the cell that a lane is in, and which gain is there."""
-    share, cell = 1.0, 0
+    """Return the interpolation weight of a corner of a lane's grid cell, and its gain's index."""
+    weight, cell = 1.0, 0
     for axis in range(len(grid.joint)):
         first, last = grid.first[axis], grid.first[axis + 1] - 1
         value = min(max(peek(grid.at, axis, lane), grid.values[first]), grid.values[last])
@@ -325,9 +335,9 @@ def _corner(grid, corner, lane):
             k += 1
         over = (value - grid.values[k]) / (grid.values[k + 1] - grid.values[k])
         beyond = corner >> axis & 1
-        share *= over if beyond else 1.0 - over
+        weight *= over if beyond else 1.0 - over
         cell += (k - first + beyond) * grid.stride[axis]
-    return share, cell
+    return weight, cell
 
 
 @called

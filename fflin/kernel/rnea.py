@@ -1,6 +1,6 @@
 """Velocities, accelerations and forces of all bodies: RNEA in base axes.
 
-All vectors stand in base axes and all moments are about the joints, as in `kernel.inertia`.
+All vectors are in base axes, and all moments are about the joints, as in `kernel.inertia`.
 
 References
 ----------
@@ -14,11 +14,11 @@ from fflin.kernel.inertia import spatial_inertia_times
 from fflin.kernel.lanes import inlined, load, splat, store
 from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
 
-# Where the motion vectors of every body begin: velocity, Psi', acceleration without c, that of c
-# alone, and Psi''.
+# Offsets of the motion vectors of each body: velocity, Psi', acceleration without c, acceleration
+# by c alone, and Psi''.
 VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
-# Where these begin, of all that its joint carries: momentum p, columns of G, stored momentum h,
-# moment and force without c, and those of c on what is carried.
+# Offsets of the quantities of each joint's subtree: momentum p, columns of G, stored momentum h,
+# moment and force without c, and moment and force by c alone.
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
 
 _NONE = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -26,7 +26,7 @@ _NONE = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
 @inlined
 def joint_axis(work, tree, body):
-    """Return the spatial axis of a joint, angular and linear, for a unit of its coordinate."""
+    """Return the spatial axis of a joint, angular and linear, per unit of its coordinate."""
     z = vec.get3(work, tree.places + (body * PLACE + 6))
     share = tree.factor[body]
     return vec.times(z, share * tree.turns[body]), vec.times(z, share * tree.slides[body])
@@ -34,27 +34,27 @@ def joint_axis(work, tree, body):
 
 @inlined
 def motion_cross(velocity, along):
-    """Return the rate of a motion vector `along` that is carried by a velocity."""
+    """Return velocity x along, the rate of a motion vector that is fixed in a moving body."""
     w, v = velocity
     return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
 
 
 @inlined
 def at_joint(work, at, place):
-    """Return a motion vector of the carrier at a joint's own origin."""
+    """Shift the parent's motion vector at `at` to the origin of a joint."""
     w, v = vec.get6(work, at)
     return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))
 
 
 @inlined
 def at_parent(work, place, force):
-    """Return a force at a joint's origin as one at its parent's."""
+    """Shift a spatial force from a joint's origin to the origin of its parent."""
     return vec.plus(force[0], vec.cross(vec.get3(work, place + 9), force[1])), force[1]
 
 
 @inlined
 def move_bodies(work, tree, layout, nu):
-    """Write the velocities, and the accelerations without c, outwards; the base does not slide."""
+    """Write velocities, and accelerations without c, outwards; v_b is taken as zero."""
     for entry in range(MOTION):
         store(work, layout.motion + entry, 0.0)
     vec.put3(work, layout.motion, vec.get3(nu, 0))
@@ -74,7 +74,7 @@ def move_bodies(work, tree, layout, nu):
 
 @inlined
 def load_bodies(work, tree, layout, loads):
-    """Write the forces on the bodies, each alone, with its stored momentum."""
+    """Write the inertial force of each single body, including its gyroscopic torque."""
     for body in range(len(tree.parent)):
         at = layout.load + body * LOAD + FORCE
         moving = layout.motion + body * MOTION
@@ -94,7 +94,7 @@ def load_bodies(work, tree, layout, loads):
 
 @inlined
 def load_carried(work, tree, layout, loads, u):
-    """Add the forces of the carried inputs to those on the bodies."""
+    """Subtract the body-fixed wrenches of inputs from the forces of the bodies."""
     for index in range(len(loads.body)):
         pushed = vec.minus6(_NONE, carried_wrench(work, tree, loads, index))
         at = layout.load + loads.body[index] * LOAD + FORCE
@@ -103,7 +103,7 @@ def load_carried(work, tree, layout, loads, u):
 
 @inlined
 def load_momenta(work, tree, layout, loads):
-    """Write the momenta of the single bodies, without velocity-product terms."""
+    """Write the momentum, the moments G and the stored momentum of each single body."""
     zero = splat(work, 0.0)
     for body in range(len(tree.parent)):
         at = layout.load + body * LOAD
@@ -111,7 +111,7 @@ def load_momenta(work, tree, layout, loads):
         w, v = vec.get6(work, layout.motion + body * MOTION + VELOCITY)
         h = vec.get3(work, own + 1)
         vec.put3(work, at + MOMENTUM, spatial_inertia_times(work, own, (w, v))[1])
-        # The second moments of mass are half the trace of I, less I.
+        # The second moments of mass are tr(I) / 2 times the identity, minus I.
         xx, xy, xz = vec.get3(work, own + 4)
         yy, yz, zz = vec.get3(work, own + 7)
         trace = 0.5 * (xx + yy + zz)
@@ -130,14 +130,14 @@ def load_momenta(work, tree, layout, loads):
 
 @inlined
 def stored_momentum(work, tree, loads, index):
-    """Return momentum that a body stores."""
+    """Return a stored momentum in base axes."""
     axes = vec.get_columns(work, tree.places + loads.stored_body[index] * PLACE)
     return vec.product(axes, vec.get3(loads.stored, 3 * index))
 
 
 @inlined
 def carried_wrench(work, tree, loads, index):
-    """Return the wrench of a unit of a carried input at its body's joint."""
+    """Return the wrench per unit of a body-fixed input, at the joint of its body."""
     axes = vec.get_columns(work, tree.places + loads.body[index] * PLACE)
     moment, force = vec.get6(loads.wrench, 6 * index)
     return vec.product(axes, moment), vec.product(axes, force)
@@ -145,7 +145,7 @@ def carried_wrench(work, tree, loads, index):
 
 @inlined
 def write_columns(work, tree, layout, loads):
-    """Write the generalised force of a unit of each carried input."""
+    """Write the generalised force per unit of each body-fixed input."""
     count = len(loads.body)
     for entry in range(len(tree.row) * count):
         store(work, layout.columns + entry, 0.0)
@@ -164,7 +164,7 @@ def write_columns(work, tree, layout, loads):
 
 @inlined
 def collect(work, tree, layout):
-    """Add the forces of what is carried, inwards, and write the bias forces."""
+    """Sum the forces of the bodies over subtrees, inwards, and write the bias forces."""
     for index in range(len(tree.row)):
         store(work, layout.bias + index, 0.0)
     for body in range(len(tree.parent) - 1, 0, -1):
@@ -178,7 +178,7 @@ def collect(work, tree, layout):
 
 @inlined
 def collect_momenta(work, tree, layout):
-    """Add the momenta of what is carried, inwards."""
+    """Sum the momenta of the bodies over subtrees, inwards."""
     for body in range(len(tree.parent) - 1, 0, -1):
         at = layout.load + body * LOAD
         above = layout.load + tree.parent[body] * LOAD
@@ -194,7 +194,7 @@ def collect_momenta(work, tree, layout):
 
 @inlined
 def accelerate_bodies(work, tree, layout):
-    """Complete the accelerations with c: write Psi'' outwards, and the forces of c inwards."""
+    """Add the contributions of c: accelerations and Psi'' outwards, then forces inwards."""
     vec.put6(work, layout.motion + ADDED, vec.get6(work, layout.c))
     for body in range(1, len(tree.parent)):
         at = layout.motion + body * MOTION

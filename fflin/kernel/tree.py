@@ -1,4 +1,4 @@
-"""A robot's tree as the arrays that the kernel reads."""
+"""The kinematic tree of a robot as arrays for the kernel."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from fflin.dynamics.actuation import Actuation
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-LANES = 8  # configurations that the kernel does at once
+LANES = 8  # number of points that the kernel evaluates at once
 
 # Rows of Pinocchio's spatial vectors, whose linear part comes first.
 PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 
-# How many numbers are a body's place (x, y and z axes, and its origin from its parent's) and its
-# inertia (m, m c, I as xx xy xz yy yz zz).
+# Numbers of entries of a body's pose (x, y and z axes, and the origin relative to the parent's
+# origin) and of its inertia (m, m c, I as xx xy xz yy yz zz).
 PLACE, INERTIA = 12, 10
-# The same of its motion and of what its joint carries, see `kernel.rnea`.
+# Numbers of entries of a body's motion and of its subtree's loads; see `kernel.rnea`.
 MOTION, LOAD = 30, 27
 
 
@@ -34,21 +34,29 @@ class Tree(
         "diagonal square size",
     )
 ):
-    """Bodies in Pinocchio's order, 0 the base; coordinates in state order, 0 to 5 the base's.
+    """Kinematic tree. Body 0 is the base; the coordinates 0 to 5 are the base's.
 
-    Of each body what carries it (`parent`); its joint's rotation columns and origin there, z along
-    the axis (`fixed`, 12 each); its joint's entry of q, an angle, a length or a cosine (`index`,
-    `unbounded`); turn and shift along z for a unit of the joint's coordinate (`turns`, `slides`);
-    mass, m c and inertia about the joint's origin, xx xy xz yy yz zz (`bodies`, 10 each, with a
-    second axis of 8 where lanes differ); the rotation of these axes in Pinocchio's (`axes`); and
-    what coordinate moves it, by how much (`coordinate`, `factor`). `armature` is what rotors add to
-    the diagonal of M.
+    Bodies are in Pinocchio's order, coordinates in state order. Fields of each body:
 
-    Of the packed M where a row begins, and how many coordinates are before its own (`row`,
-    `depth`); the coordinate of each entry (`path`); how many of them two rows have in `common`; and
-    for every body, and every one from it inwards, the entry that it adds to and how often
-    (`target`, `share`), last the first of the base's six. Then the number of entries, and where
-    the parts of the work space begin; its size.
+    - `parent`: its parent body.
+    - `fixed` (12): rotation columns and origin of its joint in the parent, with z along the axis.
+    - `index`, `unbounded`: its joint's entry of q, and whether the entry is the cosine of an angle.
+    - `turns`, `slides`: rotation about z and translation along z per unit of the joint coordinate.
+    - `bodies` (10): m, m c, and inertia about the joint's origin as xx xy xz yy yz zz. It has a
+      second axis of 8 if lanes differ.
+    - `axes`: rotation from these axes to Pinocchio's joint axes.
+    - `coordinate`, `factor`: the coordinate that moves the joint, and the joint's motion per unit.
+
+    `armature` is the inertia of rotors on the diagonal of M. Fields of the packed M:
+
+    - `row`, `depth`: offset of each row, and the number of its entries before the diagonal.
+    - `path`: the coordinate of each entry.
+    - `common`: the number of coordinates that two rows have in common.
+    - `target`, `share`: for each pair of a body and a body on its path inwards, the entry to which
+      the pair contributes, and its factor; after these, the first of the base's six entries.
+
+    `entries` is the number of entries of the packed M. The following fields are offsets of the
+    parts of the work space, and `size` is the size of the work space.
     """
 
 
@@ -57,15 +65,15 @@ class Layout(namedtuple("Layout", "motion load bias c columns lower held size"))
 
 
 class Loads(namedtuple("Loads", "body wrench input stored_body stored stiffness damping")):
-    """Body, unit wrench at its joint and number of carried inputs; stored momenta; springs."""
+    """Body-fixed inputs (body, unit wrench at its joint, index), stored momenta, and springs."""
 
 
-# By robot, as long as it is alive; robots do not change.
+# Trees of the robots that exist; robots do not change.
 _TREES: WeakKeyDictionary[Robot, Tree | None] = WeakKeyDictionary()
 
 
 def batch_tree(robot: Robot) -> Tree | None:
-    """Return a robot's tree, or None where a joint is no screw about a fixed axis, or in orbit."""
+    """Return a robot's tree; None in orbit, or if a joint is no screw about a fixed axis."""
     if robot not in _TREES:
         _TREES[robot] = _tree(robot)
     return _TREES[robot]
@@ -107,7 +115,7 @@ def _tree(robot: Robot) -> Tree | None:
         target.append(row[coordinate[body]])
         share.append(factor[body])
     size = 6 + robot.n
-    # Coordinates that the paths of any two have in common.
+    # Number of coordinates that the paths of each two coordinates have in common.
     common = np.array([[len({*one} & {*other}) for other in paths] for one in paths])
     entries = int(sum(map(len, paths)))
     parts = bodies * PLACE, bodies * INERTIA, bodies * INERTIA
@@ -136,7 +144,7 @@ def _tree(robot: Robot) -> Tree | None:
 
 
 def _screw(model: pin.Model, joint: Any) -> tuple[pin.SE3, float, float] | None:
-    """Return the frame with z along a joint's axis, and rotation and translation per unit."""
+    """Return the frame with z along a joint's axis, and its rotation and translation per unit."""
     data = joint.createData()
     q, v = pin.neutral(model), np.zeros(model.nv)
     joint.calc(data, q)
@@ -149,7 +157,7 @@ def _screw(model: pin.Model, joint: Any) -> tuple[pin.SE3, float, float] | None:
     turn = float(np.linalg.norm(angular))
     axis = angular / turn if turn else linear / np.linalg.norm(linear)
     slide = float(linear @ axis)
-    # Pinocchio has no joint whose axis misses its frame's origin.
+    # In Pinocchio, the axis of every screw joint passes through the origin of the joint's frame.
     if np.abs(linear - slide * axis).max() > 1e-12:
         return None
     rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
@@ -157,7 +165,7 @@ def _screw(model: pin.Model, joint: Any) -> tuple[pin.SE3, float, float] | None:
 
 
 def _coordinates(robot: Robot) -> tuple[list[int], list[float]]:
-    """Return the coordinate that moves each body, and how far it moves it for a unit."""
+    """Return the coordinate that moves each body's joint, and the joint's motion per unit."""
     at = {joint.idx_v: (6 + index, joint.scale) for index, joint in enumerate(robot.joints)}
     for joint, leader, multiplier, _ in robot.followers:
         at[joint.idx_v] = (at[leader.idx_v][0], multiplier)
@@ -177,9 +185,9 @@ def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> A
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
-    """Return, for every coordinate, those that its row of the factor reaches, and itself."""
-    # Where joints mimic others the coordinates inwards of what one moves need not be on one path;
-    # the factor fills them up to one: the elimination tree of Liu.
+    """Return the columns of each row of the factor, ending with its diagonal."""
+    # With mimic joints, the coordinates inwards of the bodies that one coordinate moves need not
+    # be on one path. Fill-in of the factor joins them to one path: Liu's elimination tree.
     reached: list[set[int]] = [set(range(index)) if index < 6 else set() for index in range(size)]
     for body in range(1, len(parent)):
         above = body
@@ -194,22 +202,22 @@ def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
         if reached[index]:
             nearest = max(reached[index])
             reached[nearest] |= reached[index] - {nearest}
-    # What the inverse of the factor has of a coordinate reaches all the way inwards.
+    # A row of the inverse factor has entries along the whole path inwards.
     for index in range(size):
         paths[index] = [*(paths[max(reached[index])] if reached[index] else ()), index]
     return paths
 
 
 def work_space(size: int) -> Array:
-    """Return an array (size, LANES) with nothing in it yet."""
+    """Return an uninitialised array (size, LANES)."""
     space = np.empty((size + 1) * LANES)
-    # The kernel's vectors are 64 bytes; where they begin at such an address it is faster.
+    # The kernel's vectors have 64 bytes. Access is faster if they are aligned to 64 bytes.
     first = -(space.ctypes.data // 8) % LANES
     return space[first : first + size * LANES].reshape(size, LANES)
 
 
 def loads_of(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
-    """Return what acts on a robot."""
+    """Return the loads of a robot: body-fixed inputs, stored momenta and springs."""
     body: list[int] = []
     inputs: list[int] = []
     wrenches: list[Array] = []
@@ -234,7 +242,7 @@ def loads_of(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
 
 
 def layout_of(tree: Tree, carried: int) -> Layout:
-    """Return the work space for a tree with so many inputs that are carried."""
+    """Return the layout of the work space for a tree and a number of body-fixed inputs."""
     size, bodies = len(tree.row), len(tree.parent)
     bodily = bodies * MOTION, bodies * LOAD
     sizes = *bodily, size, size, size * carried, size * 2 * size, size * 6

@@ -1,4 +1,4 @@
-"""Vectors of three, spatial vectors, attitudes and displacements, each entry a number or lanes.
+"""Vectors (3), spatial vectors, attitudes and displacements, whose entries are numbers or lanes.
 
 A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force). A
 displacement has the order of the state: the base's rotation and translation in base axes, then the
@@ -13,7 +13,7 @@ import numpy as np
 
 from fflin.kernel.lanes import floor, inlined, load, store
 
-_TERMS = 10  # exact to rounding up to half a turn, and the turn of a step is less than a radian
+_TERMS = 10  # exact to machine precision up to half a turn; a step rotates by less than a radian
 
 
 @inlined
@@ -121,7 +121,7 @@ def across(columns, a):
 
 @inlined
 def dot6(s, t):
-    """Return the power of a force along a motion, or the other way round."""
+    """Return the scalar product of a motion vector and a force vector, in either order."""
     return dot(s[0], t[0]) + dot(s[1], t[1])
 
 
@@ -145,9 +145,10 @@ def times6(s, value):
 
 @inlined
 def cosine_and_sine(x):
-    """Return both of |x| < 1e6: taken to one octant in three steps, and there by polynomials.
+    """Return the cosine and sine of |x| < 1e6, accurate to one unit in the last place.
 
-    The numbers are those of fdlibm (Sun Microsystems, 1993), exact to a unit in the last place.
+    x is reduced to an octant in three steps, in which polynomials are evaluated. All coefficients
+    are from fdlibm (Sun Microsystems, 1993).
     """
     turns = floor(x * (2.0 / np.pi) + 0.5)
     x = x - turns * 1.57079632673412561417e00
@@ -166,7 +167,7 @@ def cosine_and_sine(x):
     p = -1.38888888888741095749e-03 + z * p
     p = 4.16666666666666019037e-02 + z * p
     cosine = (1.0 - 0.5 * z) + z * z * p
-    # Add the quarter turns again, whose cosine and sine are (1, 0), (0, 1), (-1, 0) or (0, -1).
+    # Rotate by the removed quarter turns: (cosine, sine) = (1, 0), (0, 1), (-1, 0) or (0, -1).
     half = floor(turns * 0.5)
     odd = turns - half - half
     sign = 1.0 - 2.0 * (half - 2.0 * floor(half * 0.5))
@@ -194,7 +195,7 @@ _cosine, _sine, _sixth = _series(0), _series(1), _series(3)
 
 @inlined
 def quaternion_times(a, b):
-    """Return the product of quaternions (x, y, z, w) that are pairs of a vector and a scalar."""
+    """Return the product of quaternions, each given as ((x, y, z), w)."""
     v, w = a
     other, scalar = b
     vector = plus(cross(v, other), plus(times(v, scalar), times(other, w)))
@@ -203,7 +204,7 @@ def quaternion_times(a, b):
 
 @inlined
 def columns_of(quaternion):
-    """Return the columns of a unit quaternion's rotation."""
+    """Return the columns of a unit quaternion's rotation matrix."""
     (x, y, z), w = quaternion
     xx, yy, zz = 2.0 * x * x, 2.0 * y * y, 2.0 * z * z
     xy, xz, yz = 2.0 * x * y, 2.0 * x * z, 2.0 * y * z
@@ -217,7 +218,7 @@ def columns_of(quaternion):
 
 @inlined
 def attitude(q):
-    """Return the base's quaternion in a configuration."""
+    """Return the base's quaternion at a configuration."""
     return get3(q, 3), load(q, 6)
 
 
@@ -229,7 +230,7 @@ def axes_of(q):
 
 @inlined
 def displace(tree, q, along, out):
-    """Write q displaced along a tangent vector, the base by its exponential."""
+    """Displace q along a tangent vector and write the result; the base moves by the exponential."""
     w, v = get3(along, 0), get3(along, 3)
     square = dot(w, w)
     quarter = 0.25 * square

@@ -1,4 +1,4 @@
-"""Check of A and B against ABA derivatives and against differences of the nonlinear model."""
+"""Check of A and B by ABA derivatives and by differences of the nonlinear model."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,7 +10,6 @@ from fflin.base.errors import InputError
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, instance, share
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same, sensed
@@ -44,38 +43,39 @@ class Row(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """Whether the error is within the tolerance; False if the error is NaN."""
+        """Whether the error is at most the tolerance; False if the error is NaN."""
         return self.error <= self.tolerance
 
 
 _EPS = float(np.finfo(float).eps)
-# Rounding of a difference of outputs: its weights add up to two ulp, each output brings a few.
+# Rounding error [ulp] of a difference of outputs: two ulp from its weights, some from each output.
 _ULPS = 8.0
 
-# Rounding of the accelerations at the ends of a step, whose difference is the derivative.
+# Rounding error [ulp] of the accelerations whose difference approximates a derivative.
 _STEP_ULPS = 64.0
 
-# Relative to its block an analytic route agrees to round-off times the conditioning of M, with
-# room for the longer chain of operations; for a well-conditioned M, to this.
+# Tolerances for the analytic computation, relative to the largest entry of a block. The second is
+# for each unit of the condition number of M. It allows for a long chain of operations. The first
+# is the least tolerance, for a well-conditioned M.
 _ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
-# Differences of sixth order lose about four digits more to their step.
+# The same for differences of sixth order, whose step size costs about four digits more.
 _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
 
-# From the residual of an inverse to the error of what it multiplies.
+# Assumed ratio of the error of ABA's derivatives to the residual of ABA's M^-1.
 _ROUTE_SAFETY = 10.0
 
-# A tolerance beyond this would confirm less than two digits, however badly M is conditioned.
+# Largest tolerance, even for an ill-conditioned M. A larger one would confirm less than two digits.
 _LOOSEST = 1e-2
 
 
 @dataclass(frozen=True)
 class Check:
-    """Result of the check of a linear model; prints as tables.
+    """Result of `check`: the errors of a linear model; ``print`` shows a table.
 
     Attributes
     ----------
     rows : tuple of Row
-        All errors, each with its tolerance.
+        One row per comparison of a block of A or B, with its error and tolerance.
     title : str
         Description of the checked model.
 
@@ -92,7 +92,7 @@ class Check:
 
     @property
     def ok(self) -> bool:
-        """Whether every error is within its tolerance."""
+        """Whether all errors are within their tolerances."""
         return all(row.ok for row in self.rows)
 
     @property
@@ -102,11 +102,11 @@ class Check:
 
     @property
     def failures(self) -> tuple[Row, ...]:
-        """Rows whose error exceeds the tolerance."""
+        """Rows in which the error exceeds the tolerance."""
         return tuple(row for row in self.rows if not row.ok)
 
     def __str__(self) -> str:
-        """Show the verdict, and the largest error of each kind of comparison."""
+        """Return a text with the verdict and the largest error of each kind of comparison."""
         if failures := self.failures:
             names = [f"{row.block} ({row.test})" for row in failures[:6]]
             names += ["..."] * (len(failures) > 6)
@@ -131,32 +131,34 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 
     A and B are compared block by block with
 
-    - Pinocchio's ABA derivatives, mapped into the chart (tolerance 1e-9, relative);
+    - Pinocchio's ABA derivatives, mapped into the attitude chart of the model (relative tolerance
+      1e-9);
     - sixth-order central differences of the nonlinear model :math:`\dot x = f(x, u)` in the same
-      chart (tolerance 1e-8). The function f is itself verified by integrated motions.
+      chart (relative tolerance 1e-8). The function f is itself verified against integrated motions.
 
-    Tolerances are proportional to round-off errors, which grow with the condition number of M.
+    For an ill-conditioned inertia matrix M, the tolerances are larger, because round-off errors
+    grow with the condition number of M.
 
     Parameters
     ----------
     robot : Robot
-        Robot that the model should describe.
+        Robot whose linear model is checked.
     lin : LinearModel
-        Model in continuous time, from `linearize`, a file or another tool.
+        Continuous-time model from `linearize`, a file or another tool.
     tolerance : float, optional
-        Relative tolerance that replaces the tolerance of every error, such as 1e-5 if another tool
-        computed A and B by finite differences.
+        Relative tolerance for all errors, instead of the default tolerances. For example, use 1e-5
+        if another tool computed A and B by finite differences.
 
     Returns
     -------
     Check
-        Result with ``ok``, ``max_error`` and ``rows``; printable.
+        Result, in which ``ok`` is True if no error exceeds its tolerance.
 
     Raises
     ------
     InputError
-        If the model is sampled, its states or inputs differ from the robot's, or the tolerance is
-        not between 0 and 1.
+        If the model is in discrete time, the model and the robot have different states or inputs,
+        or the tolerance is not between 0 and 1.
 
     Examples
     --------
@@ -175,7 +177,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 
 
 def held_to(tolerance: float | None, found: Check) -> Check:
-    """Return the errors with one tolerance for all errors, if given."""
+    """Return the errors with a given tolerance for all of them; None keeps their tolerances."""
     if tolerance is None:
         return found
     rows = tuple(row._replace(tolerance=share("tolerance", tolerance)) for row in found.rows)
@@ -197,14 +199,15 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     A, B, inverse = aba_route(state, aba, q, v, lin.u0, moving=lin.moving)
     chart = state.chart(q)
     base_M = state.to_base(chart, state.to_base(chart, M).T).T
-    # Links far apart cost ABA digits that M keeps; what its inverse of M lacks, its route lacks.
+    # Links far apart cost ABA digits that M keeps. ABA's derivatives are as inaccurate as its M^-1,
+    # whose error is the residual of M M^-1 = I.
     own_error = inertia_residual(base_M, inverse)
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     rows = [
         Row("ABA derivatives", *block, by_aba) for block in compare(state, actuation, lin, M, A, B)
     ]
     (steps, input_steps), nx = difference_steps(state, lin, M), state.nx
-    # f is curved in the attitude and the joints alone.
+    # f has terms beyond second order only in the attitude and the joint positions.
     bends = np.zeros(nx + len(input_steps), dtype=bool)
     bends[state.groups.q_b] = bends[state.groups.q_m] = True
     point, every = np.concatenate((lin.x0, lin.u0)), np.concatenate((steps, input_steps))
@@ -220,7 +223,7 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     rows.append(Row("flow", "f", flow_error(model, lin), difference))
     rows += [Row("point", name, error, route) for name, error in _point_errors(model, lin, M, q, v)]
     rows.append(Row("inertia", "M", _relative(lin.M, M, floor=0.0), route))
-    # With the default inputs M^-1 is the lower half of B.
+    # With the default inputs, M^-1 is the lower half of B.
     inverse = lin.B[-len(M) :] if actuation.default else inverse_inertia(state, lin)
     rows.append(Row("inertia", "M M^-1 = I", inertia_residual(M, inverse), route))
     scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
@@ -233,7 +236,7 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
 
 
 def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
-    """Check many models; of each figure the one that is nearest to its tolerance, or beyond it."""
+    """Check many models, and return the largest ratio of error to tolerance for each row."""
     worst: dict[tuple[str, str], Row] = {}
     aba: Aba | None = None
     for lin in models:
@@ -248,12 +251,15 @@ def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
 def _point_errors(
     model: Nonlinear, lin: LinearModel, M: Array, q: Array, v: Array
 ) -> list[tuple[str, float]]:
-    """Errors of x0 and f0, and of f0's groups relative to the terms that may cancel in them."""
+    """Return the errors of x0 and of each group of f0.
+
+    Errors of f0 are relative to the largest terms that may cancel in the group.
+    """
     state = model.state
     mobility, input_mobility = mobilities(M, lin.B)
     rate = model(lin.x0, lin.u0)
-    # In an orbit it is the absolute velocity whose terms cancel.
-    field = field_of(state.robot, state.frame)
+    # In orbit, the terms that cancel contain the inertial velocity.
+    field = state.field
     _, rate_of_turn, momentum = speeds(state, field.absolute(q, v) if field else v)
     push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
     push += rate_of_turn**2 * float((1.0 / mobility).max())
@@ -269,7 +275,7 @@ def _point_errors(
 def _output_rows(
     model: Nonlinear, lin: LinearModel, steps: tuple[Array, Array], tolerance: float
 ) -> list[Row]:
-    """Rows of C, D and y0 compared with differences of the nonlinear outputs."""
+    """Compare C, D and y0 with differences of the nonlinear outputs; return the rows."""
     state = model.state
     outputs = (lin.output_names, lin.output_units)
     require_same(
@@ -291,7 +297,7 @@ def _output_rows(
     of_x, of_u = (np.ones(len(each), dtype=bool) for each in (step_x, step_u))
     C = jacobian(lambda rows: np.array([y(x, lin.u0) for x in rows]), lin.x0, step_x, of_x)
     D = jacobian(lambda rows: np.array([y(lin.x0, u) for u in rows]), lin.u0, step_u, of_u)
-    # A derivative below the rounding of y divided by the step is noise.
+    # Derivatives smaller than the rounding error of y divided by the step are noise.
     scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
     for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):

@@ -25,25 +25,25 @@ if TYPE_CHECKING:
 
     Mask: TypeAlias = NDArray[np.bool_]
 
-# Round-off of M a and of the accelerations themselves, relative to the terms that they sum.
+# Rounding errors of M a and of the accelerations, relative to the terms that they sum.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium(FrozenArrays):
-    """Equilibrium of a robot: minimum-norm inputs, spring deflections and residual forces.
+    """Result of `equilibrium`: minimum-norm inputs, spring deflections and residual forces.
 
     Attributes
     ----------
     q : ndarray (nq,)
-        Equilibrium configuration, the argument q of `linearize`. The equilibrium differs from the
-        given configuration by the spring deflections of passive joints.
+        Equilibrium configuration, to be given to `linearize` as q. This configuration differs from
+        the given configuration by the spring deflections of joints without a motor.
     u : ndarray (nu,)
-        Minimum-norm inputs, the argument u of `linearize`.
+        Minimum-norm inputs, to be given to `linearize` as u.
     sag : ndarray (n,)
         Deflection of each joint from its given position [rad | m].
     residual : ndarray (6 + n,)
-        Generalised forces that the inputs do not balance; forces on the base in base axes.
+        Generalised forces that the inputs do not balance. Forces on the base are in base axes.
     input_names, input_units : tuple of str
         Names and units of u.
     force_names, force_units : tuple of str
@@ -58,7 +58,7 @@ class Equilibrium(FrozenArrays):
     >>> soft = fflin.load("planar_detumble", passive=["joint_1"], stiffness={"joint_1": 50.0})
     >>> print(fflin.equilibrium(soft, fflin.configuration(soft, {"joint_1": 0.2})))
     u: all zero
-    sags: joint_1 = -0.2 rad
+    deflections: joint_1 = -0.2 rad
     """
 
     q: Array
@@ -80,7 +80,7 @@ class Equilibrium(FrozenArrays):
             return said
         names = [name.partition(".")[2] for name in self.force_names[6:]]
         units = ["m" if unit == "N" else "rad" for unit in self.force_units[6:]]
-        return f"{said}\n{signals('sags', shown, names, units)}"
+        return f"{said}\n{signals('deflections', shown, names, units)}"
 
 
 def equilibrium(
@@ -91,25 +91,27 @@ def equilibrium(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
 ) -> Equilibrium:
-    r"""Compute the minimum-norm inputs that balance all forces on a robot, with spring deflections.
+    r"""Compute the spring deflections and the minimum-norm inputs that balance all forces.
 
-    The forces are the same as in `linearize`: springs, gravity, dampers, and the inertial forces of
-    a steady motion. In orbit, the forces include the gravity gradient and the inertial forces of
-    the rotating orbital frame, in which the base is at rest. `relative_equilibria` finds
-    attitudes in which no torque on the base is necessary. With f the generalised forces without
-    u, the inputs solve
+    The balanced forces are the forces that `linearize` also includes: springs, gravity, dampers,
+    and the inertial forces of a steady motion. In orbit, the base is at rest in the rotating
+    orbital frame, and the forces include the gravity gradient and the inertial forces of this
+    frame. To find attitudes at which the base needs no torque in orbit, use `relative_equilibria`.
+
+    Let f be the generalised forces on the robot without the inputs u, and B the matrix from u to
+    generalised forces. The inputs solve
 
     .. math::
         \min \|u\|_2 \quad \text{subject to} \quad B(q)\,u = -f(q, v), \qquad
         u_k \ge 0 \text{ for every thruster } k.
 
-    The norm of u is the norm of its numerical values in SI units. The rows of the force balance,
-    in N m and N, are scaled by :math:`\sqrt{(M^{-1})_{ii}}`, so that different units become
-    comparable. The weighted residual must not exceed 1e-9 of the balanced forces.
+    The norm of u is the norm of its numerical values in SI units. The force balance has rows in N m
+    and in N. To make these rows comparable, row i is scaled by :math:`\sqrt{(M^{-1})_{ii}}`, with
+    the inertia matrix M. The scaled residual must not exceed 1e-9 of the balanced forces.
 
     A joint with a spring but without a `JointTorque` deflects, unless another input balances the
-    force on the joint. Newton's method finds the deflected position, with the Jacobian
-    :math:`M\,\partial\dot\nu/\partial q_m`.
+    force on the joint. Newton's method finds the deflected position. Its Jacobian is
+    :math:`M\,\partial\dot\nu/\partial q_m`, with the acceleration :math:`\dot\nu` of the robot.
 
     Parameters
     ----------
@@ -117,21 +119,22 @@ def equilibrium(
     q : array_like (nq,), optional
         Configuration in Pinocchio's order; neutral by default.
     v : array_like (nv,), optional
-        Velocity of a steady motion, which is constant in base axes; at rest by default. No joints
-        except rotors may move, see `LinearModel.ignorable`. Under gravity, the base may rotate only
-        about the vertical.
+        Velocity of a steady motion, which must be constant in base axes; at rest by default. Only
+        joints that are rotors may move, see `LinearModel.ignorable`. Under gravity, the base may
+        rotate only about the vertical.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the inputs on the base, as in `linearize`.
     reference : pin.SE3, optional
         Placement whose axes are the reference axes, as in `linearize`. The default is the base
-        placement, with inputs on the base in base axes for any `frame`. For a robot in orbit, the
-        default is the orbital frame.
+        placement; inputs on the base are then in base axes for any `frame`. For a robot in orbit,
+        the default is the orbital frame.
 
     Returns
     -------
     Equilibrium
-        Equilibrium for ``linearize(robot, result.q, v, u=result.u)`` with the same frame and
-        reference.
+        Result whose q and u define the operating point of
+        ``linearize(robot, result.q, v, u=result.u)``. Give `linearize` the same `frame` and
+        `reference`.
 
     Raises
     ------
@@ -140,16 +143,16 @@ def equilibrium(
 
         - no inputs balance the forces; the message names the residual forces;
         - springs are too weak for their load, or Newton's method does not converge;
-        - the motion cannot be steady under any inputs.
+        - no inputs can make the motion steady.
     InputError
-        If a size is wrong or an entry is not a number.
+        If an argument has a wrong size or an entry that is not a number.
     ChartError, SingularInertiaError
-        As in `linearize`.
+        Under the same conditions as in `linearize`.
 
     Notes
     -----
-    With the bounds of thrusters, the minimisation is a least-distance problem, which non-negative
-    least squares solve exactly (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974,
+    The bounds of thrusters turn the minimisation into a least-distance problem, which non-negative
+    least squares solve exactly (Lawson and Hanson, Solving Least Squares Problems, 1974,
     chapter 23).
 
     Examples
@@ -163,7 +166,7 @@ def equilibrium(
     state = StateMap(robot, frame=frame, reference=reference)
     given = robot.neutral() if q is None else robot.checked_configuration(q)
     axes: Any = {"moving": True}
-    if robot.orbit:  # its own placement, so that there too forces and inputs are in base axes
+    if robot.orbit:  # reference at the base, so that forces and inputs are in base axes
         own = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
         axes = {"frame": frame, "reference": own}
     linearizer = Linearizer(robot, **axes)
@@ -171,7 +174,7 @@ def equilibrium(
     free = {f"tau_m.{name}" for name, k in robot.stiffness.items() if k} - set(actuation.names)
     soft = np.array([name in free for name in pushes])
     tolerance = (balance := _Balance(linearizer, given, v)).tolerance
-    for _ in range(20):  # Newton's method: a few do
+    for _ in range(20):  # Newton's method, which needs a few steps
         loose = soft & (np.abs(balance.residual) > tolerance)
         if not loose.any():
             break
@@ -215,7 +218,7 @@ class _Balance:
         self.residual, self.tolerance = self.left / mobility, rounding + terms
 
     def newton_step(self, linearizer: Linearizer, soft: Mask) -> Array:
-        """Return Newton's step (6 + n,) of the joints whose rows of the forces are `soft`."""
+        """Return Newton's step (6 + n,), which moves only the coordinates in the mask `soft`."""
         robot, lin = linearizer.robot, linearizer(self.lin.q, self.lin.v, self.u)
         hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
         own = np.sqrt(robot.springs.stiffness[soft[6:]])
@@ -231,7 +234,7 @@ class _Balance:
 
 
 def _require_steady(lin: LinearModel, drift: Array) -> None:
-    """Refuse a motion of coordinates on which the forces depend."""
+    """Raise `EquilibriumError` if a joint moves on whose position the forces depend."""
     moving = [
         f"{name} at {rate:.3g} {unit}/s"
         for name, unit, rate in zip(lin.state_names, lin.state_units, drift.tolist(), strict=True)
@@ -240,14 +243,16 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
     orbiting, (turns, moves) = lin.frame in ORBITAL, np.abs(drift[:6]).reshape(2, 3).max(axis=1)
     if moving:
         reason = (
-            f"joints move, {listed(moving)}. Only rotors may move: joints whose link is symmetric "
-            "about the axis and carries nothing. Set the other joint rates to 0"
+            f"joints move ({listed(moving)}), but only rotors may move, which are joints whose "
+            "link is symmetric about the axis and carries nothing; set all other joint rates to "
+            "0"
         )
     elif orbiting and max(turns, moves) > TOLERANCE:
-        reason = "its base moves in the orbit's frame; leave out the velocity of the base"
+        reason = "the base moves in the orbital frame; remove the velocity of the base"
     elif not orbiting and "q_b.x" not in lin.ignorable and turns > TOLERANCE:
         reason = (
-            "under gravity its base may rotate about the vertical only; change its angular velocity"
+            "under gravity, the base may rotate only about the vertical; change the angular "
+            "velocity of the base"
         )
     else:
         return
@@ -255,7 +260,7 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
 
 
 def _rounding(robot: Robot, lin: LinearModel, M: Array) -> Array:
-    """Return the rounding errors of the forces (6 + n,) from terms that cancel."""
+    """Return bounds of the rounding errors of the forces (6 + n,), where large terms cancel."""
     state = StateMap(robot)
     field = field_of(robot, lin.frame)
     speed = np.abs(state.velocities(field.absolute(lin.q, lin.v) if field else lin.v))
@@ -278,26 +283,27 @@ def _unbalanced(
     ]
     return EquilibriumError(
         f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
-        f"forces: {listed(left)}; add inputs that balance them (thrusters only push), or choose "
-        "another point"
+        f"forces: {listed(left)}; add inputs that balance these forces (thrusters cannot pull), "
+        "or choose another point"
     )
 
 
 _EPS = float(np.finfo(float).eps)
 
-# Largest fraction of what is to be balanced that may be left over.
+# Largest allowed residual, as a fraction of the forces to be balanced.
 TOLERANCE = 1e-9
 
 
 def least_norm(C: Array, d: Array, one_sided: Mask) -> tuple[Array, Array]:
-    """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``."""
+    """Return the minimum-norm u with ``C u = d`` and ``u[one_sided] >= 0``, and ``C u - d``."""
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
         from fflin.kernel.allocation import nearest
 
         least, most = np.where(one_sided, 0.0, -np.inf), np.full(len(u), np.inf)
         u = nearest(C, d, least, most)
-        # The same without the rounding of the bounded problem: inputs at zero stay out.
+        # Solve again without bounds for the nonzero inputs, to remove the rounding errors of the
+        # bounded problem.
         pushing = ~one_sided | (u > TOLERANCE * float(np.abs(u).max(initial=0.0)))
         polished: Array = np.zeros(len(u))
         polished[pushing] = _pseudo_solve(C[:, pushing], d)
@@ -307,9 +313,9 @@ def least_norm(C: Array, d: Array, one_sided: Mask) -> tuple[Array, Array]:
 
 
 def _pseudo_solve(C: Array, d: Array) -> Array:
-    """Return the u of least norm among those with the least ``|C u - d|``."""
+    """Return the minimum-norm u that minimises ``|C u - d|``."""
     u: Array = np.linalg.lstsq(C, d, rcond=None)[0]
     u += np.linalg.lstsq(C, d - C @ u, rcond=None)[0]
-    # An input below the rounding of the largest one is noise: it counts as zero.
+    # Inputs below the rounding error of the largest input are noise, and set to zero.
     u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
     return u

@@ -20,34 +20,36 @@ from fflin.linear.model import LinearModel, StateSpace
 from fflin.linear.tool_coordinates import Jacobians, ToolCoordinates, tool_coordinates
 from fflin.robot.robot import Robot
 
-_ROUNDING = 1e-12  # of the largest entry, by which another route to a matrix may miss a zero
+_ROUNDING = 1e-12  # smaller entries, relative to the largest, count as zero
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ToolModel(StateSpace, Design):
     r"""Linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
-    The state x consists of q and v of the tool. If q is on a manifold (mujoco, pinocchio, spart),
-    x contains a tangent vector from the operating point instead of q, in the order of v.
+    The state x consists of the tool's q and v. If the tool's q is on a manifold (mujoco, pinocchio,
+    spart), x contains a tangent vector instead of q: the difference of q from the operating point,
+    in the order of v.
 
     Attributes
     ----------
     tool, robot : str
         Names of the tool and the robot.
     A, B, C, D, f0, x0, u0, y0, dt, state_names, ..., output_units
-        As in `LinearModel`.
+        The same fields as in `LinearModel`, but in the tool's coordinates.
     T : ndarray (nx, 12 + 2n)
         Matrix from state deviations of the `LinearModel` to deviations of x.
     T_left : ndarray (12 + 2n, nx)
-        Inverse of T. If x contains a whole quaternion or mimic joints, `T_left` is a left inverse
-        only.
+        Inverse of T. If x contains a quaternion of four entries or mimic joints, x has more entries
+        than the state of the `LinearModel`, so `T_left` is only a left inverse.
     T_u : ndarray (nu, nu)
-        Matrix from input deviations of the `LinearModel` to the tool's. The tool's gain is ``T_u
-        K T_left`` for a gain K of the `LinearModel`.
+        Matrix from input deviations of the `LinearModel` to input deviations of the tool. For a
+        gain K of the `LinearModel`, the gain in the tool's coordinates is ``T_u @ K @ T_left``.
     q, v : ndarray
-        Configuration and velocity of the point in the tool's coordinates.
+        Configuration and velocity of the operating point in the tool's coordinates.
     reference : str
-        "fixed", or "moving" if x is the deviation from a reference that moves through the point.
+        "fixed", or "moving" if x is the deviation from a reference that moves through the
+        operating point.
 
     Examples
     --------
@@ -76,25 +78,27 @@ class ToolModel(StateSpace, Design):
 def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None) -> ToolModel:
     r"""Return a linear model in the coordinates, order and axes of another tool.
 
-    Deviations transform as x' = T x and u' = T_u u. At any point, at rest or in motion,
+    The deviations x and u of the linear model become x' = T x and u' = T_u u in the tool's
+    coordinates, see `ToolModel`. About any operating point, at rest or in motion, the matrices are
 
     .. math:: A' = (T A + \dot T)\,T^+ + \ldots, \qquad B' = T B\,T_u^{-1}
 
-    The omitted terms are due to inputs in other axes and to the length of a quaternion, see
-    (15.1) to (15.6) of docs/derivation.md. docs/guide/tools.md compares the conventions of the
-    tools.
+    :math:`T^+` is the left inverse of T. The omitted terms account for inputs in other axes and for
+    the length of a quaternion; (15.1) to (15.6) of docs/derivation.md give them in full.
+    docs/guide/tools.md compares the conventions of the tools.
 
     Parameters
     ----------
     robot : Robot
     lin : LinearModel
-        Model of this robot, about any point. The result of a sampled model is also sampled.
+        Model of this robot about any operating point. If the model is in discrete time, so is the
+        result.
     tool : {"drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"}
         Name of the tool, or of the attitude coordinates.
     dt : float, optional
-        Time step [s] of MuJoCo, only for "mujoco". A and B are then the matrices of
-        ``mjd_transitionFD`` with the Euler integrator. For a robot with dampers, ``eulerdamp``
-        must be disabled in MuJoCo.
+        Time step [s] of MuJoCo; only for "mujoco". If `dt` is given, A and B are the discrete-time
+        matrices that ``mjd_transitionFD`` returns for the Euler integrator. If the robot has
+        dampers, disable ``eulerdamp`` in MuJoCo, because its matrices otherwise differ.
 
     Returns
     -------
@@ -103,12 +107,15 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     Raises
     ------
     InputError
-        If the model does not fit the robot, a sampled model comes from a file, or `dt` is out of
-        range or not allowed for this tool.
+        If one of these conditions is true:
+
+        - the model and the robot have different states or inputs;
+        - a discrete-time model was read from a file;
+        - `dt` is out of range or not allowed for this tool.
     UnknownNameError
-        If there is no such tool.
+        If the tool is unknown.
     ChartError
-        If the pitch of the Euler angles is 90 deg.
+        If the tool uses Euler angles and their pitch is 90 deg.
 
     Examples
     --------
@@ -158,9 +165,10 @@ class ToolGain(Design):
     ----------
     K : ndarray (nu, nx)
         Gain. If the tool's q is on a manifold (mujoco, pinocchio), ``x - x0`` consists of the
-        tool's own difference of configurations, and the difference of velocities.
+        difference of configurations that the tool computes on this manifold, and of the
+        difference of velocities.
     model : ToolModel
-        The model in the tool's coordinates: names, x0, u0, and the reference `q` and `v`.
+        The model in the tool's coordinates, with names, x0, u0, and the reference `q` and `v`.
 
     Examples
     --------
@@ -179,11 +187,11 @@ class ToolGain(Design):
 
 
 def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
-    """Return the gain of a model in a tool's coordinates; its closed-loop poles are the same."""
+    """Convert a gain K of a model to a tool's coordinates; the closed-loop poles do not change."""
     model, whole = lin.to(tool), lin.generator
     assert whole is not None and lin._robot is not None
     _, own, to, _ = _jacobians_at(lin._robot, whole, tool)
-    # An input that is held in one of the two axes turns in the other (15.4).
+    # An input that is constant in the axes of the model rotates in the axes of the tool (15.4).
     turned = np.linalg.solve(to.V, (to.H - own.H) @ to.left)
     return ToolGain(model.T_u @ K @ model.T_left + turned, model, verified=lin.verified)
 
@@ -202,7 +210,7 @@ def from_tool(
     reference: pin.SE3 | None = None,
     moving: bool = False,
 ) -> LinearModel:
-    """Return a linear model from another tool's point and matrices.
+    """Return a linear model from another tool's operating point and matrices.
 
     Parameters
     ----------
@@ -210,29 +218,32 @@ def from_tool(
     tool, dt
         See `transform`; dt is the time step for which A and B were computed.
     q, v : array_like
-        Configuration and velocity in the tool's coordinates; v is zero by default. For "spart", q
-        is R0 column by column, r0 and qm; v is u0 and um.
+        Configuration and velocity in the tool's coordinates; v is zero by default. For "spart", in
+        SPART's notation, q consists of R0 (column by column), r0 and qm, and v consists of u0 and
+        um.
     u : array_like (nu,), optional
         Inputs of the robot in the tool's order and axes; zero by default.
     A, B : array_like, optional
-        Matrices of the tool at this point, see `ToolModel`; by default fflin computes A and B.
+        Matrices of the tool at this operating point, see `ToolModel`; by default fflin computes A
+        and B.
     frame, reference, moving
         Options of the returned model, see `linearize`.
 
     Returns
     -------
     LinearModel
-        Model whose ``q``, ``v`` and ``u0`` are the operating point in the order of fflin. `check`
+        Model in the coordinates of fflin, with the operating point ``q``, ``v`` and ``u0``. `check`
         and ``certificate`` show how accurate A and B are.
 
     Raises
     ------
     InputError
-        If a size is wrong, an entry is not finite, or an attitude is not a rotation.
+        If an argument has a wrong size, an entry is not finite, or an attitude is not a rotation.
     UnknownNameError
-        If there is no such tool.
+        If the tool is unknown.
     ChartError
-        If the base is rotated by 180 deg from the reference, or as in `transform`.
+        If the base is rotated by 180 deg from the reference, or the tool uses Euler angles and
+        their pitch is 90 deg.
 
     Examples
     --------
@@ -256,7 +267,7 @@ def from_tool(
     ours = transformed(own, to, lin.A, lin.B)
     ours = _euler_step(*ours, to.P @ rates, step)[:2] if step else ours
     changes = [_difference(*each) for each in zip("AB", (A, B), ours, strict=True)]
-    if step:  # the rows of positions follow from those of rates
+    if step:  # only the rows of rates count: the rows of positions follow from them
         nv = len(ours[0]) // 2
         changes = [np.vstack((0.0 * each[:nv], each[nv:] / step)) for each in changes]
     own, to = (each._replace(rate=0.0 * each.rate, extra=0.0 * each.extra) for each in (own, to))
@@ -270,7 +281,7 @@ def from_tool(
 def _jacobians_at(
     robot: Robot, lin: LinearModel, tool: str
 ) -> tuple[ToolCoordinates, Jacobians, Jacobians, Array]:
-    """Return a tool's coordinates, the derivatives of the model's and the tool's, and dy/dt."""
+    """Return a tool's coordinates, the derivatives of the model's and tool's states, and dy/dt."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError("lin lacks some states of the robot; use the full model of the robot")
@@ -278,31 +289,31 @@ def _jacobians_at(
     kind = tool_coordinates(robot, tool, moving=lin.moving)
     nu, rates = state.velocities(lin.v), lin.drift
     point = lin.q, nu, own.actuation.in_base_axes(state.chart(lin.q), lin.u0)
-    if rates is None:  # f0 is P times the rate of y
+    if rates is None:  # f0 = P dy/dt
         rates = own.jacobians(*point, 0.0 * nu).left @ lin.f0
     rates = rates[len(nu) :]
     return kind, own.jacobians(*point, rates), kind.jacobians(*point, rates), np.append(nu, rates)
 
 
 def transformed(source: Jacobians, to: Jacobians, A: Array, B: Array) -> tuple[Array, Array]:
-    """Return A and B in other coordinates (15.3), (15.4)."""
+    """Transform A and B from one set of coordinates to another (15.3), (15.4)."""
     B = source.left @ B @ np.linalg.inv(source.V)
     A = source.left @ (A @ source.P - source.rate) + B @ (to.H - source.H)
     return (to.P @ A + to.rate) @ to.left + to.extra, to.P @ B @ to.V
 
 
 def _step(tool: str, dt: float | None) -> float:
-    """Return the time step, 0 if none is given."""
+    """Return the checked time step, or 0 without one."""
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(
-            f"dt is {h:g} s for {tool}; only mujoco takes dt, a positive time step below 1000 s"
+            f"dt is {h:g} s for {tool}, but only mujoco has a dt, a positive time step below 1000 s"
         )
     return h
 
 
 def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
-    """Return A, B and f0 of a step of semi-implicit Euler (15.6); of the base linear, angular."""
+    """Return A, B and f0 of a semi-implicit Euler step (15.6), with linear before angular rows."""
     v, a = np.split(rate, 2)
     nv, moved = len(v), h * (v + h * a)
     K, G = np.eye(nv), h * np.eye(nv)
@@ -314,6 +325,6 @@ def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array
 
 
 def _difference(name: str, given: ArrayLike | None, expected: Array) -> Array:
-    """Return by how much a matrix of the caller is more than expected."""
+    """Return the caller's matrix minus the expected matrix, or zero without a matrix."""
     array = expected if given is None else shaped(name, given, expected.shape)
     return np.asarray(array - expected)

@@ -1,9 +1,10 @@
 """Linear models and trajectories on disk: npz, mat, json and csv.
 
-A model in csv is a table for each matrix, named on its rows and columns, one for each of the
-signals, one for the point in Pinocchio's order, and the table ``info`` of texts and figures, whose
-last line is the digest of all tables. The last column of a trajectory in csv is the digest of the
-other columns, the same in every row, so that other programs read the columns by their names.
+A model in csv consists of several tables: one for each matrix, with names of rows and columns; one
+each for the states, inputs and outputs; one for the point in Pinocchio's order; and the table
+``info`` of texts and numbers, whose last line is the digest of all tables. The last column of a
+trajectory in csv repeats the digest of the other columns in every row. So other programs can read
+the columns by their names.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 FORMATS = (*record.FORMATS, ".csv")
 
 _SIGNALS = ("state", "input", "output")
-# Fields of a model in a file. Of each array: what stands along its dimensions.
+# Fields of a model in a file; each array with the kind of names along its dimensions.
 _ARRAYS: dict[str, tuple[str, ...]] = {
     "A": ("state", "state"),
     "B": ("state", "input"),
@@ -116,7 +117,7 @@ def _fields(entries: Record) -> dict[str, Any]:
     sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}
     units = {signal: len(fields[f"{signal}_units"]) for signal in _SIGNALS}
     if sizes != units:
-        raise ValueError("its signals differ in number from their units")
+        raise ValueError("the number of its signals differs from the number of their units")
     sizes |= {"velocity": sizes["state"] // 2, "coordinate": -1, "placement": 7}
     sizes |= {"drift": sizes["state"] if np.size(entries["drift"]) else 0}
     sizes |= {"limit": len(fields["limit_names"])}
@@ -143,7 +144,7 @@ def _fields(entries: Record) -> dict[str, Any]:
 
 
 def given(value: Any, _: object) -> Any:
-    """Return the content of a file for any kind of model."""
+    """Return an entry of a file unchanged."""
     return value
 
 
@@ -168,7 +169,7 @@ def _tables(entries: Record) -> dict[str, list[list[Any]]]:
 
 
 def _columns_of(signal: str) -> list[str]:
-    """Return the entries that the table of a signal has as columns."""
+    """Return the entries that are the columns of a signal's table."""
     vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
     return [f"{signal}_names", f"{signal}_units", *vectors]
 
@@ -205,7 +206,7 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
 
 
 def foreign_table(path: Path) -> Path | None:
-    """Return a file in the place of a table of NAME.csv if these are not the tables of a model."""
+    """Return a file that a table of the model NAME.csv would overwrite, if it is not a model's."""
     info = _csv_path(path, "info")
     own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
     tables = [] if own else [_csv_path(path, key) for key in _TABLES]
@@ -217,7 +218,7 @@ def _csv_path(path: Path, key: str) -> Path:
 
 
 def write_csv(path: Path, traj: Trajectory) -> None:
-    """Write named columns, as `Trajectory.load` reads them."""
+    """Write a trajectory as named columns, which `Trajectory.load` reads."""
     columns = [f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])]
     names = ["t", *columns, *Actuation(StateMap(traj.robot)).names, "hold", "frame"]
     rows = np.column_stack((traj.t, traj.q, traj.v, traj.u)).tolist()
@@ -229,13 +230,13 @@ def write_csv(path: Path, traj: Trajectory) -> None:
 
 
 def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
-    """Return the names with their units, such as ``t [s]``; none for a figure without dimension."""
+    """Return names with units, such as ``t [s]``; dimensionless names have no unit."""
     pairs = zip(names, units, strict=True)
     return [name if unit in ("", "1") else f"{name} [{unit}]" for name, unit in pairs]
 
 
 def write_table(path: Path, names: Sequence[str], rows: Array) -> None:
-    """Write named columns."""
+    """Write rows as a csv table with named columns."""
     write_atomically({path: csv_table([names, *rows.tolist()])})
 
 
@@ -246,7 +247,7 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
         table = source.suffix == ".csv"
         entries, verified = _columns(source) if table else read_record(source)
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
-            entries = struct  # of MATLAB
+            entries = struct  # a MATLAB struct
     try:
         entries = _entries(entries, StateMap(robot)) if table else entries
         hold = hold or (text(entries["hold"]) if "hold" in entries else None)
@@ -273,7 +274,7 @@ def arguments(
     if "input_names" in entries or u.shape[-1] != len(Actuation(state).names):
         _require_inputs(Actuation(state).names, entries.get("input_names", []), u.shape[-1])
     for columns in Actuation(state).held:
-        # In the axes of the world, which those of the reference may not be.
+        # Inputs in reference axes are rotated to world axes.
         u[:, columns] = u[:, columns] @ reference.rotation.T
     found_as: dict[str, Any] = {"t": np.ravel(entries["t"]), "u": u}
     found_as |= {"hold": hold, "frame": frame, "verified": verified}
@@ -289,12 +290,12 @@ def arguments(
 
 
 def _require_inputs(known: Sequence[str], names: Any, count: int) -> None:
-    """Raise `InputError` if the inputs of a file, named or not, are not the robot's inputs."""
+    """Raise `InputError` if the names or the number of a file's inputs differ from the robot's."""
     given = texts(names)
     if given == tuple(known):
         return
     missing, extra = ([n for n in a if n not in b] for a, b in ((known, given), (given, known)))
-    said = "the file has the inputs of the robot in another order"
+    said = "the file contains the inputs of the robot in another order"
     if not given:
         said = f"u has {count} columns, expected one for each input of the robot: {listed(known)}"
     elif missing or extra:
@@ -303,13 +304,13 @@ def _require_inputs(known: Sequence[str], names: Any, count: int) -> None:
     raise InputError(f"{said}; load the robot with the inputs of the trajectory (--inputs)")
 
 
-def _digest(table: Sequence[Sequence[Any]]) -> str:
+def _digest(table: Sequence[Sequence[object]]) -> str:
     """Return the digest of a table without its column of digests."""
     return record.content_digest({"table": csv_table(table)})
 
 
 def _columns(path: Path) -> tuple[Record, bool]:
-    """Return the columns of a csv by their names, as texts, and whether they are verified."""
+    """Return the columns of a csv as {name: texts}, and whether a digest verifies them."""
     lines = csv.reader(io.StringIO(read_file(path, ".csv").decode("utf-8-sig"), newline=""))
     header, *rows = [[cell.strip() for cell in line] for line in lines if any(line)]
     if len({*header}) < len(header):
@@ -329,11 +330,11 @@ def _columns(path: Path) -> tuple[Record, bool]:
 
 
 def _entries(columns: Record, state: StateMap) -> Record:
-    """Return the entries that the named columns of a csv are."""
+    """Convert the named columns of a csv to the entries of a trajectory."""
     if "t [s]" in columns:
         raise FileError(
-            "this is the table of a motion, expected a trajectory; save motion.trajectory() "
-            "instead, or save the motion as .npz, .mat or .json"
+            "this table contains a motion, expected a trajectory; save motion.trajectory() in "
+            "its place, or save the motion as .npz, .mat or .json"
         )
     inputs = Actuation(state).names
     rows = {key: [name for name in columns if name.startswith(f"{key}[")] for key in "qv"}
@@ -348,7 +349,7 @@ def _entries(columns: Record, state: StateMap) -> Record:
             raise unknown("state or input", name, (*known, *inputs))
     entries: Record = {key: columns[key][0] for key in ("hold", "frame") if key in columns}
     acting = [name for name in inputs if name in columns]
-    # Of held inputs the last row may be empty.
+    # The last row of inputs may be empty, because held inputs need none at the last knot.
     short = bool(acting) and not any(columns[name][-1] for name in acting)
     for key, names in rows.items():
         entries[key] = np.column_stack([_numbers(name, columns[name]) for name in names])

@@ -16,7 +16,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
-# Names and units, in their order.
+# Names and units of signals, in the same order.
 Signals: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
 
 
@@ -25,7 +25,7 @@ def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
     made, actuation = f"the model was made for '{lin.robot}'", Actuation(state)
     inputs = (lin.input_names, lin.input_units)
     require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
-    # A reduced model has a part of the states.
+    # A reduced model has only some of the states.
     units = dict(zip(state.names, state.units, strict=True))
     there = tuple(name for name in lin.state_names if name in units)
     states = (lin.state_names, lin.state_units)
@@ -40,14 +40,14 @@ def require_sensed(lin: LinearModel, robot: Robot, state: StateMap) -> None:
 
 
 def sensed(state: StateMap) -> Signals:
-    """Return names and units of a robot's outputs."""
+    """Return the names and units of a robot's outputs."""
     outputs = state.robot.outputs
     found = state if outputs == (FullState(),) else Sensing(state, outputs)
     return found.names, found.units
 
 
 def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signals) -> None:
-    """Raise `InputError` that lists names and units that differ from the robot's."""
+    """Raise `InputError` if names or units differ from the robot's; the message lists them."""
     mine, others = (dict(zip(*each, strict=True)) for each in (own, there))
     lacking, beside = ([n for n in a if n not in b] for a, b in ((mine, others), (others, mine)))
     if names := lacking or beside:
@@ -67,7 +67,7 @@ def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signal
 
 
 def require_turns(made: str, size: int, robot: Robot) -> None:
-    """Raise `InputError` if a configuration has another size than the robot's."""
+    """Raise `InputError` if a configuration of `size` entries does not fit the robot."""
     if size != robot.nq:
         raise InputError(
             f"{made}, but the given robot '{robot.name}' has other continuous joints, so that its "
@@ -81,18 +81,21 @@ def outputs(
 ) -> Array:
     """Return the outputs y of a robot in the coordinates of a linear model.
 
-    - Attitudes are in the model's chart, with q0 >= 0.
-    - Rotations of frames are relative to the point of linearisation.
-    - Angles of continuous joints are unwrapped to be nearest to the point of linearisation.
+    - Attitudes are in the model's chart. Of the two quaternions of an attitude, the one with a
+      scalar part q0 >= 0 is used.
+    - Rotations of frames are relative to their attitudes at the operating point.
+    - Angles of continuous joints are unwrapped to be nearest to their values at the operating
+      point.
 
-    The input of a controller designed for the linear model is ``y - lin.y0``.
+    Give ``y - lin.y0`` to a controller that was designed for the linear model.
 
     Parameters
     ----------
     robot : Robot
-        Robot with the states, inputs and outputs of the model; its masses may differ.
+        Robot with the same states, inputs and outputs as the model. Its masses may differ from
+        those with which the model was computed.
     lin : LinearModel
-        Model that defines the reference and the point.
+        Model that defines the reference and the operating point.
     q, v : array_like (nq,), (nv,)
         Configuration and velocity in Pinocchio's order; v is zero by default.
     u : array_like (nu,), optional
@@ -106,7 +109,8 @@ def outputs(
     Raises
     ------
     InputError
-        If a size is wrong, the model does not fit the robot, or the model has a moving reference.
+        If an argument has a wrong size, the model and the robot have different signals, or the
+        model has a moving reference.
 
     Examples
     --------
@@ -135,18 +139,19 @@ def outputs(
 
 
 def line_up(gain: Any, lin: LinearModel) -> Array:
-    """Return the K of a gain for another model, with states and inputs matched by name.
+    """Return the matrix K of a gain for another model, with states and inputs matched by name.
 
-    A robot keeps most of its states when a joint jams, or when it captures a payload. Columns of
-    K for states that the gain lacks are zero, and so are rows for inputs that the gain lacks.
-    States and inputs that the model lacks are dropped.
+    Use `line_up` to keep a gain after a change of the robot, such as a jammed joint or a captured
+    payload, which leaves most states the same. Columns of K belong to states, and rows to inputs.
+    A state of the model that K does not have gets a zero column, and such an input a zero row.
+    Columns and rows of K for states and inputs that the model does not have are dropped.
 
     Parameters
     ----------
     gain : Gain or GainBatch
-        Gain or gains of the first model.
+        Gain or gains of the robot before the change.
     lin : LinearModel
-        Model that needs the gain.
+        Model of the robot after the change.
 
     Returns
     -------
@@ -155,8 +160,8 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
     Raises
     ------
     InputError
-        If gain and model have different frames or sampling times, or if they belong to different
-        robots (each has states or inputs that the other lacks).
+        If gain and model have different frames or sampling times, or if each of them has states or
+        inputs that the other lacks, because they then belong to different robots.
 
     Examples
     --------
@@ -183,8 +188,8 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
         if lacking and beside:
             raise InputError(
                 f"the model of '{lin.robot}' lacks the {kind} {lacking[0]} of the gain of "
-                f"'{gain.robot}', and the gain lacks its {kind} {beside[0]}; one of the two must "
-                f"have all {kind}s of the other"
+                f"'{gain.robot}', and the gain lacks the {kind} {beside[0]} of the model; either "
+                f"the model or the gain must have all {kind}s of the other"
             )
         common = [name for name in other if name in own]
         at.append(([other.index(name) for name in common], [own.index(name) for name in common]))

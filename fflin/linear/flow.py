@@ -13,22 +13,22 @@ from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.integrators import CommutatorFree4
-from fflin.dynamics.rnea import rotor_names
 from fflin.dynamics.state import StateMap
+from fflin.robot.mass_properties import rotor_names
 
-# Steps are halved until the end of an interval is this accurate, relative to the largest rates.
+# Steps are halved until the end of an interval has this accuracy, relative to the largest rates.
 _ACCURACY, _MOST_STEPS = 1e-8, 128
 
-# Round-off of positions, and of accelerations that are sums of terms that may cancel.
+# Rounding errors of positions, and of accelerations relative to the terms that they sum.
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
-# A time this near to a knot, relative to the interval, is the knot's.
+# Times within this fraction of an interval from a knot are taken as the knot.
 _NEAR = 1e-9
 
 
 class Flow:
-    """Motion between knots, from q, v, u and t of N rows; u is in the frame of `state`."""
+    """Motion between N knots with times t and rows of q, v and u; u is in the frame of `state`."""
 
     def __init__(self, state: StateMap, t: Array, q: Array, v: Array, u: Array, held: bool) -> None:
         self._model, self._aba, self._held = state.robot.model, Aba(state), held
@@ -36,18 +36,19 @@ class Flow:
 
     @property
     def held(self) -> tuple[slice, ...]:
-        """Inputs in reference axes."""
+        """Slices of the inputs that form vectors in reference axes."""
         return self._aba.actuation.held
 
     @cached_property
     def residual(self) -> Array:
-        """Error of each interval's end at the next knot (N - 1,), see `interval_errors`."""
+        """Errors (N - 1,) of the ends of all intervals; see `interval_errors`."""
         return self.interval_errors(range(len(self._t) - 1))
 
     def interval_errors(self, intervals: Iterable[int]) -> Array:
-        """Return the relative errors of the ends of some intervals at the next knots."""
-        # An observer who flies along with the base's median velocity takes the rates (Galilei), and
-        # each rotor counts for itself: neither an orbit nor a fast wheel hides anything.
+        """Return the relative errors of the integrated ends of intervals from the next knots."""
+        # Rates are relative to an observer who moves at the base's median velocity (Galilean
+        # invariance), and each rotor has its own scale. So neither a high orbital velocity nor a
+        # fast wheel hides an error.
         t, u, state = self._t, self._u, self._aba.state
         rotations, q, v = rotation_matrices(self._q[:, 3:7]), self._q.copy(), self._v.copy()
         velocities = (rotations @ v[:, :3, None])[..., 0]
@@ -76,7 +77,7 @@ class Flow:
             return float(np.maximum(miss, jump).max())
 
         found, steps = [], 1
-        # What is no motion may diverge, which the residual says.
+        # Knots that are not a motion of the robot may diverge. The residual reports this.
         with np.errstate(all="ignore"):
             for k in intervals:
                 steps, h = max(1, steps // 4), float(t[k + 1] - t[k])
@@ -95,7 +96,7 @@ class Flow:
     def end(
         self, k: int, steps: int, q: Array, v: Array, over: tuple[float, float] = (0.0, 1.0)
     ) -> tuple[Array, Array]:
-        """Return q and v by steps of CF4 (11.1) over a fraction of an interval, all by default."""
+        """Integrate by CF4 (11.1) over part of an interval, by default all of it; return q, v."""
         start, h = self._t[k], self._t[k + 1] - self._t[k]
         method = CommutatorFree4(self._model, (over[1] - over[0]) * h / steps)
         for step in range(steps):
@@ -108,12 +109,12 @@ class Flow:
         return q, v
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
-        """Return q, v and u (base axes) at a time, from cubics with the robot's own rates."""
+        """Return q, v and u (base axes) at a time, from cubics with the robot's accelerations."""
         q, v, u = self.points(np.array([t]))
         return q[0], v[0], u[0]
 
     def points(self, times: Array) -> tuple[Array, Array, Array]:
-        """Return q, v and u (k, ..) at times (k,), as `at` does at one time."""
+        """Return q, v and u (k, ..) at times (k,); `at` returns them at one time."""
         placements = [interval_of(self._t, t) for t in times.tolist()]
         k, s = np.array([k for k, _ in placements]), np.array([s for _, s in placements])
         powers, (turns, speeds) = s[:, None] ** np.arange(4), self.cubics
@@ -150,7 +151,7 @@ class Flow:
             end = np.array([self.rate(*each) for each in zip(q[1:], v[1:], self._u, strict=False)])
         apart = np.array([pin.difference(self._model, *pair) for pair in pairwise(q)])
         wheels = [joint.idx_v for joint in self._aba.state.robot.joints if joint.unbounded]
-        # The knots have a fast wheel's angle only within a turn; its speed says how many turns.
+        # The knots give the angle of a wheel only up to full turns. Its speed gives their number.
         turns = (0.5 * h * (v[1:] + v[:-1]) - apart)[:, wheels] / (2.0 * np.pi)
         apart[:, wheels] += 2.0 * np.pi * np.round(turns)
         slopes = [
@@ -164,14 +165,14 @@ class Flow:
 
 
 def _largest(rows: list[Array]) -> Array:
-    """Return the largest magnitudes (nv,) of rows; a row that overflows counts nothing."""
+    """Return the largest magnitudes (nv,) of rows, without entries that overflow."""
     sizes = np.abs(rows)
     largest: Array = np.where(sizes < np.inf, sizes, 0.0).max(axis=0)
     return largest
 
 
 def interval_of(t: Array, time: float) -> tuple[int, float]:
-    """Return which interval of times a time is in, and the share of it that is over."""
+    """Return the index of the interval that contains a time, and the elapsed fraction of it."""
     last = len(t) - 2
     k = max(0, min(int(t.searchsorted(time, "right")) - 1, last))
     fraction = float((time - t[k]) / (t[k + 1] - t[k]))

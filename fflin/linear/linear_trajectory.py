@@ -31,18 +31,20 @@ if TYPE_CHECKING:
 class LinearTrajectory(Trajectory):
     r"""Error dynamics along a motion, ``d(dx)/dt = A(t) dx + B(t) du``, ``dy = C dx + D du``.
 
-    The error dx is in the moving base's own axes, see `Linearizer` (``moving=True``). Torques and
-    forces on the base in du are in base axes. If ``dt`` is positive, the left side is the error
-    at the next knot. ``along[k]`` is the linear model at knot k.
+    The errors dx and du are the deviations of state and inputs from the motion. The error dx is in
+    the axes of the moving base, see `Linearizer` (``moving=True``). Torques and forces on the base
+    in du are also in base axes. If ``dt`` is positive, the model is in discrete time: the left side
+    of the first equation is then the error dx at the next knot. For a LinearTrajectory ``along``,
+    ``along[k]`` is the linear model at knot k.
 
     Attributes
     ----------
     A : ndarray (N, nx, nx)
-        State matrices at the knots. If ``dt`` is positive, there are N - 1 transition matrices
-        from one knot to the next.
+        State matrices at the knots. If ``dt`` is positive, A contains N - 1 discrete-time state
+        matrices, each from one knot to the next.
     B : ndarray (N, nx, nu)
-        Input matrices at the knots. If ``dt`` is positive, there are N - 1 transition matrices
-        from one knot to the next.
+        Input matrices at the knots. If ``dt`` is positive, B contains N - 1 discrete-time input
+        matrices, each from one knot to the next.
     C : ndarray (N, ny, nx)
         Output matrices at the knots.
     D : ndarray (N, ny, nu)
@@ -52,7 +54,7 @@ class LinearTrajectory(Trajectory):
     state_names, input_names, output_names : tuple of str
         Names of dx, du and dy.
     dt : float
-        Hold time of du [s]; 0 for continuous time.
+        Sampling time [s], during which du is constant; 0 in continuous time.
     robot, t, q, v, u, hold, frame : see `Trajectory`
 
     Examples
@@ -80,7 +82,7 @@ class LinearTrajectory(Trajectory):
         if self.state_names != self._state.names:
             raise InputError(
                 f"the linear trajectory does not fit the given robot '{self.robot.name}': its "
-                "states differ; give the robot it was made for"
+                "states differ; give the robot for which the trajectory was made"
             )
 
     @property
@@ -109,16 +111,16 @@ class LinearTrajectory(Trajectory):
         return Linearizer(self.robot, moving=True)
 
     def matrices(self, t: float) -> tuple[Array, Array]:
-        """Return A (nx, nx) and B (nx, nu) about the point at time t [s], also between knots."""
+        """Return A (nx, nx) and B (nx, nu) about the motion at time t [s], also between knots."""
         A, B = self.matrices_at(np.array([self._within(t)]))
         return A[0], B[0]
 
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
-        """Return A (k, nx, nx) and B (k, nx, nu) at the times (k,), see `matrices`."""
+        """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), with one matrix pair per time."""
         placements = [interval_of(self.t, t) for t in times.tolist()]
         sampled = bool(self.dt)
-        knot = np.array([k + (share == 1.0 and not sampled) for k, share in placements])
-        inside = np.array([0.0 < share < 1.0 and not sampled for _, share in placements])
+        knot = np.array([k + (s == 1.0 and not sampled) for k, s in placements])
+        inside = np.array([0.0 < s < 1.0 and not sampled for _, s in placements])
         A, B = self.A[knot], self.B[knot]
         if inside.any():
             found = self._linearizer.along(*self.flow.points(times[inside]))
@@ -126,26 +128,30 @@ class LinearTrajectory(Trajectory):
         return A, B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
-        """Evaluate arrays at one time: interpolated between knots, or held since the last knot."""
+        """Interpolate arrays that are given at the knots to the time t [s].
+
+        If the model is in discrete time, the values at the previous knot are returned instead.
+        """
         k, fraction = interval_of(self.t, self._within(t))
         if self.dt or not fraction:
             return tuple(each[k] for each in arrays)
         return tuple(each[k] + fraction * (each[k + 1] - each[k]) for each in arrays)
 
     def check(self) -> Check:
-        """Check every knot by `fflin.check`, and return the largest value of each error."""
+        """Check the linear model at every knot by `fflin.check`, and return the largest errors."""
         from fflin.linear.check import check_all
 
         return check_all(self.robot, self, f"{self.robot.name}, {len(self)} knots")
 
     @in_one_thread
     def discretize(self, dt: float) -> LinearTrajectory:
-        r"""Return the sampled model along the motion, with du held constant over each sample.
+        r"""Return the discrete-time model along the motion, with du constant over each sample.
 
-        The transition matrix solves :math:`\dot\Phi = F(t)\,\Phi` with F = [[A, B], [0, 0]] (10.3).
-        Each step uses two exponentials of F, evaluated on the motion itself. The method has order
-        four and is exact if F is constant. Steps are halved until the result changes by less than
-        1e-8.
+        The transition matrix :math:`\Phi` solves :math:`\dot\Phi = F(t)\,\Phi` with F = [[A, B],
+        [0, 0]], see (10.3) of docs/derivation.md. Each integration step uses two matrix
+        exponentials of F, with A and B evaluated on the motion between the knots. The method has
+        order four and is exact if F is constant. The steps are halved until the result changes by
+        less than 1e-8.
 
         Parameters
         ----------
@@ -155,7 +161,7 @@ class LinearTrajectory(Trajectory):
         Raises
         ------
         InputError
-            If the duration is not a multiple of dt, or the model is already sampled.
+            If the duration is not a multiple of dt, or the model is already in discrete time.
         """
         if self.dt:
             raise InputError(
@@ -168,7 +174,7 @@ class LinearTrajectory(Trajectory):
 
     @classmethod
     def load(cls, path: str | Path, robot: Robot) -> LinearTrajectory:  # type: ignore[override]
-        """Read a file that `save` wrote for this robot; every value is restored bit for bit."""
+        """Read a file that `save` wrote for this robot, and restore every value bit for bit."""
         return cls._read(path, robot=robot)
 
 
@@ -190,12 +196,13 @@ def linearize_trajectory(
     t : Trajectory or array_like (N,)
         The motion as a `Trajectory`, or the times of its knots [s].
     q, v, u : array_like, optional
-        Configurations, velocities and inputs at the knots, see `Trajectory`; required if t
-        contains times.
+        Configurations, velocities and inputs at the knots, see `Trajectory`. Give q, v and u only
+        if t contains times.
     strict : bool
-        Whether to refuse knots that violate the robot's dynamics with a residual above 1e-2.
+        Whether to raise an error, instead of a warning, if the knots violate the robot's dynamics
+        with a residual above 1e-2.
     **options
-        hold and frame, see `Trajectory`.
+        The options `hold` and `frame` of `Trajectory`.
 
     Returns
     -------
@@ -210,8 +217,8 @@ def linearize_trajectory(
     Warns
     -----
     FflinWarning
-        If the knots do not satisfy the robot's dynamics. The warning names the interval with the
-        largest error, the error, and usual causes.
+        If the knots violate the robot's dynamics. The warning reports the largest error, the
+        interval in which it occurs, and usual causes.
 
     Examples
     --------
@@ -242,24 +249,24 @@ def along(motion: Trajectory) -> LinearTrajectory:
     found: dict[str, Any] = motion._given | linearizer.along(motion.q, motion.v, motion.u_base)
     names = ("state_names", "input_names", "output_names")
     made = LinearTrajectory(**found, **{key: linearizer.prepared.common[key] for key in names})
-    object.__setattr__(made, "flow", motion.flow)  # what it has found of the same motion
+    object.__setattr__(made, "flow", motion.flow)  # keep cached results of the same motion
     return made
 
 
-# Steps are halved until the transition of a sample is this accurate.
+# Steps are halved until the transition matrix of a sample has this accuracy.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
-# Samples that are integrated at once.
+# Number of samples that are integrated at once.
 _BATCH = 64
 
 
 class Steps(NamedTuple):
-    """Steps (m,) of constant F = [[A, B], [0, 0]] through a sample."""
+    """Steps (m,) through a sample, each with constant F = [[A, B], [0, 0]]."""
 
     F: Array  # (m, nx + nu, nx + nu)
     h: Array  # (m,) [s]
     maps: Array  # (m, nx, nx + nu)
-    nodes: Array  # (m, 2) times of the heavy and the light node of F [s]
+    nodes: Array  # (m, 2) [s] times of the nodes of F with the larger and the smaller weight
 
 
 def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
@@ -292,15 +299,15 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
 
 
 def _agree(whole: Array, coarse: Array) -> bool:
-    # Halves are more accurate by sixteen times, of which four are kept in reserve.
+    # Half steps are 16 times as accurate. A factor of 4 of this is assumed, the rest is a reserve.
     apart, size = (np.abs(each).max(axis=0) for each in (whole - coarse, whole))
     return bool((0.25 * apart <= _ACCURACY * size).all())
 
 
 def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:
-    """Return the steps and transition of samples, with so many parts between their cuts."""
-    share = np.arange(parts) / parts
-    start = [(t[:-1, None] + np.diff(t)[:, None] * share).ravel() for t in cuts]
+    """Return the steps and transition of samples, with `parts` steps between their cuts."""
+    fraction = np.arange(parts) / parts
+    start = [(t[:-1, None] + np.diff(t)[:, None] * fraction).ravel() for t in cuts]
     h = np.concatenate([np.repeat(np.diff(t) / parts, parts) for t in cuts])
     nodes = np.concatenate(start)[:, None] + np.array(GAUSS) * h[:, None]
     A, B = traj.matrices_at(nodes.ravel())

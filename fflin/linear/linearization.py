@@ -17,7 +17,7 @@ from fflin.base.validation import Array, frozen, truth, vector
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import Chart, Standing, refuse_orbit, unknown_frame
 from fflin.dynamics.orbital import mean_motion
-from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, rotor_names
+from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
 from fflin.linear.model import LinearModel
@@ -25,11 +25,11 @@ from fflin.linear.state_equations import assemble, at_rest, drift, output_equati
 from fflin.linear.verification import certify, inertia_matrix
 from fflin.robot.joints import ROOT
 from fflin.robot.limits import magnitudes_of
-from fflin.robot.mass_properties import require_inertia
+from fflin.robot.mass_properties import require_inertia, rotor_names
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
-# A model whose squares add up to more counts as not finite, since its eigenvalues would overflow.
+# Models with a larger sum of squared entries are refused, since their eigenvalues would overflow.
 LARGEST = 1e200
 
 if TYPE_CHECKING:
@@ -44,24 +44,24 @@ class Prepared:
     robot: Robot
     map: StateMap
     actuation: Actuation
-    sensing: Sensing | None  # None where the outputs are the state
+    sensing: Sensing | None  # None if the outputs are the state
     moving: bool
-    own_reference: bool  # the base's own placement at each point, not that of `map`
-    reference: Array  # (7,) the placement of `map`: position [m] and quaternion x, y, z, w
-    free: bool  # whether at rest all of a model but M^-1 is in `common` and `rest`
-    common: Mapping[str, Any]  # fields of a model that are the same about all points
-    rest: Mapping[str, Array]  # its A, f0, u0 and v where nothing moves, pulls or pushes
+    own_reference: bool  # whether the reference is the base placement at each point
+    reference: Array  # (7,) reference of `map`: position [m] and quaternion x, y, z, w
+    free: bool  # whether `common` and `rest` contain all of a model at rest except M^-1
+    common: Mapping[str, Any]  # fields of a model that are the same at all points
+    rest: Mapping[str, Array]  # A, f0, u0 and v of a model at rest without any forces
 
     @cached_property
     def fields(self) -> dict[str, Any]:
-        """Fields of a model at rest except B and q; expensive fields are computed on demand."""
+        """Fields of a model at rest except B and q; slow ones are computed at their first use."""
         state = partial(_state_at, self)
         asked = {"x0": state, "y0": state, "_reference": partial(own_reference, self.robot)}
         other = {} if self.own_reference else {"_reference": self.reference}
         return {**self.common, **self.rest, "_computed": asked, **other}
 
     def kernel(self) -> RowAccelerations:
-        """Return the compiled accelerations; `InputError` if the robot has none."""
+        """Return the compiled accelerations; raise `InputError` if the robot has none."""
         from fflin.kernel.derivatives import RowAccelerations
         from fflin.kernel.tree import batch_tree
 
@@ -74,7 +74,7 @@ class Prepared:
 
     @property
     def not_compilable(self) -> str:
-        """Reason why the robot has no compiled accelerations; empty if it has."""
+        """Reason why the robot has no compiled accelerations, or an empty text."""
         from fflin.kernel.tree import batch_tree
 
         name = self.robot.name
@@ -94,15 +94,15 @@ def prepare(
         refuse_orbit(robot, "models with moving=True")
     if frame is None:
         frame = "local" if moving else None
-    elif not isinstance(frame, str):  # nor one whose comparison below is an array
+    elif not isinstance(frame, str):  # such as an array, which cannot be compared below
         raise unknown_frame(frame)
     if moving and (reference is not None or frame != "local"):
         raise InputError(
-            "moving=True gives the error in the moving base's own axes, but a reference or a frame "
-            "other than 'local' is given; leave both out"
+            "moving=True measures the error in the axes of the moving base, so no reference and "
+            "no frame other than 'local' can be given; leave out reference and frame"
         )
     state = StateMap(robot, reference=reference, frame=frame)
-    own = reference is None and robot.orbit is None  # in orbit it is the orbit's frame
+    own = reference is None and robot.orbit is None  # in orbit the reference is the orbit frame
     require_inertia(robot)
     actuation = Actuation(state)
     sensing = None
@@ -164,7 +164,7 @@ def _state_at(ready: Prepared, lin: LinearModel) -> Array:
 
 
 def own_reference(robot: Robot, lin: LinearModel) -> Array:
-    """Return the base placement (7,) of a model, its default reference."""
+    """Return the base placement (7,) at a model's point, which is the default reference."""
     q = lin.q
     root = robot.model.jointPlacements[ROOT]
     if root.isIdentity(0.0):
@@ -177,8 +177,8 @@ _STANDING: Chart = Standing()
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     """Return the names of the ignorable coordinates of a linear model of this robot."""
-    # Found on the robot and not at a point: uniform gravity is the same everywhere, and without it
-    # error dynamics do not depend on the attitude either. In an orbit all of it matters.
+    # They depend on the robot, not on the point. Uniform gravity is the same everywhere. Without
+    # gravity, error dynamics do not depend on the attitude. In orbit, position and attitude matter.
     if robot.orbit:
         return tuple(f"q_m.{name}" for name in rotor_names(robot))
     groups = ["r_b"] if any(robot.gravity) or not lin.moving else ["q_b", "r_b"]
@@ -187,24 +187,28 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
 
 
 class Linearizer:
-    r"""Linearisation of one robot at many points; data common to all points are prepared once.
+    r"""Linearise one robot about many operating points; common data are computed only once.
 
-    Threads may share a `Linearizer`, but only one thread computes at a time. Every copy, also by
-    pickle, has a separate work space.
+    Threads may share a `Linearizer`, but only one thread computes at a time. To compute in
+    parallel, copy or pickle the `Linearizer`: every copy has a separate work space.
 
-    At rest, with N = blkdiag(E3/2, E3, En) and the joint-space inertia M in state order,
+    About a point at rest, the matrices of the linear model are
 
     .. math::
         A = \begin{bmatrix} 0 & N \\ 0 & 0 \end{bmatrix}, \qquad
         B = \begin{bmatrix} 0 \\ M^{-1} \end{bmatrix}.
 
-    At other points :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
-    :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`, then transformed to the chart and the
-    velocity frame. The dynamics do not depend on the position and linear velocity of the base
-    (Galilean invariance). The evaluation sets the position and linear velocity of the base to
-    zero, so that a large distance from the origin does not reduce the accuracy. The equations are
-    in docs/derivation.md. Section 14 of this document is about a robot in orbit, whose rates are
-    relative to the orbital frame.
+    M is the joint-space inertia in state order, and N = blkdiag(E3/2, E3, En) with identity
+    matrices E3 and En of sizes 3 and n.
+
+    About other points, the acceleration :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is
+    differentiated in base axes as :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`, where
+    rnea is the inverse dynamics. The derivatives are then transformed to the attitude chart and to
+    the axes of `frame`. The position
+    and linear velocity of the base do not affect the dynamics (Galilean invariance). Therefore they
+    are set to zero in the computation, so that a large distance from the origin does not reduce the
+    accuracy. docs/derivation.md derives the equations; its section 14 treats robots in orbit, whose
+    velocities are relative to the orbital frame.
 
     Parameters
     ----------
@@ -213,15 +217,16 @@ class Linearizer:
         Axes of the base velocities and wrenches, see `StateMap`. The default is "hybrid". For a
         robot in orbit, the frames are "lvlh" (default) and "hill".
     reference : pin.SE3, optional
-        Placement to which attitude and position are relative. The default is the base placement
-        at each point, so that q_b and r_b are zero at the point. For a robot in orbit, the
-        default is the orbital frame.
+        Placement relative to which the attitude and position of the base are measured. The default
+        is the base placement at each operating point, so that q_b and r_b are zero there. For a
+        robot in orbit, the default is the orbital frame.
     moving : bool
         Whether to return the error dynamics about a moving reference, which passes through the
-        point and obeys the dynamics of the robot. The errors are
-        :math:`q_b = \mathrm{vec}(q^{*-1} q)` and :math:`r_b = R^{*T} (p - p^*)`, the frame is
-        "local", and f0 is zero. Trajectories require a moving reference, and so do relative
-        equilibria such as a steady spin.
+        operating point and obeys the dynamics of the robot. The frame is then "local", and f0 is
+        zero. With the attitude q (rotation matrix R) and the position p of the base, the errors are
+        :math:`q_b = \mathrm{vec}(q^{*-1} q)` and :math:`r_b = R^{*T} (p - p^*)`; a star denotes the
+        reference. Use a moving reference for trajectories, and for relative equilibria such as a
+        steady spin.
 
     Raises
     ------
@@ -231,17 +236,17 @@ class Linearizer:
         - the frame is unknown, or the reference is not a pin.SE3;
         - `moving` is given with a reference, or with a frame other than "local".
     SingularInertiaError
-        If M is singular at every configuration.
+        If the inertia M is singular at every configuration.
     ModelError
-        If Pinocchio's Data for the robot would exceed 1 GiB, or its model was changed after the
-        robot was made.
+        If Pinocchio's Data for the robot would exceed 1 GiB, or the robot's Pinocchio model
+        (``robot.model``) was modified after the robot was created.
 
     Attributes
     ----------
     robot : Robot
         The robot that is linearised.
     prepared : Prepared
-        Data that are the same for all points.
+        Prepared data, which are the same for all operating points.
 
     References
     ----------
@@ -268,14 +273,14 @@ class Linearizer:
         self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
         self.robot = robot
         self._data = robot.create_data()
-        self._lock = Lock()  # of the work space
+        self._lock = Lock()  # protects the work space
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
-        # What stands for rest and no input.
+        # Default velocity and inputs: rest and zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
-        # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
+        # If only inputs act at rest, a model at rest is known in advance except for M^-1 in B.
         self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
@@ -293,12 +298,12 @@ class Linearizer:
         with self._lock:
             if known:
                 return self._at_rest(q)
-            # An overflow is refused below, so NumPy need not warn of it.
+            # `_require_finite` reports an overflow, so NumPy need not warn of it.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A copy, in this process or another, needs a work space of its own.
+        # A copy needs its own work space, so it is built from the arguments.
         ready = self.prepared
         reference = None if ready.own_reference else ready.map.reference
         options: dict[str, Any] = {"frame": ready.map.frame, "reference": reference}
@@ -335,9 +340,9 @@ class Linearizer:
         return LinearModel(self._fields | made)
 
     def along(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
-        """Return A, B, C, D and y (N, ..) about rows of valid points, with u in base axes.
+        """Return A, B, C, D and y (N, ..) about N valid points, with the inputs u in base axes.
 
-        The models must be relative to the placement of the base at each point.
+        Each model must be relative to the base placement at its point.
         """
         ready, lower, count = self.prepared, self._lower, len(q)
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing
@@ -372,7 +377,7 @@ class Linearizer:
 def _require_finite(*arrays: Array) -> None:
     """Raise `InputError` if the squares of the entries of an array overflow."""
     for array in arrays:
-        if not np.vdot(array, array) < LARGEST:  # nor NaN
+        if not np.vdot(array, array) < LARGEST:  # true for NaN as well
             raise InputError(
                 "the model is not finite, because q, v or u is too large; check their units"
             )
@@ -388,7 +393,7 @@ def linearize(
     reference: pin.SE3 | None = None,
     moving: bool = False,
 ) -> LinearModel:
-    """Linearise a robot about a point, by default at rest with neutral joints.
+    """Linearise a robot about an operating point, by default at rest with neutral joints.
 
     Parameters
     ----------
@@ -403,15 +408,18 @@ def linearize(
         Axes of the base's velocities and wrenches, see `StateMap`; by default
         "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
-        Pose that attitude and position are relative to; by default the base pose,
-        or the orbit's frame if the robot is in orbit.
+        Pose relative to which the attitude and position of the base are measured. The
+        default is the base pose at the operating point, or the orbital frame if the
+        robot is in orbit.
     moving : bool
-        Return the error dynamics about a reference that moves through the point.
+        Whether to return the error dynamics about a reference that moves through the
+        operating point; see `Linearizer`.
 
     Returns
     -------
     LinearModel
-        See `Linearizer` for the equations, and to linearise at many points.
+        Linear model, with the equations in `Linearizer`. To linearise about many
+        operating points, use `Linearizer`.
 
     Raises
     ------
@@ -420,9 +428,9 @@ def linearize(
     ChartError
         If the base is rotated by 180 deg from the reference.
     SingularInertiaError
-        If a joint moves no mass.
+        If the inertia matrix is singular because a joint moves no mass.
     ModelError
-        If the robot is too large.
+        If the robot is too large for the memory limit, see `Linearizer`.
 
     Examples
     --------

@@ -25,20 +25,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Certificate of a linear model: residuals, which should be of the order of round-off errors.
+    """Residuals that show how accurate a linear model is.
+
+    In an accurate model, the residuals are of the order of round-off errors; see `condition`.
 
     Attributes
     ----------
     condition : float
-        Condition number of M scaled to a unit diagonal. The expected residuals are about the
-        condition number times machine precision.
+        Condition number of the inertia matrix M after scaling to a unit diagonal. Residuals of
+        about this number times machine precision are expected.
     inertia_residual : float
-        Largest entry of M M^-1 - I, with M scaled as for `condition`.
+        Largest entry of M M^-1 - I, where M is scaled to a unit diagonal.
     route_A, route_B : float
-        Largest difference between A and B of this model and A and B from Pinocchio's ABA
+        Largest difference between A (or B) and the matrix that follows from Pinocchio's ABA
         derivatives, relative to the largest entry of the same block.
     f0 : float
-        Largest entry of the state derivative at the point; 0 at a fixed point.
+        Largest entry of the state derivative at the operating point; 0 at a fixed point.
 
     Examples
     --------
@@ -78,10 +80,11 @@ class StateSpace(FrozenArrays):
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
 class LinearModel(StateSpace):
-    r"""Linear model about a point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
+    r"""Linear model about an operating point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
-    The output is ``y = y0 + C (x - x0) + D (u - u0)``. If ``dt > 0``, the left side is ``x - x0``
-    at the next sample, and f0 is the constant term of each step. Arrays are read-only.
+    The output is ``y = y0 + C (x - x0) + D (u - u0)``. If ``dt > 0``, the model is in discrete
+    time: the left side of the state equation is then ``x - x0`` at the next sample, and f0 is the
+    constant term of each step. Arrays are read-only.
 
     Attributes
     ----------
@@ -94,9 +97,10 @@ class LinearModel(StateSpace):
     D : ndarray (ny, nu)
         Feedthrough matrix.
     f0 : ndarray (nx,)
-        Nonlinear right-hand side at the point; exactly zero at a fixed point.
+        State derivative of the nonlinear model at the operating point; exactly zero at a fixed
+        point.
     x0, u0, y0 : ndarray (nx,), (nu,), (ny,)
-        State, input and output at the point.
+        State, input and output at the operating point.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
@@ -104,26 +108,29 @@ class LinearModel(StateSpace):
     state_units, input_units, output_units : tuple of str
         Units of states, inputs and outputs.
     frame : str
-        Axes of velocities and wrenches: "hybrid", "local" or "world"; in orbit "lvlh" or "hill".
+        Axes of velocities and wrenches, see `StateMap`: "hybrid", "local" or "world"; in orbit
+        "lvlh" or "hill".
     moving : bool
-        Whether the state is the error relative to a reference that moves through the point.
+        Whether the state is the error relative to a reference that moves through the operating
+        point.
     q : ndarray (nq,)
-        Configuration of the point in Pinocchio's order.
+        Configuration at the operating point in Pinocchio's order.
     v : ndarray (nv,)
-        Velocity of the point in Pinocchio's order.
+        Velocity at the operating point in Pinocchio's order.
     robot : str
         Name of the robot.
     urdf_sha256 : str
         Hash of the URDF as it was read; empty if there is no URDF.
     locked : tuple of str
-        "joint=value" [rad|m] of each welded joint.
+        Text "joint=value" [rad|m] for each welded joint.
     fflin_version, pinocchio_version : str
         Versions of the packages that made the model.
     verified : bool
         True for a model computed in this session, or read from a file with a valid SHA-256 digest.
-        False for a model read from a file without a digest, and for every result of such a model.
+        False for a model read from a file without a digest, and for every result computed from
+        such a model.
     weights : mapping
-        Default weights of `lqr`, in the form of `Robot.replace`.
+        Default weights of `lqr`, with the keys of `weights` in `Robot.replace`.
     mean_motion : float
         Mean motion of the robot's orbit [rad/s]; 0 without an orbit.
 
@@ -152,18 +159,18 @@ class LinearModel(StateSpace):
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     _drift: Array | None = None
-    # Of a sampled model: its own fingerprint and the continuous model that it was made of, whose
-    # structure no exponential has blurred.
+    # Of a discrete-time model: its fingerprint and its continuous-time model, which still has the
+    # exact zeros that the matrix exponential loses.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
     weights: Mapping[str, Any] = field(default_factory=dict)
-    _robot: Robot | None = None  # that it was made of; None where it is from a file
+    _robot: Robot | None = None  # robot of the model; None for a model from a file
     mean_motion: float = 0.0
 
     def __init__(self, shared: Mapping[str, Any] | None = None, /, **fields: Any) -> None:
-        # The __init__ of a dataclass sets three dozen frozen fields one by one, which takes as long
-        # as the dynamics of a small robot. Most of them are `shared` by the models of a robot.
+        # A dataclass would set three dozen frozen fields one by one, which takes as long as the
+        # dynamics of a small robot. Here, most fields are in `shared` for all models of a robot.
         for name, value in fields.items():
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 fields[name] = frozen(value.copy())
@@ -189,22 +196,22 @@ class LinearModel(StateSpace):
 
     @property
     def reference(self) -> pin.SE3:
-        """Placement oMref to which attitude and position are relative."""
+        """Placement oMref relative to which the attitude and position of the base are measured."""
         import pinocchio as pin
 
         return pin.XYZQUATToSE3(self.placement)
 
     @property
     def placement(self) -> Array:
-        """The `reference` as an array (7,): position [m] and quaternion x, y, z, w."""
+        """The placement `reference` as an array (7,): position [m] and quaternion x, y, z, w."""
         return self._reference
 
     @property
     def drift(self) -> Array | None:
         """State derivative (nx,) of a moving reference, or None if the reference is fixed.
 
-        The attitude rate excludes rotation about the direction of gravity, which has no effect.
-        If the reference moves, f0 is zero.
+        The attitude rate excludes rotation about the direction of gravity, because this rotation
+        does not affect the dynamics. If the reference moves, f0 is zero.
         """
         return self._drift
 
@@ -215,30 +222,31 @@ class LinearModel(StateSpace):
 
     @property
     def fingerprint(self) -> str:
-        """Hash of A, B and f0, the arrays that the certificate covers."""
+        """Hash of A, B and f0, used to detect later changes of these matrices."""
         digest = sha256()
         for array in (self.A, self.B, self.f0):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
     def require(self, fingerprint: str) -> None:
-        """Raise `InputError` if the matrices differ from the certified ones."""
+        """Raise `InputError` if the hash of A, B and f0 differs from an earlier `fingerprint`."""
         if self.fingerprint != fingerprint:
             raise InputError(
-                "A, B or f0 were changed after they were certified; check them with "
-                "fflin.check(robot, lin) instead"
+                "A, B or f0 was changed after the certificate was computed; check the model with "
+                "fflin.check(robot, lin)"
             )
 
     def require_unchanged(self) -> None:
-        """Raise `ModelError` if the robot's Pinocchio model was changed after `load`."""
+        """Raise `ModelError` if the robot's Pinocchio model was modified after its creation."""
         if self._robot is not None:
             self._robot.require_unchanged()
 
     @property
     def generator(self) -> LinearModel | None:
-        """Continuous-time model from which this model was sampled, or the model itself.
+        """The model itself, or the continuous-time model from which it was discretised.
 
-        The value is None if the sampled model is from a file or its matrices were changed.
+        The value is None for a discrete-time model that was read from a file, or whose matrices
+        were changed.
         """
         if not self.dt:
             return self
@@ -247,64 +255,70 @@ class LinearModel(StateSpace):
 
     @cached_property
     def certificate(self) -> Certificate:
-        """Certificate with the residuals of the model, computed at the first access."""
+        """Residuals of the model, computed at the first access."""
         return self._certify(self)
 
     @cached_property
     def ignorable(self) -> tuple[str, ...]:
-        """Names of the states on which the dynamics do not depend, derived from the robot.
+        """Names of the states that do not affect the dynamics, as derived from the robot.
 
         The ignorable states are:
 
         - the base position, except in orbit;
-        - the angles of rotors (joints whose link is symmetric about the axis and carries no link);
+        - the angles of rotors, which are joints whose link is symmetric about the joint axis and
+          carries no other link;
         - the base attitude, for `moving` models without gravity.
         """
         return () if self._ignorable is None else self._ignorable(self)
 
     @cached_property
     def limits(self) -> Mapping[str, float]:
-        """{name of an input or state: limit}, from the URDF, the inputs and `Robot.limits`.
+        """Limits {name of an input or state: limit} from the URDF, the inputs and `Robot.limits`.
 
-        The limit of an input is its largest force or torque. The limit of ``qdot_m`` is the largest
-        speed [rad/s | m/s]. The limit of ``q_m`` is the whole range of travel [rad | m].
+        The limit of an input is its largest force or torque. The limit of a joint velocity in
+        ``qdot_m`` is the largest speed [rad/s | m/s]. The limit of a joint position in ``q_m`` is
+        the difference between its upper and lower limits [rad | m].
         """
         return {} if self._limits is None else self._limits()
 
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
-        """Return whether the point is a fixed point or a relative equilibrium.
+        """Return whether the operating point is a fixed point or a relative equilibrium.
 
-        At a relative equilibrium, ignorable coordinates move at constant rates, and all other
-        coordinates are at rest. Examples are a spinning rotor and a base with constant velocity.
-        At fixed points and relative equilibria, A and B are constant in time. With
-        ``moving=True`` the motion of the reference is tested instead of f0:
+        In both cases, A and B are constant in time. At a relative equilibrium, coordinates that are
+        `ignorable` move at constant rates, and all other coordinates are at rest. For example, a
+        rotor spins, or the base has a constant velocity.
+
+        By default, the entries of f0 are tested. For a model with ``moving=True``, f0 is always
+        zero, so the motion of the reference is tested instead:
 
         - the velocities of the reference in base axes must be constant;
-        - no joint except rotors may move;
+        - all joints except rotors must be at rest;
         - under gravity, the base may rotate only about the vertical.
 
         Parameters
         ----------
         tol : float
-            Largest permitted rate of a coordinate that is not ignorable, in SI units. In orbit the
-            tolerance is multiplied by the mean motion, because the gravity gradient is weak.
+            Largest permitted rate, in SI units, of a coordinate that is not ignorable. In orbit
+            the tolerance is multiplied by the mean motion, because the gravity gradient causes only
+            small accelerations.
         """
         rate = self.f0 if self.drift is None else self.drift
         judged = [name not in self.ignorable for name in self.state_names]
         return bool(np.abs(rate[judged]).max(initial=0.0) <= self.bound(number("tol", tol)))
 
     def bound(self, tol: float) -> float:
-        """Return the tolerance of rates at an equilibrium, scaled by the mean motion in orbit."""
+        """Return the largest rate at an equilibrium: `tol`, or `tol` times mean motion in orbit."""
         return tol * min(1.0, self.mean_motion or 1.0)
 
     def discretize(self, dt: float) -> LinearModel:
-        r"""Return the sampled model, with the input held constant between samples.
+        r"""Return the discrete-time model, with the input held constant between samples.
 
         .. math::
             A_d = e^{A h}, \quad [B_d, f_d] = \int_0^h e^{A s}\,ds\,[B, f_0]
 
-        At rest A^2 = 0, so that the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B
-        h^2/2`, (2.2) of docs/derivation.md. E is the identity.
+        At rest A^2 = 0, so that the series of the exponential ends after two terms:
+        :math:`A_d = E + A h` and :math:`B_d = B h + A B h^2/2`, with the identity E; see (2.2) of
+        docs/derivation.md.
 
         Parameters
         ----------
@@ -314,14 +328,16 @@ class LinearModel(StateSpace):
         Returns
         -------
         LinearModel
-            Sampled model with ``dt`` set and the certificate of the continuous-time model.
+            Discrete-time model with sampling time ``dt``. Its `certificate` is the certificate of
+            the continuous-time model.
 
         Raises
         ------
         InputError
-            If `dt` is not positive or the model is already sampled.
+            If `dt` is not positive or the model is already in discrete time.
         ModelError
-            If the robot's Pinocchio model was changed after `load`.
+            If the robot's Pinocchio model (``robot.model``) was modified after the robot was
+            created.
         """
         self.require_unchanged()
         dt = positive("dt", dt, "s")
@@ -342,7 +358,7 @@ class LinearModel(StateSpace):
         return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
 
     def to(self, tool: str, *, dt: float | None = None) -> ToolModel:
-        """Return the model in another tool's coordinates, see `transform`."""
+        """Return the model in the coordinates of another tool, see `transform`."""
         from fflin import transform
 
         if self._robot is None:
@@ -352,7 +368,10 @@ class LinearModel(StateSpace):
         return transform(self._robot, self, tool, dt=dt)
 
     def to_scipy(self) -> Any:
-        """Return a `scipy.signal.StateSpace` of the deviations, without names and f0."""
+        """Return the model of the deviations from x0 and u0 as a `scipy.signal.StateSpace`.
+
+        Signal names and f0 are omitted, because a `StateSpace` cannot contain them.
+        """
         from scipy.signal import StateSpace
 
         self.require_unchanged()
@@ -360,14 +379,17 @@ class LinearModel(StateSpace):
         return StateSpace(*matrices, dt=self.dt) if self.dt else StateSpace(*matrices)
 
     def to_control(self) -> Any:
-        """Return a `control.StateSpace` of the deviations, with signal names and without f0.
+        """Return the model of the deviations from x0 and u0 as a `control.StateSpace`.
+
+        The `StateSpace` has the signal names of the model. The constant f0 is omitted.
 
         Raises
         ------
         MissingPackageError
             If python-control is not installed.
         ModelError
-            If the robot's Pinocchio model was changed after `load`.
+            If the robot's Pinocchio model (``robot.model``) was modified after the robot was
+            created.
         """
         self.require_unchanged()
         matrices = (self.A, self.B, self.C, self.D)
@@ -379,8 +401,8 @@ class LinearModel(StateSpace):
         Parameters
         ----------
         path : str or Path
-            Path that ends in .npz, .mat, .json or .csv. For .csv, each matrix is written to its
-            own file, NAME.A.csv and so on.
+            Path that ends in .npz, .mat, .json or .csv. For .csv, each matrix is written to a
+            separate file, such as NAME.A.csv.
 
         Raises
         ------
@@ -396,7 +418,7 @@ class LinearModel(StateSpace):
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:
-        """Read a model that `save` wrote; every value is restored bit for bit.
+        """Read a model that `save` wrote, and restore every value bit for bit.
 
         Raises
         ------
@@ -429,6 +451,6 @@ def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
 
 
 def same_certificate(whole: LinearModel, fingerprint: str, made: LinearModel) -> Certificate:
-    """Return the certificate of the source of a model, if its matrices are unchanged."""
+    """Return the certificate of a continuous-time model, if a model made from it is unchanged."""
     made.require(fingerprint)
     return whole.certificate

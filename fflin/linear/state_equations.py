@@ -38,11 +38,11 @@ def assemble(
     *,
     moving: bool,
 ) -> Array:
-    """Write A (.., nx, nx) and the lower half of B about one point or many; return f0 (.., nx).
+    """Complete A (.., nx, nx) and the lower half of B at one or many points; return f0 (.., nx).
 
-    The slopes of `rates` are the lower half of A itself, and their by_u that of B: both are
-    converted in place from base axes to the chart and the frame. The upper half of A is that of
-    `at_rest`.
+    On entry, the upper half of A is the one of `at_rest`. `rates.slopes` is a view of the lower
+    half of A, and `rates.by_u` a view of the lower half of B. Both are converted in place from base
+    axes to the chart and the frame.
     """
     g, nv, lower = state.groups, state.nx // 2, rates.slopes
     omega_in_reference, v_in_reference = state.axes
@@ -53,7 +53,7 @@ def assemble(
     theta = _over_rotations(state, actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
 
-    # Attitude and position; `at_rest` is what does not change at the reference.
+    # Attitude and position; at the reference, the remaining blocks are those of `at_rest`.
     if moving:
         A[..., g.q_b, g.q_b] = A[..., g.r_b, g.r_b] = -W  # (5.2), (5.3)
     else:
@@ -70,7 +70,7 @@ def assemble(
     # Accelerations, still in base axes.
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
-        # The columns of the base's linear velocity are zeros.
+        # The columns of the base's linear velocity are zero, so they need no rotation.
         chart.turn_columns((ANGULAR,) if omega_in_reference else (), rates.by_nu)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
         actuation.turn_columns(chart, rates.by_u)
@@ -104,7 +104,7 @@ def _over_rotations(
 ) -> Array:
     """Return the derivatives Theta (.., 6 + n, 3) of `rates` over base rotations (4.4)."""
     omega_in_reference, v_in_reference = state.axes
-    # Derivatives of the accelerations alone are zero here without an orbit.
+    # `by_turn`, the derivative in base axes, is zero without an orbit.
     theta, c = rates.by_turn, rates.c
     for columns in actuation.held if np.count_nonzero(u) else ():
         theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
@@ -121,7 +121,7 @@ def _over_rotations(
 
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
-    """Return the own rate (.., nx) of a reference that moves along, after (5.3)."""
+    """Return the state derivative (.., nx) of a moving reference, see below (5.3)."""
     weight = (gravity * gravity).sum(axis=-1, keepdims=True) if state.falls else np.zeros(1)
     if not np.count_nonzero(weight):
         return f0

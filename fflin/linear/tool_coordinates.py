@@ -1,4 +1,4 @@
-"""Conventions of tools for a free flyer, one row of `TOOLS` each, and their derivatives."""
+"""Conventions of other tools for a free flyer (`TOOLS`), and derivatives of their coordinates."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# Along a motion by so little that its square is nothing: derivatives without any difference.
+# Complex step along a motion. It is so small that its square vanishes, so derivatives are exact.
 _STEP = 1e-20j
 
 _NAMES = {"wxyz": ["quat.w", "quat.x", "quat.y", "quat.z"], "euler": ["roll", "pitch", "yaw"]}
-_UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # of the others rad and rad/s
+_UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # all others have rad or rad/s
 
 
 class Convention(NamedTuple):
     """Convention of a tool for a free flyer."""
 
-    # In x: "wxyz", "q_b", "euler", or a tangent vector: "tangent", or "pose" with the position.
+    # Attitude in x: "wxyz", "q_b", "euler", "tangent" (a rotation vector), or "pose" (a tangent
+    # vector together with the position).
     attitude: str
-    stored: str  # in q
+    stored: str  # attitude in q
     angular_first: bool
-    axes: tuple[bool, bool]  # whether (omega, v), and (torque, force), stand in the world's axes
-    at_centre: bool = False  # of the root link's own mass, in the axes that its inertia has
-    rates: bool = False  # of the angles in place of omega
+    axes: tuple[bool, bool]  # whether (omega, v), and (torque, force), are in world axes
+    at_centre: bool = False  # base frame at the root link's centre of mass, in its inertia's axes
+    rates: bool = False  # angle rates in place of omega
 
 
 TOOLS = {
@@ -49,44 +50,45 @@ TOOLS = {
 class Jacobians(NamedTuple):
     """Derivatives of coordinates x' and inputs u' at a point, over y (15.1) and u in base axes."""
 
-    P: Array  # of x' over y (15.2)
-    rate: Array  # of P along the motion
+    P: Array  # dx'/dy (15.2)
+    rate: Array  # time derivative of P along the motion
     left: Array  # left inverse of P
-    V: Array  # of u over u'
-    H: Array  # of u over y, u' held (15.4)
-    extra: Array  # of dx'/dt along what y has not: the length of a quaternion (15.5)
+    V: Array  # du/du'
+    H: Array  # du/dy for constant u' (15.4)
+    extra: Array  # derivative of dx'/dt along the length of a quaternion, which y lacks (15.5)
 
 
 class ToolCoordinates:
-    """Coordinates relative to the reference of a `StateMap`: a tool's, or a linear model's own."""
+    """Coordinates of a tool, or of a linear model, relative to the reference of a `StateMap`."""
 
     def __init__(self, state: StateMap, tool: str = "", *, moving: bool = False) -> None:
         robot, own = state.robot, not tool
         kind = TOOLS[tool] if tool else Convention("q_b", "xyzw", True, state.axes)
         self.state, self.convention, self._moving = state, kind, moving
         self.tangent = kind.attitude in ("tangent", "pose")
-        self._roll = 0 if kind.angular_first else 3  # from angular, linear to the tool's order
+        self._roll = 0 if kind.angular_first else 3  # from (angular, linear) to the tool's order
         self._world = np.repeat(kind.axes, 3)[:, None]
         self._base = _centre(robot) if kind.at_centre else pin.SE3.Identity()
-        swap = np.roll(np.arange(6), 3)  # of Pinocchio's linear, angular
-        # Displacements and twists of the tool's base are X y and X nu, wrenches on it X^-T w.
+        swap = np.roll(np.arange(6), 3)  # from Pinocchio's (linear, angular)
+        # The tool's base has the displacement X y, the twist X nu and the wrench X^-T w.
         self._X: Array = self._base.toActionMatrixInverse()[np.ix_(swap, swap)]
         followers = [] if own else [follower.joint for follower in robot.followers]
         self.joints = sorted((*robot.joints, *followers), key=lambda joint: joint.idx_v)
         if kind.stored in ("wxyz", "matrix") and robot.file_joints:
             self.joints.sort(key=lambda joint: _joint_path(robot, joint.name))
         self._idx_v = [joint.idx_v for joint in self.joints]
-        # Of Pinocchio's v, for a unit of the tool's; only Pinocchio itself scales modal amplitudes.
+        # Velocity in nu per unit of the tool's velocity. Only Pinocchio scales modal amplitudes.
         scales = np.array([1.0 if kind.stored == "xyzw" and tool else j.scale for j in self.joints])
         self._scales = scales
         self.actuation = acting = Actuation(state)
-        self._wrench = wrench = acting.fixed[:6]  # of the inputs
+        self._wrench = wrench = acting.fixed[:6]  # wrench on the base per unit of each input
         if wrench[LINEAR].any() and not wrench[ANGULAR].any() and self._X[LINEAR, ANGULAR].any():
             raise InputError(
-                "a force of spart acts at the root link's centre of mass, and a BaseForce alone "
-                "cannot give its moment about the link's origin; give the robot a BaseTorque too"
+                "in spart, a base force acts at the centre of mass of the root link, so a "
+                "BaseForce needs a BaseTorque for its moment about the origin of the link; give "
+                "the robot a BaseTorque too"
             )
-        # Which of the robot's inputs stands where among the tool's.
+        # Index of the robot's input for each input of the tool.
         self._inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
         if not own:
             self._inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
@@ -96,7 +98,7 @@ class ToolCoordinates:
         self.inputs = {acting.names[i]: acting.units[i] for i in self._inputs}
 
     def states(self) -> dict[str, str]:
-        """Return {name: unit} of x'."""
+        """Return the names and units of x' as {name: unit}."""
         kind, found = self.convention, dict[str, str]()
         attitude = _NAMES.get(kind.attitude, ["theta.x", "theta.y", "theta.z"])
         omega = [f"{x}_rate" for x in attitude] if kind.rates else [f"omega.{x}" for x in "xyz"]
@@ -108,7 +110,7 @@ class ToolCoordinates:
         return found
 
     def vectors(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q and v as the tool has them, of valid ones of Pinocchio's."""
+        """Convert a valid Pinocchio configuration and velocity to the tool's q and v."""
         if (stored := self.convention.stored) == "xyzw":
             return q, v
         attitude, R = self._attitude(q)
@@ -124,7 +126,7 @@ class ToolCoordinates:
         return q, v
 
     def to_pinocchio(self, q: Any, v: Any) -> tuple[Array, Array]:
-        """Return Pinocchio's q and v from the tool's q and v; v None means rest."""
+        """Convert the tool's q and v to Pinocchio's q and v; v=None means rest."""
         robot, state, size = self.state.robot, self.state, 6 + len(self.joints)
         v = np.zeros(size) if v is None else vector("v", v, size, "the tool's: base, then joints")
         if self.convention.stored == "xyzw":
@@ -143,7 +145,7 @@ class ToolCoordinates:
         return robot.checked_configuration(at), robot.checked_velocity(speed)
 
     def _rotation(self, attitude: Array) -> Array:
-        """Return the rotation (3, 3) of an attitude as it is stored."""
+        """Return the rotation (3, 3) of an attitude stored in q."""
         if self.convention.stored == "euler":
             return pin.rpy.rpyToMatrix(*attitude)
         if self.convention.stored == "matrix":
@@ -157,7 +159,7 @@ class ToolCoordinates:
         return turning.rotation_matrix(np.roll(attitude, -1) / length)
 
     def _attitude(self, q: Array) -> tuple[Array, Array]:
-        """Return the quaternion x, y, z, w and the rotation that x' is about."""
+        """Return the quaternion x, y, z, w of the attitude in x', and its rotation matrix."""
         quaternion = quaternion_product(self.state.origin_quaternion, q[3:7])
         quaternion = quaternion_product(quaternion, pin.SE3ToXYZQUAT(self._base)[3:])
         if self.convention.attitude == "q_b":
@@ -173,14 +175,18 @@ class ToolCoordinates:
         return rotation
 
     def _held(self, parts: Array) -> Array:
-        """Return the derivatives (6, 3) over a rotation of world-fixed vectors, base axes (4.4)."""
+        """Return the derivatives (6, 3) of world-fixed vectors in base axes over a rotation (4.4).
+
+        Parts that are fixed in base axes have the derivative zero.
+        """
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
     def jacobians(self, q: Array, nu: Array, u: Array, rates: Array) -> Jacobians:
         """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) in base axes."""
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
         here, R_now = self._attitude(q)
-        # A step along the motion; errors and tangents go along with a reference that moves.
+        # Complex step along the motion. With a moving reference, errors and tangent vectors do not
+        # change along the motion.
         twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
         moved = (not self._moving) * _STEP * twist.real
         turns = 0.5 * turning.product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
@@ -211,7 +217,7 @@ class ToolCoordinates:
         extra = np.zeros((len(P), len(P)))
         if k == 7:
             extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(here, 1))
-        # By blocks, so that zeros stay zeros.
+        # Invert block by block, so that zeros remain exact.
         poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
         below = -twists @ P.real[first:, : 6 + n] @ poses
         left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
@@ -224,7 +230,7 @@ class ToolCoordinates:
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
-    """Return the tool's coordinates."""
+    """Return the coordinates of a tool; raise an error if the robot cannot have them."""
     if not isinstance(tool, str) or tool not in TOOLS:
         raise unknown("tool", str(tool), TOOLS)
     if tool[:5] != "euler":
@@ -256,7 +262,7 @@ def _left(P: Array) -> Array:
 
 
 def _angles(R: Array) -> Array:
-    """Return roll, pitch and yaw of R = R_z(yaw) R_y(pitch) R_x(roll), along a complex step too."""
+    """Return roll, pitch and yaw of R = R_z(yaw) R_y(pitch) R_x(roll); R may be complex."""
     if np.hypot(R[0, 0].real, R[1, 0].real) < SMALLEST_Q0:
         raise ChartError(
             "the pitch is 90 deg, where roll and yaw cannot be distinguished; use a tool without "
@@ -270,7 +276,7 @@ def _angles(R: Array) -> Array:
 
 
 def _of_angles(angles: Array, omega: Any = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
-    """Return G, with angle rates G omega, and the derivative of G omega over the angles."""
+    """Return the G of angle rates = G omega, and the derivative of G omega over the angles."""
     (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
     G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
     _, pitch, yaw = G @ omega

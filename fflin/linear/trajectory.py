@@ -1,4 +1,4 @@
-"""Trajectory: a motion of a robot given by knots, with held or linear inputs in between."""
+"""Trajectory: motion of a robot given by knots, with constant or linear inputs between knots."""
 
 from __future__ import annotations
 
@@ -23,21 +23,23 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
 from fflin.robot.robot import Robot
 
-# The largest residual of a motion of the robot.
+# Largest residual up to which knots count as a motion of the robot.
 _MOTION = 1e-2
 
-# Between two knots the base goes the shorter way, of less than half a turn [rad].
+# Largest rotation of the base between two knots [rad], so that its direction is unambiguous.
 _FARTHEST_TURN = 2.5
 
 _CAUSES = (
-    "usual causes: wrong hold, wrong axes (frame) of u or v, wrong units of t or of joints, or "
-    "other springs, damping or gravity"
+    "usual causes: wrong hold, wrong axes (frame) of u or v, wrong units of t or of the joints, "
+    "or springs, damping or gravity that differ from the robot"
 )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Design):
-    """Motion of a robot, given at knots; the arrays are copied and read-only.
+    """Motion of a robot, given by configurations, velocities and inputs at knots.
+
+    The arrays are copied and read-only.
 
     Parameters
     ----------
@@ -50,24 +52,28 @@ class Trajectory(Design):
     v : array_like (N, nv)
         Velocities in Pinocchio's order.
     u : array_like (N, nu) or (N - 1, nu)
-        Inputs at the knots. With N - 1 rows, each row applies to one interval between knots.
+        Inputs at the knots. If u has N - 1 rows, each row applies to one interval between knots.
     hold : {"linear", "previous"}, optional
-        Inputs between the knots: "linear" interpolates, "previous" holds the value of the previous
-        knot, like a digital controller. The default is "linear", or "previous" if u has N - 1
-        rows.
+        Inputs between the knots: "linear" interpolates, and "previous" holds the value of the
+        previous knot, like a digital controller. The default is "linear", or "previous" if u has
+        N - 1 rows.
     frame : {"local", "hybrid", "world"}
-        Axes of the force and torque on the base. Held forces and torques are constant in these
-        axes. local: base axes. hybrid: force in world axes, torque in base axes. world: force and
-        torque in world axes.
+        Axes of the force and torque on the base:
+
+        - local: force and torque in base axes;
+        - hybrid: force in world axes, torque in base axes;
+        - world: force and torque in world axes.
+
+        If the inputs are held ("previous"), the force and torque are constant in these axes.
     verified : bool
-        False for data from a file without a SHA-256 digest. Damage to such a file cannot be
+        False for data from a file without a SHA-256 digest, because damage to such a file cannot be
         detected.
 
     Raises
     ------
     InputError
-        If a size is wrong, the times do not increase, or a row is not a valid configuration,
-        velocity or input.
+        If an array has a wrong size, the times do not increase, or a row is not a valid
+        configuration, velocity or input.
 
     Examples
     --------
@@ -90,7 +96,7 @@ class Trajectory(Design):
     u: Array
     hold: str | None = field(default=None, kw_only=True)
     frame: str = field(default="local", kw_only=True)
-    _note: str = field(default="", kw_only=True)  # what is printed below it; no file has it
+    _note: str = field(default="", kw_only=True)  # note printed below; not saved in files
 
     def __post_init__(self) -> None:
         refuse_orbit(self.robot, "trajectories")
@@ -137,7 +143,7 @@ class Trajectory(Design):
         )
 
     def __str__(self) -> str:
-        """Show the trajectory with its residual as a motion of the robot."""
+        """Return a text about the trajectory, with its residual as a motion of the robot."""
         said = self._fault or f"residual {self.residual.max():.1e}"
         note = f"\n{folded([self._note])}" if self._note else ""
         return f"{folded(super().__str__().splitlines())}\n{folded([said])}{note}"
@@ -149,22 +155,23 @@ class Trajectory(Design):
 
     @cached_property
     def flow(self) -> Flow:
-        """Motion between the knots."""
+        """Interpolation of the motion between the knots."""
         return Flow(self._state, self.t, self.q, self.v, self.u, self.hold == "previous")
 
     @cached_property
     def u_base(self) -> Array:
-        """Inputs (N, nu) just after each knot; inputs on the base are in base axes."""
+        """Inputs (N, nu) just after each knot, with inputs on the base in base axes."""
         state = self._state
         return frozen(Actuation(state).in_base_axes(state.charts(self.q), self.u))
 
     @property
     def residual(self) -> Array:
-        """Residual (N,) of the motion at each knot: the larger error of the two adjacent intervals.
+        """Residual (N,) at each knot, which shows how well the motion obeys the robot's dynamics.
 
-        Each interval is integrated from its first knot under its inputs. The error of the interval
-        is the difference between the integrated state and the next knot, divided by the duration of
-        the interval and by the largest rate of the motion; see `Flow`.
+        In each interval, the dynamics are integrated from the first knot under the given inputs.
+        The error of the interval is the difference between the integrated state and the second
+        knot, divided by the duration of the interval and by the largest rate of the motion; see
+        `Flow`. The residual of a knot is the larger error of its two adjacent intervals.
         """
         found = self.flow.residual
         return np.maximum(np.append(found, 0.0), np.append(0.0, found))
@@ -172,7 +179,8 @@ class Trajectory(Design):
     def point(self, t: float) -> tuple[Array, Array, Array]:
         """Return q (nq,), v (nv,), and u (nu,) in base axes, at time t [s].
 
-        Between knots, q and v are cubics that match the robot's velocities and accelerations.
+        Between knots, q and v are cubic polynomials that match the robot's velocities and
+        accelerations at the knots.
 
         Raises
         ------
@@ -182,9 +190,9 @@ class Trajectory(Design):
         return self.flow.at(self._within(t))
 
     def resampled(self, dt: float) -> Trajectory:
-        """Return the same motion with knots every dt [s] and a knot at the end, see `point`.
+        """Return the motion with new knots every dt [s] and at the end, interpolated by `point`.
 
-        Held inputs are unchanged if every old knot is also a new knot.
+        Held inputs are reproduced exactly only if every old knot is also a new knot.
         """
         times = self.samples(dt)
         if times[-1] < self.t[-1]:
@@ -195,7 +203,7 @@ class Trajectory(Design):
         return Trajectory(self.robot, times, q, v, u, **kept)  # type: ignore[arg-type]
 
     def samples(self, dt: float) -> Array:
-        """Return the times every dt [s] from the first knot to the last."""
+        """Return times from the first knot to the last, dt [s] apart."""
         dt, duration = number("dt", dt), float(self.t[-1] - self.t[0])
         if not dt >= 1e-7 * duration:
             raise InputError(
@@ -207,11 +215,11 @@ class Trajectory(Design):
         return times
 
     def require(self, *, strict: bool = False) -> None:
-        """Warn if the residual of the motion exceeds 1e-2, or raise `InputError` if `strict`.
+        """Warn if the residual of the motion exceeds 1e-2; raise `InputError` instead if `strict`.
 
         The message gives the interval with the largest error, this error, and the number of
-        intervals with errors above 1e-2. If the motion overflows, `InputError` is raised in
-        either case.
+        intervals with errors above 1e-2. If the integration overflows, `InputError` is raised even
+        without `strict`.
         """
         fault = self._fault
         if fault and (strict or self.flow.residual.max() == np.inf):
@@ -221,7 +229,7 @@ class Trajectory(Design):
 
     @property
     def _fault(self) -> str:
-        """Return why the knots are not a motion of the robot; empty if they are."""
+        """Return why the knots are not a motion of the robot, or an empty text."""
         missed = self.flow.residual
         k = int(missed.argmax())
         where = f"'{self.robot.name}': from t = {self.t[k]:g} to {self.t[k + 1]:g} s"
@@ -239,7 +247,7 @@ class Trajectory(Design):
         if turns[k] > _FARTHEST_TURN:
             return (
                 f"the base rotates by {turns[k]:.2g} rad from t = {self.t[k]:g} to "
-                f"{self.t[k + 1]:g} s, which is too far for one interval; give knots at most "
+                f"{self.t[k + 1]:g} s, too far for one interval; give more knots, at most "
                 f"{_FARTHEST_TURN:g} rad apart"
             )
         return ""
@@ -263,14 +271,14 @@ class Trajectory(Design):
     ) -> Trajectory:
         """Read a trajectory that `save`, `Motion.save` or another program wrote.
 
-        A .npz, .mat or .json file has the entries
+        A .npz, .mat or .json file contains the entries
 
         - t (N,);
         - q and v, or the states x (N, nx) of `StateMap`;
         - u, with one row for each knot;
         - optionally the texts `hold` and `frame`.
 
-        A .csv file has the named columns
+        A .csv file contains the named columns
 
         - t;
         - q[0] ... and v[0] ..., or the names of the states, such as q_b.x;
@@ -282,8 +290,8 @@ class Trajectory(Design):
         path : str or Path
         robot : Robot
         hold, frame : str, optional
-            Options of `Trajectory`; by default as in the file. If the file contains x, `frame` is
-            also the frame of the velocities in x.
+            Options of `Trajectory`, by default as in the file. If the file contains x, `frame` also
+            defines the axes of the velocities in x.
 
         Raises
         ------
@@ -316,7 +324,7 @@ class Trajectory(Design):
 
 
 def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
-    """Return q (count, nq); single angles are replaced by their cosine and sine."""
+    """Return q (count, nq); if continuous joints are given as angles, convert to (cos, sin)."""
     rows, cosines = as_double("q", q), np.array(list(robot.unbounded), dtype=int)
     narrow = (count, robot.nq - len(cosines))
     if rows.shape == (count, robot.nq):
@@ -333,15 +341,15 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
 
 
 def along(motion: Any, robot: Robot | None) -> Trajectory:
-    """Return a motion by knots, with held or linear inputs, whose residual is smaller."""
+    """Convert a motion to a trajectory with constant or linear inputs, by the smaller residual."""
     if motion.phases:
         raise InputError(
-            "the motion has several phases, each with its own robot; convert each of its phases "
-            "separately"
+            "the motion has several phases, each with its own robot; convert each phase separately"
         )
     if robot is None:
         raise InputError(
-            "the motion was read from a file, which does not contain its robot; give the robot"
+            "the motion was read from a file, which does not contain its robot; give the robot, "
+            "motion.trajectory(robot)"
         )
     entries = {name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")}
     from fflin.linear.files import arguments

@@ -23,7 +23,6 @@ from fflin.dynamics.coordinates import (
     state_history,
     times,
 )
-from fflin.dynamics.orbital import field_of
 from fflin.dynamics.rnea import Inertia
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import Certificate, LinearModel
@@ -35,8 +34,8 @@ if TYPE_CHECKING:
 
     Index: TypeAlias = slice | NDArray[np.intp]
 
-# Terms that cancel exactly still leave their rounding, 1e-16 of their size. Counted with this
-# fraction they allow for it, and hide nothing larger.
+# Terms that cancel exactly still leave rounding errors of 1e-16 of their size. The scale of errors
+# contains this fraction of such terms, which allows for the rounding and hides no larger error.
 _ROUNDING_FRACTION = 1e-3
 
 
@@ -62,7 +61,7 @@ def scaled_condition(M: Array) -> float:
 
 
 def inertia_residual(M: Array, inverse: Array) -> float:
-    """Return the largest entry of ``M M^-1 - E`` with M scaled to a unit diagonal."""
+    """Return the largest entry of ``M M^-1 - I`` with M scaled to a unit diagonal."""
     scale = np.sqrt(M.diagonal())
     residual = M @ inverse - np.eye(len(M))
     return float(np.abs(residual * scale / scale[:, None]).max())
@@ -71,16 +70,16 @@ def inertia_residual(M: Array, inverse: Array) -> float:
 def aba_route(
     state: StateMap, aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Build A and B from the derivatives of ABA, (4.9) and (15.3), and return its M^-1 too."""
+    """Return A and B from the derivatives of ABA, (4.9) and (15.3), and the M^-1 of ABA."""
     own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
-    # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
-    # digits; no derivative depends on where the base is, nor in the axes of an orbit.
+    # Pinocchio differentiates about the world's origin, where a distant base would cost digits. So
+    # the base is placed at the origin: no derivative depends on its position, not even in orbit.
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
     there = own.jacobians(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
-    # The tangent of what moves on turns with it.
+    # Kinematics of the tangent displacement in axes that rotate with the base.
     A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
     A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
     A[LINEAR, ANGULAR] = -skew(nu[LINEAR])
@@ -101,10 +100,11 @@ def compare(
     steps: Array | None = None,
     rounding: float = 0.0,
 ) -> list[tuple[str, float]]:
-    """Return the errors of A and B against other matrices, by block: "A[q_b, q_m]"."""
-    # Relative to the largest entry of its block, rows of accelerations being scaled by the mobility
-    # sqrt((M^-1)_ii), so that a light joint does not hide a heavy one, and B by that of its input;
-    # where large terms cancel in a block, to those, which a route by steps has there.
+    """Return the errors of A and B from other matrices, block by block, such as "A[q_b, q_m]"."""
+    # Errors are relative to the largest entry of a block. Rows of accelerations are divided by the
+    # mobility sqrt((M^-1)_ii), so that a light joint does not hide a heavy one. Columns of B are
+    # divided by the mobility of their input. If large terms cancel in a block, errors are relative
+    # to these terms, because differences have their rounding errors.
     nv = len(M)
     mobility, input_mobility = mobilities(M, B)
     row_scale = np.concatenate((np.ones(state.nx - nv), mobility))[:, None]
@@ -114,8 +114,8 @@ def compare(
     groups, inputs = state.groups._asdict(), actuation.groups
     errors, errors_B = _blocks(difference_A, groups, groups), _blocks(difference_B, groups, inputs)
     if errors.any():
-        # In an orbit it is the absolute velocity whose terms cancel.
-        field = field_of(state.robot, state.frame)
+        # In orbit, the terms that cancel contain the inertial velocity.
+        field = state.field
         v = field.absolute(lin.q, lin.v) if field else lin.v
         terms = _cancelling_terms(state, lin, v, mobility, input_mobility)
         if steps is not None:
@@ -134,14 +134,14 @@ def compare(
 
 
 def _blocks(matrix: Array, rows: Mapping[str, Index], columns: Mapping[str, Index]) -> Array:
-    """Return the largest entry of each block, none being negative; zero of an empty one."""
+    """Return the largest entry of each block of a nonnegative matrix, 0 for an empty block."""
     largest = np.array([matrix[each].max(axis=0, initial=0.0) for each in rows.values()])
     found = [largest[:, each].max(axis=1, initial=0.0) for each in columns.values()]
     return np.array(found).reshape(len(columns), len(rows)).T
 
 
 def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
-    """Return sqrt((M^-1)_ii) (6 + n,) and sqrt(b^T M^-1 b) (nu,) of every input's column b."""
+    """Return sqrt((M^-1)_ii) (6 + n,), and sqrt(b^T M^-1 b) (nu,) for the force b of each input."""
     own = np.sqrt(np.linalg.inv(M).diagonal())
     lower = B[-len(M) :]
     inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, M, lower))
@@ -151,10 +151,10 @@ def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
 def _cancelling_terms(
     state: StateMap, lin: LinearModel, v: Array, mobility: Array, input_mobility: Array
 ) -> Array:
-    """Size (6, 6) of the terms that may cancel in a block of A, in its scaled units."""
-    # The base's own velocity counts for what its rounding can do to Pinocchio's derivatives only.
+    """Return the size (6, 6) of the terms that may cancel in each block of the scaled A."""
+    # The base's velocity is included only by its rounding errors in Pinocchio's derivatives.
     speed, rate, momentum = speeds(state, v)
-    # What the momentum of wheels does to a turning link, in the units of the rows.
+    # Gyroscopic torque of the wheels on a rotating link, in the units of the rows.
     spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
     slowed = speed.copy()
     slowed[LINEAR] *= _ROUNDING_FRACTION
@@ -162,7 +162,7 @@ def _cancelling_terms(
     accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
     forces = np.abs(lin.u0) * input_mobility
     size = _largest(accelerations) + _largest(forces) + rate * (_largest(resting) + spin)
-    # A unit of a velocity under the motion, and, where it turns, of the base's speed.
+    # Effect of a unit velocity at the present rates, and for rotations at the base's speed too.
     unit = 1.0 / mobility
     turning = rate * np.array([_largest(unit[part]) for part in (ANGULAR, LINEAR, slice(6, None))])
     turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
@@ -203,7 +203,7 @@ def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
 
 
 def _in_frame(state: StateMap, q: Array, matrix: Array) -> Array:
-    """Return M or its inverse (6 + n, 6 + n), given in base axes, in the axes of the frame."""
+    """Transform M or its inverse (6 + n, 6 + n) from base axes to the axes of the frame."""
     chart = state.chart(q)
     return state.to_frame(chart, state.to_frame(chart, matrix).T).T
 
@@ -211,7 +211,7 @@ def _in_frame(state: StateMap, q: Array, matrix: Array) -> Array:
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Where the base flies faster than this [m/s], the rounding of its speed would hide the rest.
+# Speed of the base [m/s] above which its rounding errors would hide the other velocities.
 _FAST = 100.0
 
 # Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
@@ -230,12 +230,12 @@ class Nonlinear:
         self._observer = observer if moves else np.zeros(3)
 
     def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return (q, v, a) in Pinocchio's order."""
+        """Return q, v and dv/dt in Pinocchio's order."""
         _, q, v, a = self._accelerations(x[None], u[None])
         return q[0], v[0], a[0]
 
     def _accelerations(self, x: Array, u: Array) -> tuple[Chart, Array, Array, Array]:
-        """Return the chart, q, v and a of rows."""
+        """Return the charts, q, v and dv/dt of rows of x and u."""
         chart, q, v = self.state.points(x)
         u = self.aba.actuation.in_base_axes(chart, u)
         observer = self._observer @ rotation_matrices(q[:, 3:7])
@@ -247,7 +247,7 @@ class Nonlinear:
         return chart, q, v, a
 
     def after_motion(self, x: Array, q: Array, v: Array, a: Array, t: Array) -> Array:
-        """Return the states (N, nx) a time t (N, 1) after rows of q, v and a, near the state x."""
+        """Return the states (N, nx) a time t (N, 1) after rows of q, v and a; angles are near x."""
         model = self.state.robot.model
         after = np.array([pin.integrate(model, *each) for each in zip(q, t * v, strict=True)])
         return state_history(self.state, after, v + t * a, x)
@@ -265,7 +265,7 @@ class Nonlinear:
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         rate = state.velocities(a)
         if state.axes[1]:
-            # Of the velocity's reference-axis components.
+            # Derivative of the components in reference axes.
             rate[:, LINEAR] += times(skew(angular), linear)
         turning = chart.q0 * angular + times(skew(chart.q_b), angular)
         position_rate, rates = times(chart.R, linear), state.velocities(v)[:, 6:]
@@ -283,7 +283,7 @@ class ErrorDynamics(Nonlinear):
         self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
 
     def after_motion(self, x: Array, q: Array, v: Array, a: Array, t: Array) -> Array:
-        """Return the errors when reference and robot have both moved on for a time t."""
+        """Return the errors after reference and robot have both moved for a time t."""
         at, at_rest = np.tile(self._q, (len(t), 1)), np.zeros_like(a)
         ahead = super().after_motion(x, at, np.tile(self._v, (len(t), 1)), at_rest, t)
         errors = moving_errors("local", super().after_motion(x, q, v, a, t), ahead)
@@ -309,7 +309,10 @@ class ErrorDynamics(Nonlinear):
 def jacobian(
     f: Callable[[Array], Array], point: Array, steps: Array, is_curved: NDArray[np.bool_]
 ) -> Array:
-    """Return the Jacobian of f, a function of rows, by central differences of the given steps."""
+    """Return the Jacobian of f by central differences; f maps rows of points to rows of values.
+
+    Columns with `is_curved` use sixth-order differences, the others use one difference.
+    """
     curved, straight = np.diag(steps)[is_curved], np.diag(steps)[~is_curved]
     offsets = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
     first, last = np.split(f(np.concatenate((point + offsets, point - offsets))), 2)
@@ -323,11 +326,11 @@ def jacobian(
 def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array, Array]:
     """Return the steps for differences in x (nx,) and u (nu,) at a model's point."""
     groups, nv = state.groups, len(M)
-    # Small against the angles over which accelerations change where light links line up.
+    # Small compared with the angles over which accelerations change if light links line up.
     step = np.full(state.nx, 2e-4)
-    # Well inside the chart, whose edge |q_b| = 1 the model feels long before.
+    # Well inside the chart, because f becomes steep near its limit |q_b| = 1.
     step[groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[groups.q_b]))
-    # f is quadratic in the velocities and linear in the input: no truncation at any step.
+    # f is quadratic in the velocities and linear in the inputs, so no step size causes truncation.
     speed = np.abs(lin.x0[-nv:])
     step[-nv:] = 0.1 * max(1.0, float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
     step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
@@ -337,7 +340,7 @@ def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array
 
 
 def flow_error(model: Nonlinear, lin: LinearModel) -> float:
-    """Return the relative error of f compared with the state derivative along motions."""
+    """Return the relative error of f from the differentiated states of short motions."""
     model = copy(model)
     model.state = state = model.state.about(pin.SE3(lin.reference.rotation, np.zeros(3)))
     x = np.tile(lin.x0, (7, 1))

@@ -1,5 +1,5 @@
 """Robots, made from a file or from a `pinocchio.Model`.
 
-The free-flying tree of joints, its inputs and outputs, springs, locks, and the catalogue of robot
-names. Imports `base`; `robot.urdf` reads the file.
+This package contains the free-flying tree of joints, its inputs, outputs, springs and locks, and
+the catalogue of robot names. `robot.urdf` reads URDF files. Imports `base`.
 """

@@ -4,28 +4,28 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import unquote
 
 from fflin.base.errors import FileError, InputError, require_known, unknown
 from fflin.base.writing import as_path, missing, shown
 
-# Robots of example-robot-data that its loader's code makes from the URDF of another robot.
+# Robots of example-robot-data without a URDF of their own: code makes them from another robot.
 _MADE_BY_CODE = ("talos_legs",)
 
 
 class RobotFile(NamedTuple):
     """Location of a robot's description."""
 
-    name: str  # that `load` takes
-    path: Path  # of the URDF
+    name: str  # name for `load`
+    path: Path  # path of the URDF
     origin: str  # "fflin", "example-robot-data" or "file"
-    package_dirs: tuple[Path, ...] = ()  # where ``package://`` paths of meshes are looked up
+    package_dirs: tuple[Path, ...] = ()  # folders in which ``package://`` meshes are searched
 
 
 @cache
 def bundled_directory() -> Path:
-    """Folder of the bundled URDFs: inside an installed package, beside a source checkout's."""
+    """Return the folder of the bundled URDFs, in an installed package or in a source checkout."""
     package = Path(__file__).resolve().parents[1]
     installed = package / "bundled"
     return installed if installed.is_dir() else package.parent / "robots"
@@ -39,7 +39,7 @@ def _bundled() -> dict[str, RobotFile]:
 
 @cache
 def _example_robot_data() -> dict[str, RobotFile]:
-    # Only class attributes are read: making a loader would load its meshes.
+    # Only class attributes are read, because an instance of a loader would load its meshes.
     from example_robot_data.robots_loader import ROBOTS, getModelPath
 
     found = {}
@@ -53,7 +53,9 @@ def _example_robot_data() -> dict[str, RobotFile]:
 
 
 def list_robots() -> tuple[str, ...]:
-    """Return all robot names that `load` accepts: bundled, then from example-robot-data.
+    """Return all robot names that `load` accepts.
+
+    The bundled robots come first, then the robots of the package example-robot-data.
 
     Returns
     -------
@@ -68,7 +70,7 @@ def list_robots() -> tuple[str, ...]:
 
 
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
-    """Find a robot by a bundled name, a path from the folder or a name of example-robot-data."""
+    """Find a robot by a bundled name, by a path in `folder`, or by a name in example-robot-data."""
     if not isinstance(robot, str | os.PathLike):
         raise InputError(f"robot has type {type(robot).__name__}, expected a robot name or a path")
     if isinstance(robot, str) and robot in _bundled():
@@ -77,9 +79,9 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
     bundled = bundled_directory() / text
     if not os.path.exists(path) and bundled in bundled_directory().glob("*.toml"):
         path = bundled
-    # Unlike Path.exists, this takes a name that is too long for one that does not exist.
+    # Path.exists would raise an error for a name that is too long.
     if os.path.exists(path) and not (path.is_dir() and text in _example_robot_data()):
-        # The name of a file need not be text.
+        # File names may contain bytes that are not valid text.
         name = path.stem.encode(errors="backslashreplace").decode()
         return RobotFile(name, path, "file", (path.resolve().parent,))
     if isinstance(robot, Path) or path.suffix or len(Path(robot).parts) != 1:
@@ -90,7 +92,7 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 
 
 def find_inputs(inputs: str | Path) -> Path:
-    """Find a file of inputs by the name of the bundled one's robot, else by its path."""
+    """Find a file of inputs by the name of a bundled robot, or else by its path."""
     path = as_path(inputs)
     bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
     if str(inputs) in bundled:
@@ -100,8 +102,8 @@ def find_inputs(inputs: str | Path) -> Path:
     return path
 
 
-def folders(given: Any, within: str | Path = "") -> tuple[Path, ...]:
-    """Return one folder or a list of folders, relative to a folder."""
+def folders(given: object, within: str | Path = "") -> tuple[Path, ...]:
+    """Return a given folder or list of folders as paths relative to the folder `within`."""
     listed = [given] if isinstance(given, str | os.PathLike) else given
     if not isinstance(listed, Sequence):
         raise InputError(f"package_dirs is {given!r}, expected a list of folders")
@@ -109,7 +111,7 @@ def folders(given: Any, within: str | Path = "") -> tuple[Path, ...]:
 
 
 def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
-    """Return the file of package://NAME/PATH, file:///PATH or a path; None without one."""
+    """Return the file of package://NAME/PATH, file:///PATH or a path; None if it does not exist."""
     scheme, separator, rest = uri.partition("://")
     candidates: Iterable[Path]
     if not separator:
@@ -118,7 +120,7 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
         candidates = [Path(unquote(rest))]
     else:
         folders, inside = (*package_dirs, *urdf.resolve().parents), Path(*Path(rest).parts[1:])
-        # A package's own folder may have been given, or be called otherwise.
+        # A given folder may contain the package folder, or be it, possibly with another name.
         candidates = (folder / part for part in (rest, inside) for folder in folders)
-    # Unlike Path.is_file, this takes a name that is too long for one that does not exist.
+    # Path.is_file would raise an error for a name that is too long.
     return next((path for path in candidates if os.path.isfile(path)), None)

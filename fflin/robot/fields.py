@@ -15,7 +15,7 @@ from fflin.robot.joints import Find, by_joint
 from fflin.robot.orbit import checked_orbit
 from fflin.robot.outputs import Output, parse_output
 
-# The least and the largest value; infinite where there is no limit.
+# Least and largest value; infinite without a limit.
 Range: TypeAlias = tuple[float, float]
 
 _OF_JOINTS = ("q_m", "qdot_m")
@@ -26,16 +26,16 @@ _WEIGHTS = ("rule", "q", "r", "bryson")
 
 
 class Scope(NamedTuple):
-    """Parts of a robot that its fields name."""
+    """Parts of a robot to which its fields refer by name."""
 
-    find: Find  # the joint of a name
+    find: Find  # returns the joint with a name
     joints: Sequence[str]
-    own: Sequence[str]  # the joints without the wheels
+    own: Sequence[str]  # joints except wheels
     inputs: Sequence[Input]
     urdf_damping: Mapping[str, float]
 
 
-def checked_fields(fields: Mapping[str, Any], scope: Scope) -> dict[str, Any]:
+def checked_fields(fields: Mapping[str, object], scope: Scope) -> dict[str, Any]:
     """Return the checked fields of `Robot.replace`, except for passive joints and inputs."""
     require_known("field of a robot", fields, FIELDS)
     return {name: FIELDS[name](value, scope) for name, value in fields.items()}
@@ -44,7 +44,7 @@ def checked_fields(fields: Mapping[str, Any], scope: Scope) -> dict[str, Any]:
 def checked_inputs(
     value: object, find: Find, joints: Sequence[str], passive: Sequence[str]
 ) -> tuple[Input, ...]:
-    """Return the inputs as a robot holds them."""
+    """Check inputs, and return them with one joint torque for each joint of a pattern."""
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise InputError(f"inputs has type {type(value).__name__}, expected a sequence of inputs")
     if not value:
@@ -55,11 +55,11 @@ def checked_inputs(
             raise InputError(f"{item!r} is not an input; expected {known}")
     value = [one for item in value for one in _spread(item, find, joints, passive)]
     if not value:
-        raise InputError("all inputs are torques of passive joints; add another input")
+        raise InputError("all inputs are torques of passive joints; add an input that is not")
     names = [name for item, own in named_inputs(value) for name in own]
     for each in names:
         if names.count(each) > 1:
-            raise InputError(f"input '{each}' is given twice; remove one of the two")
+            raise InputError(f"input '{each}' is given twice; remove one of them")
     return tuple(value)
 
 
@@ -77,13 +77,13 @@ def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[st
 
 
 def _input_keys(inputs: Sequence[Input]) -> tuple[str, ...]:
-    """Return the names of the inputs, as `fflin.base.names.input_keys` has those of a model."""
+    """Return the names of inputs with their groups, as `fflin.base.names.input_keys` does."""
     pairs = ((item.GROUP, name) for item, names in named_inputs(inputs) for name in names)
     return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
 
 
 def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) -> dict[str, Range]:
-    """Return {name of an input or state: (least, largest)} of a magnitude, or of some by name."""
+    """Return {input or state: (least, largest)} from one magnitude, or from limits by name."""
     keys, states, named = _input_keys(inputs), state_keys(joints), named_inputs(inputs)
     names = [*(name for _, own in named for name in own), *states]
     floors = [0.0 if not item.PULLS else -math.inf for item, own in named for _ in own]
@@ -93,7 +93,7 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) 
     ranges = {str(key): range_of(key, value) for key, value in given.items()}
     of_inputs = {key: ranges[key] for key in ranges if stands_for_any(key, keys)}
     of_states = {key: ranges[key] for key in ranges if key not in of_inputs}
-    # The group of all joints leaves wheels out, whose speeds are of another size.
+    # A limit for all joints excludes wheels, because they are much faster than joints.
     wheels = {f"{group}.{name}" for group in _OF_JOINTS for name, _ in named_wheels(inputs)}
     whole = {key: of_states.pop(key) for key in _OF_JOINTS if key in of_states}
     found = by_name("input or state", whole, (*keys, *states))
@@ -106,7 +106,7 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) 
 
 
 def _outputs(value: object, _: Scope) -> tuple[Output, ...]:
-    """Return outputs, some of which may be words as on the command line."""
+    """Return outputs from `Output` objects or from texts as on the command line."""
     given = [value] if isinstance(value, str) else value
     if not isinstance(given, Sequence) or not given:
         raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
@@ -144,7 +144,7 @@ def _damping(value: object, scope: Scope) -> dict[str, float]:
 
 
 def range_of(name: str, value: Any) -> Range:
-    """Return a limit of a magnitude, or of (least, largest)."""
+    """Return (least, largest) from this pair or from one magnitude."""
     if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
         least, largest = (number(f"limit of '{name}'", x) for x in value)
     else:
@@ -159,7 +159,7 @@ def range_of(name: str, value: Any) -> Range:
 
 
 def _state(what: str, value: object, scope: Scope) -> dict[str, Any]:
-    """Return a point, start or target of a robot, with joints and rates by their full names."""
+    """Check a point, start or target of a robot, and replace patterns by the names of joints."""
     state = _parts(what, value, _STATE)
     if "joints" in state:
         values = numbers(f"{what} joints", state["joints"], "joint", f"{what} of joint")
@@ -174,24 +174,15 @@ def _state(what: str, value: object, scope: Scope) -> dict[str, Any]:
 
 
 def of_joints(state: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]:
-    """Return a point, start or target without the joints and wheels that are not among `joints`."""
+    """Return a point, start or target with only the entries of `joints`."""
     names = {*joints, *state_keys(joints)}
     by_name = {part: state[part] for part in ("joints", "velocity") if part in state}
     kept = {part: {k: x for k, x in of.items() if k in names} for part, of in by_name.items()}
     return {**state, **kept}
 
 
-def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a state with parts, joints and rates replaced by those of another state."""
-    both = {**state, **other}
-    for part in ("joints", "velocity"):
-        if part in both:
-            both[part] = {**state.get(part, {}), **other.get(part, {})}
-    return both
-
-
 def _weights(value: object, scope: Scope) -> dict[str, Any]:
-    """Return the weights of a robot's regulator, by names of states and inputs."""
+    """Check the weights of a robot's regulator; the keys are names of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)
     require_known("rule of weights", [str(weights.get("rule", RULES[0]))], RULES)
     states, keys = state_keys(scope.joints), _input_keys(scope.inputs)
@@ -208,7 +199,7 @@ def _weights(value: object, scope: Scope) -> dict[str, Any]:
                 least = "0 or more" if part == "q" else "more than 0"
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
     for key in weights["bryson"].keys() & (weights["q"].keys() | weights["r"].keys()):
-        raise InputError(f"'{key}' has both a weight and a largest value; give only one of the two")
+        raise InputError(f"'{key}' has both a weight and a largest value; give only one of them")
     return {part: value for part, value in weights.items() if value}
 
 
@@ -228,7 +219,8 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, Any]:
     return dict(value)
 
 
-# In the order in which a file applies them: the names of inputs are known after the inputs.
+# Checks of the fields, in the order in which a file applies them: inputs come before the fields
+# that refer to their names.
 FIELDS: dict[str, Callable[[Any, Scope], object]] = {
     **dict.fromkeys(("passive", "inputs", "appendages"), lambda value, _: value),
     "outputs": _outputs,
@@ -244,5 +236,5 @@ FIELDS: dict[str, Callable[[Any, Scope], object]] = {
     "start": partial(_state, "start"),
 }
 
-# Fields by joint or name: the entries of a call are added to those of a robot file.
+# Fields with entries by name: the entries of a call are added to the entries of a robot file.
 MERGED = ("stiffness", "damping", "rest", "limits")

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 
@@ -19,15 +19,15 @@ Vector3: TypeAlias = Sequence[float]
 class Input:
     """Base class of inputs, with their limits and names."""
 
-    KEY: ClassVar[str]  # its type in a TOML file
-    GROUP: ClassVar[str]  # what its inputs are called together, in weights and limits
+    KEY: ClassVar[str]  # `type` in a TOML file
+    GROUP: ClassVar[str]  # common name of all inputs of this class in weights and limits
     UNIT: ClassVar[str] = "N m"
     ENTRIES: ClassVar[str] = " "
     PULLS: ClassVar[bool] = True
 
-    # What it does not exceed, in its unit; one number, or three for torque and force on the base.
+    # Largest value, in UNIT: one number, or three for a torque or force on the base.
     max: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
-    # The least that it gives; by default -max, of a thruster 0.
+    # Least value: by default -max, or 0 for a thruster.
     min: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
@@ -47,12 +47,12 @@ class Input:
                     "than 0 and a min of at most max; leave out what is not limited"
                 )
 
-    def _set(self, name: str, value: Any) -> None:
+    def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
-        """(least, largest) value of each entry; infinite if there is no limit."""
+        """Least and largest value (least, largest) of each entry; infinite without a limit."""
         largest = np.broadcast_to(math.inf if self.max is None else self.max, len(self.ENTRIES))
         usual = -largest if self.PULLS else 0.0
         least = np.broadcast_to(usual if self.min is None else self.min, len(largest))
@@ -65,33 +65,38 @@ class Input:
         return () if frame is None else (frame,)
 
     def names(self, count: int) -> tuple[str, ...]:
-        """Return the names of this input's entries in u, for input number `count` of its type."""
+        """Return the names of this input's entries in u.
+
+        `count` is the number of this input among the inputs of its type; the default names of
+        thrusters and wheels contain it.
+        """
         return tuple(f"{self.GROUP}.{entry}" for entry in self.ENTRIES)
 
 
 class WrenchInput(Input, ABC):
     """Base class of inputs whose wrench on a link is constant in a frame."""
 
-    frame: str | None  # of the model, on the base or on any link; None is the base's root frame
+    frame: str | None  # frame of the model on any link; None for the base's root frame
     name: str | None
 
     def names(self, count: int) -> tuple[str, ...]:
-        """Return the input's name in u: the given one, or thruster_1, wheel_1, ... by default."""
+        """Return the input's name in u: the given name, or a default such as thruster_1."""
         return (self.name or f"{self.KEY.rpartition('_')[2]}_{count}",)
 
     @property
     @abstractmethod
     def wrench(self) -> Array:
-        """Force [N] and torque [N m] (6,) of a unit input at the frame's origin, in frame axes."""
+        """Force [N] and torque [N m] (6,) of a unit input, at the frame's origin in frame axes."""
 
 
 class BaseTorque(Input):
-    """Torque tau_b (3,) [N m] on the base, in the axes of the chosen velocity frame.
+    """Torque tau_b (3,) [N m] on the base, in the axes that `frame` of `linearize` selects.
 
     Parameters
     ----------
     max, min : float or sequence of float (3,), optional
-        Limits [N m] of each entry; keyword only. Every type of input accepts these two parameters.
+        Upper and lower limits [N m] of each entry; keyword only. Every type of input accepts these
+        two parameters.
 
     Examples
     --------
@@ -104,12 +109,12 @@ class BaseTorque(Input):
 
 
 class BaseForce(Input):
-    """Force F_b (3,) [N] at the base origin, in the axes of the chosen velocity frame.
+    """Force F_b (3,) [N] at the base origin, in the axes that `frame` of `linearize` selects.
 
     Parameters
     ----------
     max, min : float or sequence of float (3,), optional
-        Limits [N] of each entry; keyword only.
+        Upper and lower limits [N] of each entry; keyword only.
 
     Examples
     --------
@@ -130,7 +135,7 @@ class JointTorque(Input):
     joint : str
         Name of an independent joint. The motor also drives the mimic joints of this joint.
     max, min : float, optional
-        Limits [N m | N], which replace the effort limit of the URDF; keyword only.
+        Upper and lower limits [N m | N], which replace the effort limit of the URDF; keyword only.
 
     Examples
     --------
@@ -143,34 +148,37 @@ class JointTorque(Input):
     joint: str
 
     def names(self, count: int) -> tuple[str, ...]:
-        """Return the input's name in u, ``tau_m.JOINT``."""
+        """Return the input's name in u, which is ``tau_m.JOINT``."""
         return (f"{self.GROUP}.{self.joint}",)
 
 
 @dataclass(frozen=True)
 class Thruster(WrenchInput):
-    """Force [N] of a thruster, with point of action and direction fixed in a frame.
+    """Force [N] of a thruster, with its point of action and direction fixed in a frame.
 
     Parameters
     ----------
     frame : str
         Frame of the model, on the base or on any link.
     position : sequence of float (3,)
-        Point [m] where the force acts, in that frame.
+        Point [m] at which the force acts, in the axes of `frame`.
     direction : sequence of float (3,)
-        Direction of the force on the link, in that frame; any length except zero.
+        Direction of the force on the link (opposite to the exhaust), in the axes of `frame`. The
+        vector may have any length except zero.
     name : str, optional
         Name of the input; thruster_1, thruster_2, ... by default.
     max, min : float, optional
-        Limits [N], at least 0: a thruster never pulls. Keyword only, like all parameters that
-        follow.
+        Upper and lower limits [N], which must be at least 0, because a thruster never pulls. These
+        and all following parameters are keyword only.
     on_off : bool
-        True if the thruster has no thrust between zero and `max`. `simulate` then replaces the
-        command of each sample by one pulse of `max`, whose length is a whole number of steps. The
-        remaining impulse is added to the next sample, so that the mean impulse is correct.
+        True if the thruster can only be off or produce the thrust `max`. In each sample, `simulate`
+        then replaces the commanded thrust by one pulse of `max`, whose length is a whole number of
+        steps. The difference from the commanded impulse is added to the command of the next sample,
+        so that the mean impulse is correct.
     least_impulse : float, optional
-        Smallest impulse of a sample [N s]. If the commanded impulse is smaller, the thruster does
-        not fire, and the impulse is added to the next sample.
+        Smallest impulse [N s] that the thruster can produce in a sample. If the commanded impulse
+        is smaller, the thruster does not fire, and this impulse is added to the command of the next
+        sample.
 
     Examples
     --------
@@ -193,8 +201,8 @@ class Thruster(WrenchInput):
         pulses = truth("thruster on_off", self.on_off)
         if self.ranges[0][0] < 0.0 or (pulses and (self.max is None or self.min)):
             raise InputError(
-                f"thruster min is {self.min} and max is {self.max}, expected a min of 0 or more, "
-                "and with on_off a max, the force of a pulse, and no min"
+                f"thruster min is {self.min} and max is {self.max}, expected a min of 0 or more; "
+                "an on_off thruster needs a max, the force of its pulses, and no min"
             )
         if (impulse := self.least_impulse) is not None:
             self._set("least_impulse", positive("thruster least_impulse", impulse, "N s"))
@@ -206,7 +214,7 @@ class Thruster(WrenchInput):
 
     @property
     def wrench(self) -> Array:
-        """Force [N] and torque [N m] (6,) of a unit input at the frame's origin, in frame axes."""
+        """Force [N] and torque [N m] (6,) of a unit input, at the frame's origin in frame axes."""
         return np.concatenate((self.direction, np.cross(self.position, self.direction)))
 
 
@@ -214,26 +222,28 @@ class Thruster(WrenchInput):
 class ReactionWheel(WrenchInput):
     r"""Motor torque [N m] of a balanced reaction wheel, whose axis is fixed on a link.
 
-    The torque u acts on the wheel along the axis a, and the torque -u acts on the link that
-    carries the wheel. The motor's power is u times the speed of the wheel relative to this link.
-    Mass and inertia of the carrier in the URDF must include the wheel, as if it were welded.
+    The link that carries the wheel is called the carrier. The motor exerts the torque u about the
+    axis a on the wheel, and the torque -u on the carrier. The motor's power is u times the speed of
+    the wheel relative to the carrier. The carrier's mass and inertia in the URDF must include the
+    wheel as if it were welded.
 
-    With an ``inertia`` J, the speed of the wheel is a state. The robot gets one more joint: a
-    continuous joint with the wheel's name. In the state vector, the wheel comes after all joints
-    on its carrier. The inertia J a a^T is transferred from the carrier to the wheel; mass and
-    transverse inertia stay with the carrier.
+    If the wheel has an ``inertia`` J, the speed of the wheel is a state, because the wheel becomes
+    an additional continuous joint of the robot with the wheel's name. In the state vector, this
+    joint comes after all other joints on the carrier. The inertia J a a^T is transferred from the
+    carrier to the wheel; the wheel's mass and transverse inertia stay with the carrier.
 
-    If ``inertia`` is omitted, the wheel is modelled only by the torques on its carrier: the
+    If ``inertia`` is omitted, the wheel is modelled only by two torques on its carrier: the
     reaction -u a, and the gyroscopic torque :math:`-\omega \times h a` of the wheel's ``momentum``
-    h. A wheel without inertia is the limit of a small and fast wheel: h is constant even if u is
-    nonzero, and J is part of the carrier's inertia.
+    h, where :math:`\omega` is the angular velocity of the carrier. This model is the limit of a
+    small and fast wheel: h stays constant even if u is nonzero, and J is part of the carrier's
+    inertia.
 
     Parameters
     ----------
     axis : sequence of float (3,)
-        Rotation axis, in the axes of `frame`; any length except zero.
+        Rotation axis a in the axes of `frame`. The vector may have any length except zero.
     frame : str, optional
-        Frame of the model, on the base or on any link; the base's root frame by default.
+        Frame of the model, on the base or on any link; by default the root frame of the base.
     inertia : float, optional
         Moment of inertia J [kg m^2] about the axis. The carrier must have a larger inertia about
         the same axis.
@@ -241,13 +251,14 @@ class ReactionWheel(WrenchInput):
         Name of the input, and of the joint of a wheel with inertia; wheel_1, wheel_2, ... by
         default.
     momentum : float
-        Constant angular momentum h [N m s] along the axis, relative to the carrier; only if
-        `inertia` is omitted.
+        Constant angular momentum h [N m s] about the axis, relative to the carrier. Give `momentum`
+        only if `inertia` is omitted.
     max, min : float, optional
-        Limits [N m] of the motor's torque; keyword only, like all parameters that follow.
+        Upper and lower limits [N m] of the motor's torque. These and all following parameters are
+        keyword only.
     max_speed : float, optional
-        Largest speed [rad/s] relative to the carrier, in both directions, of a wheel with inertia
-        J. The wheel stores at most J max_speed [N m s].
+        Largest speed [rad/s] of the wheel relative to the carrier, in both directions. Give
+        `max_speed` only for a wheel with inertia J, which then stores at most J max_speed [N m s].
 
     Examples
     --------
@@ -286,7 +297,7 @@ class ReactionWheel(WrenchInput):
 
     @property
     def wrench(self) -> Array:
-        """Force [N] and torque [N m] (6,) of a unit input at the frame's origin, in frame axes."""
+        """Force [N] and torque [N m] (6,) of a unit input, at the frame's origin in frame axes."""
         return np.concatenate((np.zeros(3), -np.array(self.axis)))
 
 
@@ -312,7 +323,7 @@ def unit_vector(what: str, value: Vector3, hint: str) -> tuple[float, float, flo
 
 
 def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]:
-    """Return inputs, each with the names of its entries in u."""
+    """Return (input, names of its entries in u) for each input."""
     seen: Counter[str] = Counter()
     found = []
     for item in inputs:
@@ -322,6 +333,6 @@ def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]
 
 
 def named_wheels(inputs: Sequence[Input]) -> list[tuple[str, ReactionWheel]]:
-    """Return the wheels among inputs, each with its name: wheel_1, wheel_2, ... by default."""
+    """Return (name, wheel) for the wheels among inputs; default names are wheel_1, wheel_2, ..."""
     found = named_inputs(inputs)
     return [(names[0], item) for item, names in found if isinstance(item, ReactionWheel)]

@@ -16,10 +16,10 @@ ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
 _CONFIGURATION = "a configuration in Pinocchio's order"
 
-# What renormalising a unit quaternion leaves: two ulp of unity.
+# Rounding error of the length of a normalised quaternion: two ulp of 1.
 ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
-# Data holds a third-order tensor of nv^3 entries among others: about 32 nv^3 bytes in all.
+# pin.Data contains third-order tensors of nv^3 entries. It takes about 32 nv^3 bytes.
 _DATA_BYTES_PER_NV3 = 32
 _DATA_LIMIT = 2**30
 
@@ -30,21 +30,21 @@ class Joint(NamedTuple):
     """Joint with one degree of freedom."""
 
     name: str  # in the model
-    idx_q: int  # where it begins in Pinocchio's q, and in v
-    idx_v: int
-    unbounded: bool  # stored as (cos, sin), two entries of q; one angle in the state
-    prismatic: bool  # a length in metres; otherwise an angle in radians
+    idx_q: int  # index of its first entry in Pinocchio's q
+    idx_v: int  # index of its entry in Pinocchio's v
+    unbounded: bool  # continuous: two entries (cos, sin) of q, but one angle in the state
+    prismatic: bool  # position is a length [m] instead of an angle [rad]
     # "joint", "slosh", or "modal" for the amplitude of a mode.
     kind: str = "joint"
-    scale: float = 1.0  # entry of q for a unit of q_m; 1 except for modal amplitudes
-    # Of a mode alone: its inertia with the link clamped, 1 for a modal amplitude, and the rotation
-    # [rad] that a unit of it stands for, 0 if it stands for none.
+    scale: float = 1.0  # entry of q per unit of q_m; 1 except for modal amplitudes
+    # Inertia of a mode if its link is clamped; 1 for a modal amplitude.
     inertia: float = 1.0
+    # Rotation [rad] of the structure per unit of a mode; 0 without rotation.
     rotation: float = 0.0
 
     @property
     def unit(self) -> str:
-        """Unit of the joint's position; the unit of its rate is this per second."""
+        """Unit of the joint's position; the joint's rate has this unit per second."""
         return "kg^0.5 m" if self.kind == "modal" else "m" if self.prismatic else "rad"
 
     @property
@@ -76,7 +76,7 @@ class Joint(NamedTuple):
         return float(q[self.idx_q]) / self.scale
 
     def within(self, model: pin.Model) -> "Joint":
-        """Return the joint of the same name with its offsets in another model."""
+        """Return this joint with the indices of the joint of the same name in another model."""
         joint = model.joints[model.getJointId(self.name)]
         return self._replace(idx_q=joint.idx_q, idx_v=joint.idx_v)
 
@@ -90,16 +90,16 @@ class Follower(NamedTuple):
     offset: float
 
     def place(self, q: Array) -> None:
-        """Place the mimic joint by its leader's value in the configuration q (nq,)."""
+        """Write the mimic joint's value, which follows from its leader's value, into q (nq,)."""
         self.joint.place(q, self.multiplier * self.leader.value(q) + self.offset)
 
 
-# Returns the joint of a name, or raises what is wrong with it.
+# Function that returns the joint with a name, or raises an error that names the problem.
 Find: TypeAlias = Callable[[str], Joint]
 
 
 def by_joint(values: Mapping[str, T], joints: Sequence[str], find: Find) -> dict[str, T]:
-    """Return {joint: value} of {joint or pattern: value}; the group ``q_m`` is all joints."""
+    """Return {joint: value} from {joint or pattern: value}; ``q_m`` stands for all joints."""
     return joints_by_name("joint", values, joints, lambda name: find(name).name)
 
 
@@ -111,11 +111,11 @@ class Carried(NamedTuple):
 
 
 def frame_index(model: pin.Model, name: str) -> int:
-    """Return the index of a frame of the robot; a link's comes before a joint's of that name."""
-    # Pinocchio's own look-up refuses a name that a link and a joint share, and takes a link called
+    """Return the index of a frame; if a link and a joint share a name, return the link's frame."""
+    # Pinocchio's own search refuses a name that a link and a joint share, and takes a link named
     # universe for the world.
     frames = {i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT}
-    # The comparison with an array would be one.
+    # The type is checked because an array as name would give an array of comparisons.
     found = [i for i, f in frames.items() if isinstance(name, str) and f.name == name]
     if not found:
         raise unknown("frame", str(name), [frame.name for frame in frames.values()])
@@ -123,7 +123,7 @@ def frame_index(model: pin.Model, name: str) -> int:
 
 
 def find_frame(model: pin.Model, name: str | None) -> Carried:
-    """Return the location of a frame, see `frame_index`; of the base's root frame for None."""
+    """Return the location of a frame (see `frame_index`), or of the base's root frame for None."""
     if name is None:
         return Carried(ROOT, pin.SE3.Identity())
     frame = model.frames[frame_index(model, name)]
@@ -170,18 +170,18 @@ class Coordinates:
 
     @cached_property
     def unbounded(self) -> dict[int, str]:
-        """Continuous joints: {index of the cosine in q: joint name}."""
+        """Continuous joints as {index of the cosine in q: joint name}."""
         joints = (*self.joints, *(follower.joint for follower in self.followers))
         return {joint.idx_q: joint.name for joint in joints if joint.unbounded}
 
     def neutral(self) -> Array:
-        """Return the neutral configuration (nq,), with mimic joints placed by their leaders."""
+        """Return the neutral configuration (nq,), in which mimic joints follow their leaders."""
         q = pin.neutral(self.model)
         self.follow(q)
         return q
 
     def follow(self, q: Array) -> None:
-        """Place the mimic joints of a configuration q (nq,) by their leaders, in place."""
+        """Write the values of mimic joints, which follow their leaders, into q (nq,)."""
         for follower in self.followers:
             follower.place(q)
 
@@ -191,7 +191,7 @@ class Coordinates:
             q = self._sized("q", q, self.nq, _CONFIGURATION)
         entries = q.tolist()
         if not math.isfinite(sum(entries)):
-            vector("q", q, self.nq, _CONFIGURATION)  # says which entry it is
+            vector("q", q, self.nq, _CONFIGURATION)  # raises an error that names the entry
         x, y, z, w = entries[3:7]
         square = x * x + y * y + z * z + w * w
         worst = abs(square - 1.0)
@@ -210,7 +210,7 @@ class Coordinates:
         return self._followed(q) if self.followers else q
 
     def checked_velocity(self, v: Array) -> Array:
-        """Return a valid velocity v (nv,), without modification, or raise `InputError`."""
+        """Return a velocity v (nv,) unchanged if it is valid, or raise `InputError`."""
         v = self._sized("v", v, self.nv, "a velocity in Pinocchio's order")
         for joint, leader, multiplier, _ in self.followers:
             expected = multiplier * v[leader.idx_v]
@@ -222,10 +222,12 @@ class Coordinates:
         return v
 
     def _sized(self, name: str, value: Array, size: int, of_what: str) -> Array:
-        """Return a vector (size,); the error for a longer one names the removed coordinates."""
+        """Return a vector (size,); the error for a longer vector names removed coordinates."""
         if self._removed and np.size(value) > size:
             removed = ", ".join(self._removed)
-            of_what += f"; the coordinates {removed} left with the replaced inputs or appendages"
+            of_what += (
+                f"; the coordinates {removed} were removed with the replaced inputs or appendages"
+            )
         return vector(name, value, size, of_what)
 
     def _followed(self, q: Array) -> Array:
@@ -247,7 +249,7 @@ class Coordinates:
         """Raise `ModelError` if the model was changed in place after the robot was made."""
         assert self._as_made is not None
         made = self._as_made[1]
-        # Tells in a microsecond that nothing at all was changed.
+        # The comparison takes a microsecond; `change_in` runs only if the models differ.
         if self.model != made and (change := change_in(self.model, made)):
             raise ModelError(
                 f"the model of '{self.name}' was changed after the robot was made: {change}; make "
@@ -271,7 +273,10 @@ def require_room(model: pin.Model, name: str) -> None:
 
 
 def change_in(model: pin.Model, made: pin.Model) -> str:
-    """Name a changed part of the model on which A, B and C depend; not limits or new frames."""
+    """Return the name of a changed part on which A, B and C depend, or an empty text.
+
+    Changed limits and new frames are ignored.
+    """
     parts = {
         "names": lambda x: x.names,
         "parents": lambda x: x.parents,
@@ -298,7 +303,7 @@ def _not_of_length_1(what: str, square: float) -> InputError:
 
 
 def joint_of(model: pin.Model, index: int) -> Joint:
-    """Return a joint, or refuse one that has not one degree of freedom."""
+    """Return a joint; raise `ModelError` unless it has one degree of freedom."""
     joint, name = model.joints[index], model.names[index]
     kind = joint.shortname()
     if kind == "JointModelMimic":

@@ -19,8 +19,8 @@ _OPEN: Range = (-math.inf, math.inf)
 
 def limits_of(robot: Robot) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} for all limits."""
-    # Of the URDF, where zero, which exporters write for none, is none; before it go the inputs'
-    # own limits, and before those `Robot.limits`.
+    # Limits of the URDF come first; a limit of zero means none, as exporters write it. Limits of
+    # the inputs replace them, and `Robot.limits` replaces both.
     found: dict[str, Range] = {}
     for joint in robot.joints:
         found[f"q_m.{joint.name}"] = _travel(robot, joint)
@@ -38,7 +38,10 @@ def limits_of(robot: Robot) -> dict[str, Range]:
 
 
 def magnitudes_of(robot: Robot) -> dict[str, float]:
-    """Return {name of an input or state: magnitude} of what is limited both ways, travels whole."""
+    """Return {input or state: magnitude} of all finite limits.
+
+    The magnitude of a joint position is its whole travel, and of a one-sided input its range.
+    """
     sizes = {
         name: largest - least if name.startswith("q_m.") or least >= 0.0 else min(-least, largest)
         for name, (least, largest) in limits_of(robot).items()
@@ -47,7 +50,7 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
 
 
 def chosen_limits(robot: Robot, limits: Any) -> tuple[dict[str, Range], dict[str, Range]]:
-    """Return the saturation of the inputs by the limits of `simulate`, and all known limits."""
+    """Return the saturation limits of the inputs for `simulate`, and all known limits."""
     own, cutting = limits_of(robot), dict[str, Range]()
     given: dict[str, Range] = {}
     several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)
@@ -73,10 +76,10 @@ def _travel(robot: Robot, joint: Joint) -> Range:
 
 
 def _either(size: float) -> Range:
-    """Return the range of a largest magnitude."""
+    """Return the range (-size, size), or an infinite range for a size of zero."""
     return (-_known(size), _known(size)) if size > 0.0 else _OPEN
 
 
 def _known(limit: float) -> float:
-    # Pinocchio marks what the URDF does not limit by the largest double or by infinity.
+    # Pinocchio stores a missing limit as the largest double or as infinity.
     return limit if abs(limit) < 1e300 else math.copysign(math.inf, limit)

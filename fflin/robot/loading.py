@@ -28,28 +28,28 @@ def load(
     *,
     lock: Lock | None = None,
     package_dirs: Sequence[str | Path] = (),
-    **fields: Any,
+    **fields: object,
 ) -> Robot:
     """Load a robot as a free flyer, by default in zero gravity.
 
     Parameters
     ----------
     robot : str or Path
-        Name of a bundled robot or of example-robot-data, or path to a URDF or to a robot file. A
-        robot file is a TOML file that names a URDF and sets fields of the robot; see the guide.
-        No mesh is loaded.
+        Name of a bundled robot or of a robot in example-robot-data, or path of a URDF or robot
+        file. A robot file is a TOML file that names a URDF and sets fields of the robot; see the
+        guide. No mesh is loaded.
     lock : mapping or iterable of str, optional
-        Joints to weld: {joint: value [rad|m]} (None: at the neutral position), or names of
-        joints. A name may be a pattern, ``hinge_*``. The mimic joints of a locked joint are also
-        welded.
+        Joints to weld, as names or as {joint: value [rad|m]}. A joint given only by its name, or
+        with the value None, is welded at its neutral position. A name may be a pattern such as
+        ``hinge_*``. Mimic joints of a locked joint are also welded.
     package_dirs : sequence of path
-        Folders to search for ``package://`` meshes when the robot is drawn. The given folders are
-        searched before the folders that contain the URDF.
+        Folders to search for ``package://`` meshes when the robot is drawn. They are searched
+        before the folders that contain the URDF.
     **fields
-        inputs, outputs, stiffness, damping, rest, gravity, orbit, limits, passive, weights, start:
-        see `Robot.replace`. Fields given here take precedence over the robot file. Locks, limits,
-        springs and dampers given here are added to the entries of the robot file, and replace
-        entries of the same name.
+        Fields of the robot: inputs, outputs, appendages, stiffness, damping, rest, gravity, orbit,
+        limits, passive, weights, point, target and start; see `Robot.replace`. Fields given here
+        take precedence over the robot file. Locks, limits, springs and dampers are merged with the
+        robot file: an entry given here replaces only the entry with the same name.
 
     Returns
     -------
@@ -64,14 +64,14 @@ def load(
     FileError, UrdfError
         If the file cannot be read or is malformed.
     MissingPackageError
-        If the file is written in xacro and the package that expands it is not installed.
+        If the file is written in xacro, but the package that expands xacro is not installed.
     ModelError
         If a joint has more than one degree of freedom.
 
     Warns
     -----
     FflinWarning
-        If the model does not contain a part of the file, or the file contains likely errors.
+        If a part of the file is ignored, or the file contains likely errors.
 
     Examples
     --------
@@ -107,12 +107,12 @@ def load(
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     if loaded.idle_coordinates:
-        # No warning: whatever needs the inverse of M refuses with this.
+        # A note instead of a warning, because every function that inverts M raises this error.
         notes.append(massless_note(loaded))
     return replace(loaded, notes=tuple(notes))
 
 
-def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
+def with_fields(robot: Robot, fields: Mapping[str, object]) -> Robot:
     """Return a robot with new fields; fields of joints are merged with the robot's."""
     if not fields:
         return robot
@@ -130,14 +130,14 @@ def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
 def _load(
     found: RobotFile, lock: Lock | None, package_dirs: tuple[Path, ...]
 ) -> tuple[Robot, tuple[Advice, ...]]:
-    """Return the robot of a URDF, and the warnings that its fields may still remove."""
+    """Return the robot of a URDF, and warnings that fields of the robot may make unnecessary."""
     description = read_urdf(found.path)
     loaded = _robot(description.model, found.name, lock, description.mimics)
     dirs = (*package_dirs, *found.package_dirs)
-    # Meshes are read when the robot is drawn, and no output may replace them before.
+    # Meshes are read when the robot is drawn, so output files must not overwrite them before.
     remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in description.meshes)))
     damping = {name: description.damping.get(name, 0.0) for name in loaded.joint_names}
-    # That of mimic joints counts with that of their leaders: the power is the same.
+    # Damping of a mimic joint is added to its leader with equal dissipated power.
     for joint, leader, multiplier, _ in loaded.followers:
         damping[leader.name] += multiplier**2 * description.damping.get(joint.name, 0.0)
     loaded = replace(
@@ -154,20 +154,22 @@ def _load(
 
 
 def from_model(
-    model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: Any
+    model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: object
 ) -> Robot:
     """Make a robot from a Pinocchio model that was built from MJCF, SDF or code.
 
     Parameters
     ----------
     model : pin.Model
-        Model whose only root joint is a free-flyer. The model is copied; the copy has no gravity.
+        Model whose only root joint is a free-flyer. The robot contains a copy of the model with
+        zero gravity.
     name : str, optional
         Name of the robot; the model's name by default.
     lock : mapping or iterable of str, optional
-        As in `load`.
+        Joints to weld, as in `load`.
     **fields
-        As in `load`. With damping="urdf", the ``damping`` of the model is used.
+        Fields of the robot, as in `load`. With damping="urdf", the ``damping`` of the model is
+        used.
 
     Returns
     -------
@@ -180,8 +182,9 @@ def from_model(
 
         - the root is not a single free-flyer;
         - a joint has more than one degree of freedom;
-        - the joints are not in depth-first order, so that CRBA would be silently wrong;
-        - a placement, a body or an armature is not physical.
+        - the joints are not in depth-first order, in which case the inertia matrix of Pinocchio's
+          CRBA would be wrong without an error;
+        - a placement, the inertia of a body or an armature is not physically realisable.
 
     Examples
     --------
@@ -222,7 +225,7 @@ def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, 
 
 
 def _check_root(model: pin.Model, name: str) -> None:
-    """Refuse a model that is not one tree on one free-flyer."""
+    """Raise `ModelError` unless the model is one tree with one free-flyer root joint."""
     root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
     if root != "JointModelFreeFlyer":
         raise ModelError(
@@ -232,27 +235,28 @@ def _check_root(model: pin.Model, name: str) -> None:
     fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
     if fixed:
         raise ModelError(
-            f"'{name}': joint '{fixed[0]}' is attached to the world, not the free-flyer; connect "
-            "every moving link to the one base"
+            f"'{name}': joint '{fixed[0]}' is attached to the world, not to the free-flyer; "
+            "connect every moving link to the base"
         )
 
 
 def _check_order(model: pin.Model, name: str) -> None:
-    """Refuse joints that are not in depth-first order."""
+    """Raise `ModelError` if the joints are not in depth-first order."""
     above: list[int] = []
     for joint, parent in enumerate(model.parents.tolist()):
         while above and above[-1] != parent:
             above.pop()
         if joint and not above:
             raise ModelError(
-                f"'{name}': the joints are not in depth-first order, which makes Pinocchio's CRBA "
-                "wrong; add all joints of one branch before the joints of the next"
+                f"'{name}': the joints are not in depth-first order, for which Pinocchio's CRBA "
+                "gives wrong results; add all joints of one branch before the joints of the "
+                "next branch"
             )
         above.append(joint)
 
 
 def _check_model(model: pin.Model, name: str) -> None:
-    """Refuse a model whose numbers no robot has, by the joint that has them."""
+    """Raise `ModelError` if a joint or body has physically impossible numbers."""
     for index in range(ROOT, model.njoints):
         body, joint, parent = model.inertias[index], model.joints[index], model.parents[index]
         armature = model.armature[joint.idx_v : joint.idx_v + joint.nv]
@@ -279,7 +283,7 @@ def _check_model(model: pin.Model, name: str) -> None:
 
 
 def body_alone(inertia: pin.Inertia, name: str) -> Robot:
-    """Return a body as a robot without joints."""
+    """Return a robot that consists of one body without joints."""
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
     model.appendBodyToJoint(1, inertia, pin.SE3.Identity())
@@ -288,5 +292,5 @@ def body_alone(inertia: pin.Inertia, name: str) -> Robot:
 
 
 def inertia_of(value: pin.Inertia) -> pin.Inertia:
-    """Return the inertia of a body that has mass, or raise `InputError`."""
+    """Return the inertia of a body, or raise `InputError` if it has no mass."""
     return given_body("payload", value, value)

@@ -2,10 +2,9 @@ r"""Mass of each link as in the URDF, changes of bodies, and motions that move n
 
 A body has mass m, centre of mass c and inertia I about c. With the identity matrix E, the second
 moments of its mass distribution are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The body is
-physically realisable if and only if its pseudo-inertia is positive (semi)definite, that is if m
-and Sigma are (Wensing, Kim and Slotine, Linear matrix
-inequalities for physically-consistent inertial parameter identification, IEEE Robotics and
-Automation Letters 3(1), 2018).
+physically realisable if and only if m and Sigma are positive (semi)definite (Wensing, Kim and
+Slotine, Linear matrix inequalities for physically-consistent inertial parameter identification,
+IEEE Robotics and Automation Letters 3(1), 2018).
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, SingularInertiaError, listed, require_known
-from fflin.base.names import by_name
+from fflin.base.names import by_name, matching
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, number, positive, shaped, vector, whole
 from fflin.base.validation import by_name as mapping
-from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.urdf.links import TRIANGLE_SLACK, Link, is_impossible
 
 if TYPE_CHECKING:
@@ -29,19 +28,22 @@ if TYPE_CHECKING:
 
 _KEYS = ("mass", "com", "inertia")
 _SYMMETRIC = 1e-9
-# Relative errors of a sum of bodies, and of a second moment, from rounding.
+# Relative rounding errors of a sum of bodies, and of a second moment.
 _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
 
-# Singular values below this share of the largest are zero: rounding leaves 1e-15 of it, and the
-# least that is meant, of links 1e7 m apart, is 1e-7 of it.
+# Singular values below this fraction of the largest count as zero. Rounding errors are 1e-15 of the
+# largest, and the smallest true value, for links 1e7 m apart, is 1e-7 of the largest.
 _ZERO = 1e-12
 
-# A coordinate is named where its share in a motion is larger than this.
+# A message names the coordinates whose component in a unit motion exceeds this.
 _INVOLVED = 0.1
 
+# Relative asymmetry up to which a body counts as symmetric, for the rounding of numbers in a URDF.
+_ASYMMETRY = 1e-12
 
-def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
-    """Return {joint: body} of bodies that `Robot.with_mass_properties` is given."""
+
+def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
+    """Return {joint: body} from the argument of `Robot.with_mass_properties`."""
     given = mapping("bodies", bodies, "body")
     index_of = {"base": ROOT, **{model.names[i]: i for i in range(ROOT, model.njoints)}}
     links: dict[int, list[str]] = {}
@@ -65,8 +67,8 @@ def given_bodies(model: pin.Model, bodies: Any) -> dict[int, pin.Inertia]:
     return new
 
 
-def given_body(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
-    """Return a body that is given in part or as a whole."""
+def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
+    """Return a body from an inertia, or from changed parts of the old body."""
     of = f"of '{name}'"
     if isinstance(value, pin.Inertia):
         value = {"mass": value.mass, "com": value.lever, "inertia": value.inertia}
@@ -96,7 +98,7 @@ def given_body(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
 
 
 def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pin.Inertia]:
-    """Return {joint: body} with all bodies drawn at random, see `Robot.perturbed`."""
+    """Return {joint: body} with random changes of all bodies; see `Robot.perturbed`."""
     checked = {key: number(key, value) for key, value in spreads.items()}
     for key, spread in checked.items():
         if not 0.0 <= spread < 1.0:
@@ -115,7 +117,7 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
 
 
 def _radii(body: pin.Inertia) -> Array:
-    """Return the root mean square distances (3,) of a body's mass from its centre, by axis [m]."""
+    """Return the root mean square distances (3,) [m] of a body's mass from its centre, per axis."""
     second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
     radii: Array = np.sqrt(np.abs(second) / (body.mass or np.inf))
     return radii
@@ -124,15 +126,17 @@ def _radii(body: pin.Inertia) -> Array:
 def stretched(
     body: pin.Inertia, mass: Array, com: Array, inertia: Array
 ) -> tuple[Array, Array, Array]:
-    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of a body that was changed.
+    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of N variants of a body.
 
-    `mass` (N, 1) and `inertia` (N, 3) are relative; `com` (N, 3) moves the centre [m], mass and
-    inertia about it held. All are along the axes of the body's frame.
+    `mass` (N, 1) and `inertia` (N, 3) are relative changes. `com` (N, 3) [m] shifts the centre of
+    mass, and changes neither the mass nor the inertia about the centre. All are along the axes of
+    the body's frame.
     """
-    # Stretched along its frame's axes by S, its Sigma becomes S Sigma S, which stays positive.
+    # A body that is stretched by S along its axes has the second moments S Sigma S, which remain
+    # positive definite.
     heavier, unit = 1.0 + mass.reshape(-1), np.eye(3)
     second = 0.5 * np.trace(body.inertia) * unit - body.inertia
-    # A body that is none, as some files have them, keeps its shape.
+    # A physically impossible body, as in some files, is scaled equally along all axes.
     sound = np.linalg.eigvalsh(second)[0] >= -_NO_MOMENT * np.trace(second)
     stretch = np.sqrt(1.0 + (inertia if sound else inertia[:, :1] * np.ones(3)))
     second = heavier[:, None, None] * second * stretch[:, :, None] * stretch[:, None]
@@ -145,7 +149,7 @@ class LinkMass(NamedTuple):
 
     mass: float
     inertia: Array
-    placement: pin.SE3  # of the <inertial> on the link
+    placement: pin.SE3  # placement of the <inertial> on the link
 
     @classmethod
     def of(cls, link: Link) -> LinkMass:
@@ -162,20 +166,24 @@ class LinkMass(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """A link, or a whole body, on the joint that carries it."""
+    """Mass properties of a link, or of a whole body, on the joint that moves it."""
 
     joint: int
-    placement: pin.SE3  # of centre of mass and axes, on the joint
+    placement: pin.SE3  # placement of the centre of mass and the inertia's axes on the joint
     mass: float
     inertia: Array
-    frame: pin.SE3  # on the joint, in which its centre of mass is given
-    whole: bool = False  # whether it is a body of several links
+    frame: pin.SE3  # placement on the joint of the frame in which the centre of mass is given
+    whole: bool = False  # whether the piece is a body of several links
 
 
 def pieces_of(
     model: pin.Model, links: Mapping[str, LinkMass]
 ) -> tuple[dict[str, Piece], dict[str, str]]:
-    """Return {name: piece} of links and of bodies of several, and {body: link} of the others."""
+    """Return {name: piece} and {body: link}.
+
+    The pieces are all links, and all bodies of several links. A body of one link is given by the
+    name of this link.
+    """
     found, also = dict[str, Piece](), dict[str, str]()
     of_body: dict[int, dict[str, Piece]] = {}
     for name, link in links.items():
@@ -198,6 +206,23 @@ def pieces_of(
         also |= {own: alone} if alone != own else {}
         found.setdefault(alone, whole)
     return found, also
+
+
+def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
+    """Return the names in `pieces` of the links and bodies that match a name or pattern."""
+    pieces, link_of = robot.pieces, robot.link_of
+    if key in pieces or key in link_of:
+        return [key if key in pieces else link_of[key]]
+    sums = sums_of(pieces)
+    names = [*(name for name in pieces if name not in sums), *link_of]
+    found = [names[i] for i in matching(kind, key, names)]
+    return list(dict.fromkeys(link_of.get(name, name) for name in found))
+
+
+def sums_of(pieces: Mapping[str, Piece]) -> set[str]:
+    """Return the names of bodies whose links are pieces as well."""
+    linked = {each.joint for each in pieces.values() if not each.whole}
+    return {name for name, each in pieces.items() if each.whole and each.joint in linked}
 
 
 def as_inertia(piece: Piece) -> pin.Inertia:
@@ -249,9 +274,9 @@ def _squares(com: Array) -> Array:
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     """Return the coordinates that can move together without moving mass; usually none."""
-    # The energy vanishes only if the velocity of every mass, every turn that has inertia and every
-    # rate that has an armature do: a question of geometry, decided without the masses, whose
-    # rounding could hide it.
+    # A motion has no kinetic energy if it moves no mass, rotates no body about an axis with
+    # inertia, and moves no joint with armature. This depends on geometry alone, so the values of
+    # masses, whose rounding errors could hide it, are not used.
     bodies = robot.model.inertias.tolist()[ROOT:]
     moments = [np.linalg.eigh(body.inertia) for body in bodies]
     if all(
@@ -259,7 +284,7 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
         for body, (values, _) in zip(bodies, moments, strict=True)
     ):
         return ()
-    # v = columns nu: joints that mimic others follow them.
+    # v = columns @ nu, where mimic joints follow their leaders.
     columns = np.eye(robot.nv)
     for joint, leader, multiplier, _ in robot.followers:
         columns[joint.idx_v, leader.idx_v] = multiplier
@@ -267,7 +292,7 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
     idle: tuple[str, ...] = ()
-    # An M that is singular at two random configurations is singular at all.
+    # If M is singular at two random configurations, it is singular at every configuration.
     for _ in range(2):
         velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
         q = pin.integrate(robot.model, robot.neutral(), velocity)
@@ -283,7 +308,7 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
 
 
 def coordinate_names(robot: Robot) -> list[str]:
-    """Return the names (6 + n) of the coordinates of velocity, in state order, for a message."""
+    """Return names for messages of the 6 + n velocity coordinates, in state order."""
     return ["the base"] * 6 + [f"joint '{name}'" for name in robot.joint_names]
 
 
@@ -292,18 +317,18 @@ def massless_note(robot: Robot) -> str:
     idle = listed(robot.idle_coordinates)
     return (
         f"the mass matrix of '{robot.name}' is singular at every configuration: {idle} can move "
-        "without moving mass; give the links of these joints an inertia, or lock the joints"
+        "without moving mass; give an inertia to the link of each such joint, or lock the joint"
     )
 
 
 def require_inertia(robot: Robot) -> None:
-    """Refuse an M that is singular at every configuration, which rounding of factors may hide."""
+    """Raise an error if M is singular at every configuration; its factors may not show this."""
     if robot.idle_coordinates:
         raise SingularInertiaError(massless_note(robot))
 
 
 def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:
-    """Return rows (k, nv) that give, from v, every velocity that has inertia."""
+    """Return the matrix (k, nv) that maps v to all velocities on which the energy depends."""
     model, data = robot.model, robot.create_data()
     pin.computeJointJacobians(model, data, q)
     rows = [np.eye(model.nv)[model.armature > 0.0]]
@@ -315,3 +340,36 @@ def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Ar
         turning = values > _NO_MOMENT * values[2]
         rows.append(axes[:, turning].T @ J[3:])
     return np.vstack(rows)
+
+
+def rotor_names(robot: Robot) -> tuple[str, ...]:
+    """Return the names of rotors: symmetric joints that carry no other joint."""
+    model = robot.model
+    index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
+    named = set(robot.used_frames)
+    # Joints that carry or lead another joint, or that have a spring, an input or an output.
+    busy = set(model.parents.tolist())
+    busy |= {index_of[follower.leader.name] for follower in robot.followers}
+    busy |= {index_of[name] for name, stiffness in robot.stiffness.items() if stiffness}
+    if named:
+        busy |= {frame.parentJoint for frame in model.frames if frame.name in named}
+    free = (joint for joint in robot.joints if index_of[joint.name] not in busy)
+    return tuple(joint.name for joint in free if _is_symmetric(robot, joint, index_of[joint.name]))
+
+
+def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
+    """Return whether the body of a joint is symmetric about the joint axis."""
+    if joint.prismatic:
+        return False
+    pin_joint = robot.model.joints[index]
+    data = pin_joint.createData()
+    pin_joint.calc(data, robot.neutral())
+    linear, axis = np.split(np.asarray(data.S).ravel(), 2)
+    if linear.any():  # a screw
+        return False
+    body, turn = robot.model.inertias[index], skew(axis)
+    inertia = body.inertia
+    uneven = float(np.abs(turn @ inertia - inertia @ turn).max())
+    largest = float(np.abs(inertia).max())
+    offset = body.mass * float(np.square(turn @ body.lever).sum())
+    return uneven <= _ASYMMETRY * largest and offset <= _ASYMMETRY**2 * largest

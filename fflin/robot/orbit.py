@@ -23,34 +23,33 @@ BODIES = {
     "saturn": (3.793120749e16, 60268000.0),
 }
 
-# A lower altitude [m] over the earth is probably in km.
+# An altitude [m] over the earth below this value was probably meant in km.
 _LOWEST = 80e3
 
-_FOLLOWS: Any = None  # from the others
+_FOLLOWS: Any = None  # default of fields that follow from other fields
 
 
 @dataclass(frozen=True)
 class CircularOrbit:
     r"""Circular orbit about a central body.
 
-    The robot is described relative to a frame whose origin moves along the orbit in free fall.
-    The frame rotates with the orbit. The axes of the rotating frame are one of
+    The orbital frame has its origin on the orbit, in free fall, and rotates once per revolution.
+    Its axes are one of
 
     - ``lvlh``: x along the orbit, y opposite to the orbit normal, z towards the central body;
     - ``hill``: x away from the central body, y along the orbit, z along the orbit normal.
 
-    The rotating frame is Pinocchio's world, so that velocities are relative to the rotating
-    frame. The gravity gradient is linear in the position x relative to the origin: the force per
-    mass is
-    :math:`n^2 (3 r r^T - E) x`, with the unit vector r away from the central body and the
-    identity E. The relative error of this linearisation is of the order of ``|x|`` divided by the
-    orbit's radius.
+    The orbital frame is the world of Pinocchio, so that velocities are relative to this rotating
+    frame. The gravity gradient is modelled as linear in the position x relative to the origin: the
+    force per mass is :math:`n^2 (3 r r^T - E) x`, with the mean motion n, the unit vector r away
+    from the central body, and the identity E. The relative error of this linearisation is of the
+    order of ``|x|`` divided by the orbit's radius.
 
     Parameters
     ----------
     altitude : float, optional
-        Height above the surface [m]. An `FflinWarning` is issued for less than 80 km over the
-        earth, which is probably a value in km.
+        Height above the surface [m]. An altitude of less than 80 km over the earth causes an
+        `FflinWarning`, because the value was probably given in km.
     mean_motion : float, optional
         Mean motion n [rad/s], instead of the altitude.
     body : str
@@ -106,8 +105,8 @@ class CircularOrbit:
         given = [value for value in (self.altitude, self.mean_motion) if value is not None]
         if len(given) != 1:
             raise InputError(
-                f"an orbit has altitude {self.altitude} [m] and mean_motion {self.mean_motion} "
-                "[rad/s]; give exactly one of the two"
+                f"altitude is {self.altitude} [m] and mean_motion is {self.mean_motion} [rad/s]; "
+                "give exactly one of them"
             )
         size = self.mu, self.body_radius
         mu, ground = (
@@ -123,16 +122,16 @@ class CircularOrbit:
             altitude = (mu / n) ** (1.0 / 3.0) / n ** (1.0 / 3.0) - ground
         if not 0.0 < altitude < 1e15:
             raise InputError(
-                f"an altitude of {altitude:g} m over {self.body} is no orbit; give an altitude "
-                "above 0, or a smaller mean motion"
+                f"an altitude of {altitude:g} m over {self.body} is not an orbit; give an "
+                "altitude above 0 and below 1e15 m, or another mean motion"
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
-            # Not for an orbit that was saved, nor for another body called earth.
+            # No warning for a saved orbit, or for another body that is named earth.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
                 warnings.warn(
-                    f"an altitude of {altitude:.8g} m over earth: altitudes are in metres; write "
-                    "400 km as 400e3",
+                    f"an altitude of {altitude:.8g} m over earth is too low for an orbit; "
+                    "altitudes are in metres, so write 400 km as 400e3",
                     FflinWarning,
                     stacklevel=3,
                 )
@@ -156,7 +155,7 @@ class CircularOrbit:
 
     @classmethod
     def from_json(cls, text: str) -> CircularOrbit:
-        """Return the orbit that `to_json` wrote, bit for bit."""
+        """Return the orbit from the JSON text of `to_json`, with bit-for-bit equal values."""
         parts = json.loads(text)
         n = parts.pop("mean_motion")
         orbit = cls(**parts)
@@ -170,8 +169,8 @@ class CircularOrbit:
         )
 
 
-def checked_orbit(value: Any) -> CircularOrbit | None:
-    """Return the orbit of a field: an orbit, an altitude [m], a mapping of parts, or None."""
+def checked_orbit(value: object) -> CircularOrbit | None:
+    """Return the orbit from an orbit, an altitude [m], a mapping of parts, or None."""
     if value is None or isinstance(value, CircularOrbit):
         return value
     if not isinstance(value, Mapping):

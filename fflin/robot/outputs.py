@@ -1,7 +1,7 @@
 """Outputs y of the linear model: measured quantities of a robot, in any mix and order.
 
-Reference axes are the axes of the reference placement that the state is relative to. The module
-`fflin.dynamics.outputs` holds the measured value of each kind and its derivatives.
+Reference axes are the axes of the state's reference placement. The module
+`fflin.dynamics.outputs` computes the outputs and their derivatives.
 """
 
 from dataclasses import dataclass, fields
@@ -14,11 +14,11 @@ from fflin.base.errors import InputError, require_known
 class Output:
     """Base class of outputs, with their names and units."""
 
-    # What it is called on a command line.
+    # Name on the command line.
     WORD: ClassVar[str]
-    # (name, unit) of each vector of three that it measures; empty where it is of states.
+    # (name, unit) of each measured vector (3,); empty if the output consists of states.
     VECTORS: ClassVar[tuple[tuple[str, str], ...]] = ()
-    # Whether it depends on the accelerations, and so on the inputs.
+    # Whether the output depends on accelerations, and so on the inputs.
     FEELS_ACCELERATION: ClassVar[bool] = False
 
     @property
@@ -35,7 +35,7 @@ class Output:
 
 @dataclass(frozen=True)
 class FrameOutput(Output):
-    """Base class of outputs of one or two frames of the model, on the base or on any link."""
+    """Base class of outputs that depend on one or two frames on the base or on links."""
 
     frame: str
 
@@ -46,7 +46,7 @@ class FrameOutput(Output):
 
 
 class FullState(Output):
-    """Output of all states, with the names, order and axes of the state.
+    """Output of all states, with the same names, order and axes as in the state vector.
 
     Examples
     --------
@@ -61,7 +61,7 @@ class FullState(Output):
 
 
 class BasePose(Output):
-    """Output of the base pose states: attitude q_b (3,) [1] and position r_b (3,) [m].
+    """Output of the base pose, as in the state: attitude q_b (3,) [1] and position r_b (3,) [m].
 
     Examples
     --------
@@ -80,19 +80,20 @@ class JointOutput(Output):
     joints: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        # A string is a sequence of names of one letter each.
+        # A string would be taken as a sequence of one-letter names.
         if isinstance(self.joints, str):
             given = repr(self.joints)
             raise InputError(f"joints is {given}, expected a tuple of names: write ({given},)")
 
 
 class JointPositions(JointOutput):
-    """Output of joint position states: angles [rad] or lengths [m].
+    """Output of joint positions: angles [rad] or lengths [m].
 
     Parameters
     ----------
     joints : tuple of str, optional
-        Independent joints, or patterns, in the wanted order; by default all, in state order.
+        Names of independent joints, or patterns, in the order of the outputs. The default is all
+        independent joints in state order.
 
     Examples
     --------
@@ -105,12 +106,13 @@ class JointPositions(JointOutput):
 
 
 class JointVelocities(JointOutput):
-    """Output of joint velocity states: rates [rad/s] or [m/s].
+    """Output of joint velocities: angular [rad/s] or linear [m/s].
 
     Parameters
     ----------
     joints : tuple of str, optional
-        Independent joints, or patterns, in the wanted order; by default all, in state order.
+        Names of independent joints, or patterns, in the order of the outputs. The default is all
+        independent joints in state order.
 
     Examples
     --------
@@ -126,8 +128,8 @@ class FramePose(FrameOutput):
     """Output of the pose of a frame, on the base or on any link.
 
     - Position (3,) [m] of the frame's origin relative to the reference, in reference axes.
-    - Rotation vector (3,) [rad], log(R*^T R), from the frame's attitude R* at the point of
-      linearisation, in the frame's own axes. The vector is zero at this point.
+    - Rotation vector (3,) [rad], log(R*^T R), in the frame's own axes. R is the frame's attitude,
+      and R* is its attitude at the operating point. At this point, the rotation vector is zero.
 
     Parameters
     ----------
@@ -146,13 +148,13 @@ class FramePose(FrameOutput):
 
 
 class FrameVelocity(FrameOutput):
-    """Output of the velocity of a frame, with the axis convention of the hybrid base velocity.
+    """Output of the velocity of a frame, in the same axes as the "hybrid" base velocity.
 
     - Angular velocity (3,) [rad/s], in the frame's own axes.
     - Velocity (3,) [m/s] of the frame's origin, in reference axes.
 
-    At the point of linearisation, both velocities are the time derivatives of `FramePose`, for
-    any velocity frame of the state.
+    At the operating point, these outputs are the time derivatives of the `FramePose` outputs. The
+    axes do not depend on the `frame` that is chosen for the base velocities in the state.
 
     Parameters
     ----------
@@ -176,15 +178,16 @@ class RelativePose(FrameOutput):
 
     - Position (3,) [m] of the origin of `frame` relative to the origin of `to`, in the axes of
       `to`.
-    - Rotation vector (3,) [rad], log(R*^T R), from the relative attitude R* at the point of
-      linearisation, in the axes of `frame`. The vector is zero at this point.
+    - Rotation vector (3,) [rad], log(R*^T R), in the axes of `frame`. R is the attitude of `frame`
+      relative to `to`, and R* is this attitude at the operating point. At this point, the rotation
+      vector is zero.
 
     Parameters
     ----------
     frame : str
         Name of the measured frame.
     to : str
-        Name of the frame relative to which `frame` is measured.
+        Name of the frame relative to which the pose of `frame` is measured.
 
     Examples
     --------
@@ -199,7 +202,7 @@ class RelativePose(FrameOutput):
 
 
 class CenterOfMass(Output):
-    """Output of the centre of mass: position (3,) [m] relative to the reference, in its axes.
+    """Output of the centre of mass: position (3,) [m] in the axes of the reference.
 
     Examples
     --------
@@ -230,7 +233,7 @@ class Momentum(Output):
 
 
 class Gyroscope(FrameOutput):
-    """Output of a gyroscope: angular velocity (3,) [rad/s] of a frame, in its own axes.
+    """Output of a gyroscope: angular velocity (3,) [rad/s] of a frame, in the frame's own axes.
 
     Parameters
     ----------
@@ -249,11 +252,11 @@ class Gyroscope(FrameOutput):
 
 
 class Accelerometer(FrameOutput):
-    """Output of an accelerometer: specific force (3,) [m/s^2] of a frame, in its own axes.
+    """Output of an accelerometer: specific force (3,) [m/s^2] at a frame, in the frame's own axes.
 
-    The specific force is the acceleration of the frame's origin minus gravity. The specific force
-    is zero in free fall without rotation and thrust. At rest under gravity, the specific force is
-    +g upwards.
+    The specific force is the acceleration of the frame's origin minus the gravitational
+    acceleration. It is zero in free fall without rotation and thrust. At rest under gravity, it is
+    directed upwards with the magnitude g.
 
     Parameters
     ----------
@@ -272,7 +275,7 @@ class Accelerometer(FrameOutput):
     FEELS_ACCELERATION = True
 
 
-# In the order in which a command line lists them.
+# In the order of the list on the command line.
 KINDS: tuple[type[Output], ...] = (
     *(FullState, BasePose, JointPositions, JointVelocities, CenterOfMass, Momentum),
     *(FramePose, FrameVelocity, RelativePose, Gyroscope, Accelerometer),
@@ -280,7 +283,7 @@ KINDS: tuple[type[Output], ...] = (
 
 
 def parse_output(text: str) -> tuple[Output, ...]:
-    """Read outputs as a command line has them: WORD, joints:NAME, pose:NAME, relative:NAME:TO."""
+    """Read outputs of the command line: WORD, joints:NAME, pose:NAME or relative:NAME:TO."""
     word, colon, rest = text.partition(":")
     kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
     require_known("output", [word], kinds)

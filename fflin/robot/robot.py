@@ -40,7 +40,7 @@ class Springs(NamedTuple):
     rest: Array
 
     def force(self, q_m: Array, rates: Array) -> Array:
-        """Return the force (.., n) on joints at q_m (.., n) that move at rates (.., n)."""
+        """Return the forces (.., n) of springs and dampers at q_m (.., n) and rates (.., n)."""
         return self.stiffness * (self.rest - q_m) - self.damping * rates
 
 
@@ -52,14 +52,15 @@ class Robot(Coordinates):
     ----------
     model : pin.Model
         Pinocchio model with a free-flyer root joint and zero gravity. Mimic joints and reaction
-        wheels with an inertia are ordinary joints of `model`. The model must not be changed; use
-        `from_model` to make a robot from another model.
+        wheels with an inertia are ordinary joints of `model`. The model must not be modified; to
+        use another model, make another robot by `from_model`.
     name : str
-        Name or file stem by which the robot was loaded.
+        Name of the robot, or the file name of its URDF without the extension.
     urdf : Path or None
-        File from which the robot was read.
+        URDF file from which the robot was read; None if there is no URDF.
     urdf_sha256 : str
-        Hash of the URDF, and of the masses if they were changed; empty if there is no URDF.
+        Hash of the URDF, and of the mass properties if they were changed; empty if there is no
+        URDF.
     joints : tuple of Joint
         The n independent joints in state order, which is Pinocchio's order.
     followers : tuple of Follower
@@ -67,46 +68,49 @@ class Robot(Coordinates):
     notes : tuple of str
         Warnings that were issued when the robot was read.
     locked : tuple of str
-        "joint=value" [rad|m] of each welded joint.
+        Text "joint=value" [rad|m] for each welded joint.
     urdf_damping : mapping
-        {joint: viscous damping [N m s/rad | N s/m]} from the file, including the damping of the
-        joint's mimic joints. The damping is part of the model only if `damping` is "urdf".
+        Viscous damping {joint: value [N m s/rad | N s/m]} from the URDF, including the damping of
+        the joint's mimic joints. The robot has this damping only if `replace` or `load` was given
+        ``damping="urdf"``.
     inputs : tuple of Input
         Inputs of the robot; by default torque and force on the base and the torque of every joint.
     outputs : tuple of Output
         Measured outputs of the robot; by default the full state.
     stiffness, damping : mapping
-        {joint: value [N m/rad | N/m], [N m s/rad | N s/m]} of springs and dampers.
+        Stiffness {joint: value [N m/rad | N/m]} of the springs, and damping {joint: value
+        [N m s/rad | N s/m]} of the dampers.
     rest : mapping
-        {joint: position [rad|m]} at which a spring is relaxed; 0 for joints not named.
+        Positions {joint: value [rad|m]} at which the springs are relaxed; 0 for all other joints.
     gravity : tuple of float (3,)
-        Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has no gravity.
+        Uniform gravitational acceleration [m/s^2] in Pinocchio's world axes. `model` itself has
+        zero gravity.
     orbit : CircularOrbit or None
-        Orbit of the robot; Pinocchio's world is then the orbit's frame, see `CircularOrbit`.
+        Orbit of the robot. In orbit, Pinocchio's world is the orbital frame, see `CircularOrbit`.
     package_dirs : tuple of Path
         Folders that are searched for ``package://`` meshes when the robot is drawn.
     passive : tuple of str
         Joints without a motor.
     weights : mapping
-        Default weights of `lqr`, which replace the weights of the rule "urdf" or "identity", see
-        `replace`.
+        Default weights of `lqr`, which take precedence over the weights of the rule "urdf" or
+        "identity"; see `replace`.
     point : mapping
-        Operating point of the command line, see `replace`.
+        Default operating point of commands such as `fflin linearize`, see `replace`.
     target : mapping
-        Target state of the commands `simulate` and `montecarlo`, see `replace`.
+        Target state of the commands `fflin simulate` and `fflin montecarlo`, see `replace`.
     start : mapping
         Default initial state of `simulate` and `visualize`, see `replace`.
     limits : mapping
-        Limits {name of an input or state: (least, largest)}, which replace limits of the URDF and
-        of the inputs.
+        Limits {name: pair (least, largest)} of inputs and states, which replace limits of the URDF
+        and of the inputs.
     links : mapping
-        {link: LinkMass}: mass properties of all links with mass, as given in the URDF.
+        Mass properties of all links with mass, as given in the URDF, by the names of the links.
     file_joints : tuple of str
         All joints of the file, including fixed joints.
     attached : tuple of (str, Robot)
-        Grasped robots, each with the prefix of its names.
+        Grasped payload robots, each in a pair with the prefix of its names.
     appendages : tuple of FlexibleAppendage and Slosh
-        Flexible appendages and slosh, whose modes are among the joints.
+        Flexible appendages and slosh. Their modes are among the joints.
 
     Examples
     --------
@@ -144,68 +148,74 @@ class Robot(Coordinates):
     file_joints: tuple[str, ...] = ()
     attached: tuple[tuple[str, Robot], ...] = ()
     appendages: tuple[Appendage, ...] = ()
-    # Where some of its joints are wheels or modes: the same robot without them.
+    # The same robot without wheels and modes; None if no joint is a wheel or mode.
     _unequipped: Robot | None = None
-    # Wheels and modes that it had before its inputs or appendages were replaced.
+    # Wheels and modes that were removed when inputs or appendages were replaced.
     _removed: tuple[str, ...] = ()
-    # The model, and what it was when the first robot of it was made.
+    # The model, and a copy from when the first robot was made from it.
     _as_made: tuple[pin.Model, pin.Model] | None = None
 
     def __post_init__(self) -> None:
         if self._as_made is None or self._as_made[0] is not self.model:
             object.__setattr__(self, "_as_made", (self.model, self.model.copy()))
         if not self.inputs:
-            # One force for each degree of freedom.
+            # Default: one force or torque for each degree of freedom.
             default = (BaseTorque(), BaseForce(), *map(JointTorque, self.joint_names))
             object.__setattr__(self, "inputs", default)
 
-    def replace(self, **fields: Any) -> Robot:
-        """Return a copy of the robot with other inputs, passive joints, gravity or orbit.
+    def replace(self, **fields: object) -> Robot:
+        """Return a copy of the robot with other inputs, springs, gravity, orbit or other fields.
 
         Parameters
         ----------
         inputs : sequence of Input
-            Inputs of the robot, in the order of u. Wheels with an inertia become joints of the
-            robot; previous wheels that are not among the new inputs are removed. The joint of a
-            `JointTorque` may be a pattern, ``*``, for all matching joints that have a motor.
+            Inputs of the robot, in the order of u; they replace all previous inputs. Wheels with an
+            inertia become joints of the robot, and wheels that are no longer among the inputs are
+            removed. The joint of a `JointTorque` may be a pattern such as ``*``, which stands for
+            all matching joints with a motor.
         appendages : sequence of FlexibleAppendage and Slosh
-            Flexible appendages and slosh of the robot, whose modes become passive joints.
-            Previous appendages are removed.
+            Flexible appendages and slosh of the robot, which replace all previous ones. Their
+            modes become joints without motors.
         outputs : sequence of Output
             Measured outputs of the robot, in the order of y.
         stiffness : mapping or float
-            {joint: K [N m/rad | N/m]}, or one value for all joints except wheels. In all
-            mappings, a name may be a pattern, ``hinge_*``.
+            Spring stiffness {joint: value [N m/rad | N/m]}, or one value for all joints except
+            wheels. In this and all other mappings, a name may be a pattern such as ``hinge_*``.
         damping : mapping, float or "urdf"
-            {joint: D [N m s/rad | N s/m]}, one value for all joints except wheels, or "urdf" for
-            the damping of the URDF.
+            Viscous damping {joint: value [N m s/rad | N s/m]}, one value for all joints except
+            wheels, or "urdf" for the damping of the URDF.
         rest : mapping
-            {joint: position [rad|m]} at which its spring is relaxed.
+            Positions {joint: position [rad|m]} at which the springs are relaxed.
         gravity : sequence of float (3,)
-            Uniform acceleration [m/s^2] in Pinocchio's world axes.
+            Uniform gravitational acceleration [m/s^2] in Pinocchio's world axes.
         orbit : CircularOrbit, float, mapping or None
-            Orbit of the robot, an altitude over the earth [m], or {parameter: value} of an orbit.
+            Orbit of the robot, altitude [m] over the earth, or parameters {name: value} of a
+            `CircularOrbit`. None removes the orbit.
         passive : sequence of str
-            Names of joints without a motor; the torques of these joints are removed from the
-            inputs.
+            Names of joints without a motor. Their torques are removed from the inputs.
         weights : mapping
-            Default weights of `lqr`: ``rule`` ("urdf" or "identity"), and ``q``, ``r``,
-            ``bryson``, each {state, input, group or pattern: weight or largest value}.
+            Default weights of `lqr` under its keywords ``rule``, ``q``, ``r`` and ``bryson``.
+            ``rule`` is "urdf" or "identity". ``q`` and ``r`` are weights, and ``bryson`` contains
+            largest values: {state, input, group or pattern: value}.
         point : mapping
-            Operating point of `fflin linearize`, `fflin check`, `fflin lqr` and others: ``joints``
-            {joint: position [rad|m]}, ``rpy`` (3,) [deg] about fixed axes, ``position`` (3,) [m]
-            of the base, ``velocity`` {joint or state: rate}, as in `fflin.velocity`. Functions
-            ignore `point`; their arguments define the operating point.
+            Default operating point of commands such as `fflin linearize`, `fflin check` and
+            `fflin lqr`. Functions ignore `point`, because their arguments define the operating
+            point. The keys, all optional, are
+
+            - ``joints``: {joint: position [rad|m]};
+            - ``rpy`` (3,): roll, pitch and yaw [deg] of the base about fixed axes;
+            - ``position`` (3,): position of the base [m];
+            - ``velocity``: {joint or state: rate}, as in `fflin.velocity`.
         target : mapping
-            Target state of the commands `simulate` and `montecarlo`, with the keys of `point`.
-            Omitted parts are as in `point`.
+            Target state of the commands `fflin simulate` and `fflin montecarlo`, with the same
+            keys as `point`. Omitted keys are taken from `point`.
         start : mapping
-            Default initial state of `simulate`, with the keys of `point`. Omitted parts are as in
-            `point`.
+            Default initial state of `simulate`, with the same keys as `point`. Omitted keys are
+            taken from `point`.
         limits : mapping
-            {key: limit}. A key is a name, a group or a pattern of inputs or states. A limit is a
-            largest magnitude, or a pair (least, largest).
-            Limits given here replace the limits of the URDF and of the inputs.
+            Limits {name: limit}, which replace the limits of the URDF and of the inputs. A name
+            is an input, a state, a group or a pattern. A limit is a largest magnitude, or a pair
+            (least, largest).
 
         Returns
         -------
@@ -223,7 +233,8 @@ class Robot(Coordinates):
             If a field, a joint, a frame of an input or output, or a name in `limits` does not
             exist.
         ModelError
-            If the robot's Pinocchio model was changed after `load`.
+            If the robot's Pinocchio model (``robot.model``) was modified after the robot was
+            created.
         """
         self.require_unchanged()
         robot = self
@@ -237,48 +248,52 @@ class Robot(Coordinates):
         scope = Scope(robot.joint, joints, own, robot.inputs, self.urdf_damping)
         checked = checked_fields(fields, scope)
         for key in ("stiffness", "damping"):
-            if key in checked:  # modes keep theirs unless they are named
+            if key in checked:  # modes keep their values unless they are named
                 old = getattr(robot, key)
                 kept = {joint.name: old[joint.name] for joint in robot.modes if joint.name in old}
                 checked[key] = kept | checked[key]
         robot = replace(robot, **checked)
         if robot.orbit and any(robot.gravity):
             raise InputError(
-                f"'{self.name}' has both uniform gravity and an orbit, which includes the gravity "
-                "of its central body; leave one out"
+                f"'{self.name}' has both uniform gravity and an orbit, but an orbit already "
+                "includes the gravity of its central body; leave one of them out"
             )
         for name in robot.used_frames:
             find_frame(robot.model, name)
         return robot
 
-    def with_mass_properties(self, bodies: Mapping[str, Any]) -> Robot:
+    def with_mass_properties(self, bodies: Mapping[str, object]) -> Robot:
         """Return a copy of the robot with other masses, centres of mass or inertias.
 
         Parameters
         ----------
         bodies : mapping
-            {body: {"mass": m [kg], "com": (3,) [m], "inertia": (3, 3) [kg m^2] about the centre of
-            mass} or pin.Inertia}, in the axes of the body's joint.
+            New mass properties {body: properties} in the axes of the body's joint. The properties
+            are a pin.Inertia, or a mapping with any of the keys
 
-            The name of a body is its joint, ``base``, a pattern, or its link if the body has only
-            one link. Links that are fixed to each other form one body. Give the properties of the
-            whole body, including its wheels.
+            - ``mass`` [kg];
+            - ``com`` (3,) [m], the centre of mass;
+            - ``inertia`` (3, 3) [kg m^2] about the centre of mass.
 
-            Omitted properties are unchanged. A mass without an inertia scales the inertia in
-            proportion, like a change of density.
+            Links that are fixed to each other form one body, named by its joint or ``base``. A body
+            with only one link can also be named by this link. A pattern selects several bodies.
+            Give the properties of the whole body, including its wheels.
+
+            Omitted properties are unchanged. But if a mass is given without an inertia, the
+            inertia is scaled in proportion to the mass, as for a change of density.
 
         Returns
         -------
         Robot
-            A robot with the same meshes, names and inputs, and another ``urdf_sha256``.
+            A robot with the same meshes, names and inputs, but with another ``urdf_sha256``.
 
         Raises
         ------
         InputError
-            If a mass is not positive, or an inertia is not physically realisable or less than
-            the inertia of the wheels in the body.
+            If a mass is not positive, an inertia is not physically realisable, or the inertia of a
+            body is less than the inertia of its wheels.
         UnknownNameError
-            If there is no such body or property.
+            If a body or property does not exist.
         """
         return self.with_bodies(given_bodies(self._bare.model, bodies))
 
@@ -287,13 +302,14 @@ class Robot(Coordinates):
     ) -> Robot:
         """Return a copy of the robot with random, physically realisable mass properties.
 
-        A number d is drawn uniformly from [-1, 1], independently for each body and axis:
+        The properties of each body are changed by random numbers d, each drawn independently and
+        uniformly from [-1, 1]:
 
         - The mass is multiplied by ``1 + mass * d``.
-        - The second moments per mass along the axes of the body's frame are multiplied by ``1 +
-          inertia * d``.
-        - The centre of mass is shifted along each axis by ``com * d`` times the root-mean-square
-          distance of the mass from the centre of mass along this axis.
+        - For each axis of the body's frame, the second moment along this axis per unit mass is
+          multiplied by ``1 + inertia * d``.
+        - Along each axis, the centre of mass is shifted by ``com * d`` times the root-mean-square
+          distance of the body's mass elements from the centre of mass along this axis.
 
         Parameters
         ----------
@@ -305,13 +321,13 @@ class Robot(Coordinates):
         Returns
         -------
         Robot
-            Robot as returned by `with_mass_properties`.
+            Copy of the robot with the changed mass properties.
         """
         spreads = {"mass": mass, "com": com, "inertia": inertia}
         return self.with_bodies(random_bodies(self._bare.model, seed, **spreads))
 
     def with_bodies(self, bodies: Mapping[int, pin.Inertia]) -> Robot:
-        """Return the robot with other bodies {joint: body}, including wheels."""
+        """Return a copy of the robot with other inertias {joint index: body}, including wheels."""
         self.require_unchanged()
         bare = self._bare
         model = bare.model.copy()
@@ -331,7 +347,7 @@ class Robot(Coordinates):
         changed: Robot = with_inputs(whole, self.inputs)
         if not self.modes:
             return changed
-        # On the same joints, so that a configuration keeps its amplitudes.
+        # The joints remain the same, so configurations keep their modal amplitudes.
         model, own = self.model.copy(), self.model.inertias
         for joint in bodies:
             at = self.model.getJointId(bare.model.names[joint]) if joint > ROOT else ROOT
@@ -343,8 +359,8 @@ class Robot(Coordinates):
 
     @cached_property
     def pieces(self) -> dict[str, Piece]:
-        """{name: piece} of the links, and of bodies of several links, on the model's joints."""
-        # Wheels stand between the joints of the whole robot.
+        """Mass properties {name: piece} of all links, and of all bodies with several links."""
+        # The joint indices of the bare robot change, because wheels are inserted between joints.
         names, at = self._bare.model.names, self.model.getJointId
         now = [at(name) if joint > ROOT else joint for joint, name in enumerate(names)]
         found = self._links_and_bodies[0]
@@ -352,7 +368,7 @@ class Robot(Coordinates):
 
     @property
     def link_of(self) -> dict[str, str]:
-        """{body: link} of the bodies with one link; both names mean the same body."""
+        """Link names {body: link} of the bodies with one link, for which both names are valid."""
         return self._links_and_bodies[1]
 
     @cached_property
@@ -361,29 +377,35 @@ class Robot(Coordinates):
 
     @property
     def used_frames(self) -> tuple[str, ...]:
-        """Names of the model's frames that inputs and outputs use."""
+        """Names of the frames at which inputs and outputs are mounted."""
         of_inputs = [name for item in self.inputs for name in item.frames]
         return (*of_inputs, *(name for item in self.outputs for name in item.frames))
 
     @cached_property
     def idle_coordinates(self) -> tuple[str, ...]:
-        """Coordinates that can move together without moving mass; usually none."""
+        """Coordinates that make M singular, because they can move together without moving any mass.
+
+        Most robots have no such coordinates.
+        """
         return idle_coordinates(self)
 
     @cached_property
     def wheels(self) -> dict[str, float]:
-        """{name: inertia [kg m^2]} of the wheels among the joints."""
+        """Inertias {name: inertia [kg m^2]} of the reaction wheels that are joints of the robot."""
         wheels = named_wheels(self.inputs)
         return {name: wheel.inertia for name, wheel in wheels if wheel.inertia}
 
     @cached_property
     def stored_momentum(self) -> tuple[tuple[int, Array], ...]:
-        """Momentum of wheels without inertia: (joint index, vector (3,) [N m s] in joint axes)."""
+        """Angular momentum stored in the wheels without inertia, by the joint that carries them.
+
+        Each entry is the joint index and the vector (3,) [N m s] in joint axes.
+        """
         return stored_momentum(self.model, self.inputs)
 
     @cached_property
     def springs(self) -> Springs:
-        """Stiffness, damping and rest positions (n,) in state order."""
+        """Stiffness, damping and rest positions (n,) of all joints in state order."""
         given = (self.stiffness, self.damping, self.rest)
         return Springs(*(np.array([x.get(name, 0.0) for name in self.joint_names]) for x in given))
 
@@ -401,9 +423,9 @@ class Robot(Coordinates):
         Raises
         ------
         UnknownNameError
-            If there is no such joint; the message suggests similar names.
+            If the robot has no joint with this name; the message suggests similar names.
         InputError
-            If the joint is a mimic joint, a wheel without inertia or a locked joint.
+            If the name belongs to a mimic joint, a wheel without inertia or a locked joint.
         """
         for joint in self.joints:
             if joint.name == name:
@@ -425,16 +447,16 @@ class Robot(Coordinates):
 
     @cached_property
     def modes(self) -> tuple[Joint, ...]:
-        """Joints that are modes of flexible appendages or slosh."""
+        """Joints of the robot that represent modes of flexible appendages or slosh."""
         return tuple(joint for joint in self.joints if joint.mode)
 
     @property
     def _bare(self) -> Robot:
-        """The robot without the wheels and modes among its joints."""
+        """The robot without wheels and modes."""
         return self._unequipped or self
 
-    def _without_motors(self, passive: Any) -> Robot:
-        """Return the robot without the torques of joints that have no motor."""
+    def _without_motors(self, passive: object) -> Robot:
+        """Return the robot without the torque inputs of passive joints."""
         bare = self._bare
         joints = checked_passive(passive, bare.joint, bare.joint_names)
         inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)

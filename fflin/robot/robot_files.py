@@ -19,13 +19,13 @@ from fflin.robot.welding import requested
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
-# Fields that a file gives as arrays of tables.
+# Fields of a robot that are arrays of tables in a file: {field: names of the arrays}.
 _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
-# Tables of named parts, some of which are tables.
+# Tables whose entries may be tables.
 _OF_PARTS = ("weights", "point", "target", "start")
 
-# The keys of a robot file; a file without `urdf` holds inputs alone. The guide has their meaning.
+# Keys of a robot file, which the guide explains; a file without `urdf` contains only inputs.
 KEYS = (
     *("urdf", "package_dirs", "lock"),
     *(table for tables in _TABLES.values() for table in tables),
@@ -47,7 +47,7 @@ class RobotToml:
                 "contains only inputs with --inputs or fflin.load_inputs"
             )
         with document.located("urdf"):
-            # The URDF, under the name of the TOML file.
+            # The robot has the name of the TOML file, not of the URDF.
             self.found = find_robot(document.record["urdf"], path.parent)._replace(name=name)
             if self.found.path.suffix.lower() == ".toml":
                 raise InputError(f"urdf is {self.found.path}, expected a URDF or a robot's name")
@@ -72,7 +72,7 @@ class RobotToml:
 
     @contextmanager
     def located_locks(self) -> Iterator[None]:
-        """Put file and line in front of errors that name a joint that the file locks."""
+        """Add file and line to errors that name a joint which the file locks."""
         try:
             yield
         except FflinError as error:
@@ -82,8 +82,8 @@ class RobotToml:
                 raise
 
 
-def _flat(key: str, value: Any) -> Any:
-    """Return the value of a key with flat tables: names in them may have dots."""
+def _flat(key: str, value: object) -> Any:
+    """Return the value of a key with flat tables: nested keys are joined by dots."""
     if not isinstance(value, dict):
         return value
     if key in _OF_PARTS:
@@ -94,30 +94,32 @@ def _flat(key: str, value: Any) -> Any:
 def load_inputs(path: str | Path) -> tuple[Input, ...]:
     """Read the inputs of a robot from a TOML file.
 
-    The file is an array of tables ``[[input]]``, in the order of u. In each table,
-    ``type`` selects the class of the input. The other keys are the parameters of this class:
+    The file is an array of tables ``[[input]]``, one table per input, in the order of u. In each
+    table, ``type`` selects the class of the input. The other keys are the parameters of this class:
 
-    ==================  =========================================================
-    ``type``            keys
-    ==================  =========================================================
-    ``base_torque``     none: `BaseTorque`
-    ``base_force``      none: `BaseForce`
-    ``joint_torque``    ``joint``: `JointTorque`
-    ``thruster``        ``frame``, ``position`` [m], ``direction``; optional:
-                        ``name``, ``on_off`` (true: pulses of ``max``),
-                        ``least_impulse`` [N s]: `Thruster`
-    ``reaction_wheel``  ``axis``; optional: ``frame``, ``name``, and either
-                        ``inertia`` [kg m^2] with ``max_speed`` [rad/s] or
-                        ``momentum`` [N m s]: `ReactionWheel`
-    every type          optional: ``max`` and ``min`` [N m | N], the largest and
-                        the least value. The default of ``min`` is -max, for a
-                        thruster 0. For base inputs: one number, or three
-    ==================  =========================================================
+    ==================  ===============  =========================================
+    ``type``            class            keys
+    ==================  ===============  =========================================
+    ``base_torque``     `BaseTorque`     no other keys
+    ``base_force``      `BaseForce`      no other keys
+    ``joint_torque``    `JointTorque`    ``joint``
+    ``thruster``        `Thruster`       ``frame``, ``position`` [m] and
+                                         ``direction``; optional: ``name``,
+                                         ``on_off``, ``least_impulse`` [N s]
+    ``reaction_wheel``  `ReactionWheel`  ``axis``; optional: ``frame``, ``name``,
+                                         and either ``inertia`` [kg m^2] with
+                                         ``max_speed`` [rad/s], or ``momentum``
+                                         [N m s]
+    ==================  ===============  =========================================
+
+    Every type also accepts ``max`` and ``min`` [N m | N], the largest and the smallest value of the
+    input. For base inputs, each limit is one number, or three numbers. If ``min`` is omitted, it is
+    -max, or 0 for a thruster. With ``on_off = true``, a thruster fires in pulses of ``max``.
 
     Parameters
     ----------
     path : str or Path
-        Path of the file, or the name of a bundled one: ``"cubesat"``, ``"servicer_7dof"``.
+        Path of the file, or the name of a bundled file: ``"cubesat"`` or ``"servicer_7dof"``.
 
     Returns
     -------
@@ -128,10 +130,10 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     FileError
         If the path is not a regular file, or the file cannot be read or is too large.
     UnknownNameError
-        If there is no such type or key; the message names file and line.
+        If a type or key is unknown; the message names the file and line.
     InputError
-        If the file is not TOML, a key is missing or a value is wrong; the message names file and
-        line.
+        If the file is not TOML, a key is missing or a value is wrong; the message names the file
+        and line.
 
     Examples
     --------
@@ -148,7 +150,8 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
         position = [-0.9, 0.0, 0.65]
         direction = [1, 0, 0]
 
-    gives ``(JointTorque("joint_1"), Thruster("base", (-0.9, 0, 0.65), (1, 0, 0), "nozzle"))``.
+    gives the inputs
+    ``(JointTorque("joint_1"), Thruster("base", (-0.9, 0, 0.65), (1, 0, 0), "nozzle"))``.
 
     >>> inputs = fflin.load_inputs("cubesat")  # bundled
     >>> len(inputs), inputs[-1].name
@@ -167,7 +170,7 @@ def check_keys(document: TomlFile) -> None:
 
 
 def read_inputs(document: TomlFile) -> tuple[Input, ...]:
-    """Return the inputs of a file, as `load_inputs` does."""
+    """Return the inputs of a file; see `load_inputs`."""
     inputs: list[Input] = []
     for index, table in enumerate(_tables(document, "input")):
         kind, values = str(table.get("type")), {**table}
@@ -192,7 +195,7 @@ def read_appendages(document: TomlFile) -> list[Appendage]:
         ("flexible", FlexibleAppendage, FlexibleAppendage.from_nastran),
         ("slosh", Slosh, Slosh.cylinder),
     ):
-        # Keys that only files of Nastran, or cylinders, have.
+        # Keys that are valid only for a Nastran file or for a cylinder.
         alone = set(signature(special).parameters) - set(signature(make).parameters)
         for index, table in enumerate(_tables(document, key)):
             values = {**table}
@@ -211,19 +214,19 @@ def _tables(document: TomlFile, key: str) -> list[dict[str, Any]]:
     return tables
 
 
-def _built(document: TomlFile, place: tuple[str, int], build: Any, values: dict[str, Any]) -> Any:
-    """Build the object of a table, with file and line in front of errors."""
-    of, parameters = f"{place[0]} {place[1] + 1}: ", dict(signature(build).parameters)
+def _built(document: TomlFile, table: tuple[str, int], build: Any, values: dict[str, Any]) -> Any:
+    """Build an object from a table; errors begin with file and line."""
+    of, parameters = f"{table[0]} {table[1] + 1}: ", dict(signature(build).parameters)
     if isinstance(name := values.get("name"), str):
         of = of.replace(":", f" ('{name}'):")
-    if build is FlexibleAppendage:  # which has more parameters from files of Nastran
+    if build is FlexibleAppendage:  # these parameters come only from Nastran files
         del parameters["inertia"], parameters["rigid"]
     for name in values:
         if name not in parameters:
-            problem = f"{of}{unknown(f'key of {place[0]}', name, parameters)}"
-            raise document.error(UnknownNameError(problem), *place, name)
+            problem = f"{of}{unknown(f'key of {table[0]}', name, parameters)}"
+            raise document.error(UnknownNameError(problem), *table, name)
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in values:
-            raise document.error(f"{of}the key '{name}' is missing; add this key", *place)
-    with document.located(*place, of=of):
+            raise document.error(f"{of}the key '{name}' is missing; add this key", *table)
+    with document.located(*table, of=of):
         return build(**values)

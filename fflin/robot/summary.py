@@ -7,7 +7,6 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from string import Template
 from textwrap import fill
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -26,12 +25,12 @@ _LOOKS = {
     "thruster": re.compile(r"(?<![a-z])(thr|thruster|nozzle|rcs)(?![a-z])", re.IGNORECASE),
 }
 
-# How joints without a motor swing with all else held [rad/s], and their damping ratio.
+# Frequency [rad/s] and damping ratio that a draft suggests for joints without a motor.
 _SWING, _DAMPED = math.pi, 0.01
 
 
 def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
-    """Show robots: (name, the robot or why it does not load, where from)."""
+    """Return a table of robots from entries (name, robot or error message, origin)."""
     rows, refused = [["name", "n", "mass [kg]", "from"]], []
     for name, robot, origin in entries:
         if isinstance(robot, str):
@@ -39,12 +38,12 @@ def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
         else:
             rows.append([name, str(robot.n), f"{robot.mass:.6g}", origin])
     notes = [textwrap.fill(line, width(), subsequent_indent="  ") for line in refused]
-    head = f"{len(rows) - 1} robots can be loaded by name, {len(refused)} cannot be loaded"
+    head = f"{len(rows) - 1} robots can be loaded by name; {len(refused)} cannot be loaded"
     return "\n\n".join((head, grid(rows, "lrrl"), *notes))
 
 
 def robot_info(robot: Robot, at_point: str = "") -> str:
-    """Show a robot's tree, masses and limits, below a report of the robot at a point."""
+    """Return a text about a robot's tree, masses and limits, which includes `at_point`."""
     model = robot.model
     inputs = sum(3 if isinstance(item, BaseTorque | BaseForce) else 1 for item in robot.inputs)
     source = str(robot.urdf) if robot.urdf else "a Pinocchio model"
@@ -109,7 +108,7 @@ def _masses(robot: Robot) -> list[float]:
 
 
 def _settings(robot: Robot) -> list[str]:
-    """Show settings in addition to the URDF, except inputs and orbit."""
+    """Return lines about settings that the URDF does not contain, except inputs and orbit."""
     outputs = [":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ()))) for y in robot.outputs]
     shown = {
         "stiffness [N m/rad | N/m | 1/s^2]": robot.stiffness,
@@ -132,7 +131,7 @@ def _settings(robot: Robot) -> list[str]:
     return [folded(lines)] * bool(lines)
 
 
-def _said(value: Any) -> str:
+def _said(value: object) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key} = {_said(each)}" for key, each in value.items())
     if isinstance(value, tuple | list):
@@ -145,12 +144,12 @@ def _indented(text: str, below: str) -> str:
 
 
 def _limit(value: float) -> str:
-    # Pinocchio marks what the URDF does not limit by the largest double or by infinity.
+    # Pinocchio stores a missing limit as the largest double or as infinity.
     return "." if not math.isfinite(value) or abs(value) > 1e300 else f"{value:.5g}"
 
 
 def draft(robot: Robot, urdf: str) -> str:
-    """Return the text of a robot file for a robot that is defined by its URDF `urdf` alone."""
+    """Return the draft of a robot file for a robot that has only a URDF, with the path `urdf`."""
     from importlib.resources import files
 
     model = robot.model
@@ -205,7 +204,7 @@ def _order(model: pin.Model) -> Callable[[int], list[tuple[float, str]]]:
 
 
 def _candidate(robot: Robot, index: int) -> tuple[str, str]:
-    """Return the input that a link's name suggests, in comments, and the joint of a wheel."""
+    """Return the input that a link's name suggests, as TOML comments, and a wheel's joint."""
     model, frame = robot.model, robot.model.frames[index]
     kind = next((kind for kind, look in _LOOKS.items() if look.search(frame.name)), "")
     if not kind or frame.type != pin.FrameType.BODY or frame.parentJoint < ROOT:
@@ -216,7 +215,7 @@ def _candidate(robot: Robot, index: int) -> tuple[str, str]:
     axis, name, limits = np.array([0.0, 0.0, 1.0]), frame.name, "# max = 1.0  # [N]\n"
     own = ""
     if kind == "reaction_wheel":
-        name += "_rotor"  # which may be a joint's, whose name no frame has
+        name += "_rotor"  # because the wheel's name must differ from the names of joints and frames
         limits = "# max = 1.0  # [N m]\n"
         joint = model.joints[frame.parentJoint]
         if joint.nv == 1 and model.frames[frame.parentFrame].type == pin.FrameType.JOINT:
@@ -251,5 +250,5 @@ def _vector(values: np.ndarray) -> str:
 
 
 def _text(name: str) -> str:
-    """Write a name as TOML does."""
+    """Return a name as a TOML string."""
     return json.dumps(name, ensure_ascii=False).replace("\x7f", "\\u007f")

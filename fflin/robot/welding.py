@@ -29,7 +29,7 @@ Lock = Mapping[str, float | None] | Iterable[str]
 
 
 def welded(robot: Robot, lock: Lock) -> Robot:
-    """Return a robot with joints welded at values, and wheels welded to their carriers."""
+    """Return a robot with joints welded at given values, and with locked wheels welded."""
     bare, asked = robot._bare, requested(lock)
     wheels = {name for name in asked if name in robot.wheels}
     at = {name: value for name, value in asked.items() if name not in wheels}
@@ -43,8 +43,8 @@ def welded(robot: Robot, lock: Lock) -> Robot:
     ]
     if not inputs:
         raise InputError(
-            f"without {', '.join(sorted(gone))} the robot has no input; a model needs at least "
-            "one input"
+            f"without {', '.join(sorted(gone))}, the robot has no input, but a model needs at "
+            "least one input"
         )
     outputs = [
         replace(each, joints=tuple(x for x in each.joints if x not in gone))
@@ -71,8 +71,8 @@ def welded(robot: Robot, lock: Lock) -> Robot:
     return with_inputs(whole, inputs)
 
 
-def _without(of: Any, gone: Iterable[str], left: Iterable[str]) -> Any:
-    """Return a mapping and its nested mappings without keys that name removed joints alone."""
+def _without(of: object, gone: Iterable[str], left: Iterable[str]) -> Any:
+    """Remove the keys that match only removed joints from a mapping and its nested mappings."""
     if not isinstance(of, Mapping):
         return of
     removed, others = (
@@ -110,7 +110,7 @@ def locked_model(
         locked.append(f"{name}={0.0 if value is None else value!r}")
         if value is not None:
             joint_of(model, index).place(q, value)
-        # Without a frame for the joint, which models built in code may lack, Pinocchio crashes.
+        # Models built in code may lack the joint's frame, without which Pinocchio crashes.
         if not model.existFrame(name, pin.FrameType.JOINT):
             model.addJointFrame(index)
     left = {name: mimic for name, mimic in mimics.items() if name not in values}
@@ -118,7 +118,7 @@ def locked_model(
 
 
 def requested(lock: Any) -> dict[str, float | None]:
-    """Return the locks of a caller as {joint or pattern: value, or None at neutral}."""
+    """Return locks as {joint or pattern: value}, where None is the neutral value."""
     try:
         names = [lock] if isinstance(lock, str) else list(lock)
     except TypeError:
@@ -132,7 +132,8 @@ def requested(lock: Any) -> dict[str, float | None]:
 
 def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
     """Weld joints at q (nq,)."""
-    # Pinocchio looks frames up by name, which links and joints may share: joints keep theirs.
+    # Pinocchio finds frames by name, and a link and a joint may share a name. So frames of links
+    # are renamed temporarily.
     names = Counter(frame.name for frame in model.frames.tolist())
     shared: dict[str, str] = {}
     for index, frame in enumerate(model.frames):
@@ -148,7 +149,10 @@ def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
 
 
 def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: str) -> Robot:
-    """Return a robot with the base of another, all PREFIX.NAME and no motors, welded to a frame."""
+    """Return a robot with another robot's base welded to a frame.
+
+    The names of the other robot become PREFIX.NAME, and its joints have no motors.
+    """
     bare = robot._bare
     joint, at = find_frame(bare.model, frame)
     _require_new_names(robot, prefix)
@@ -170,7 +174,7 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         name: {**getattr(robot, name), **_prefixed(getattr(other, name), prefix)}
         for name in ("stiffness", "damping", "rest", "urdf_damping", "links")
     }
-    if not other.links:  # a body alone: its own parameters have its name
+    if not other.links:  # a single body, whose mass properties get the name of the prefix
         body = other.model.inertias[ROOT]
         at_center = pin.SE3(np.eye(3), body.lever)
         both["links"][prefix] = LinkMass(body.mass, body.inertia, at_center)
@@ -190,7 +194,7 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     return with_inputs(whole, robot.inputs)
 
 
-def _prefixed(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+def _prefixed(values: Mapping[str, object], prefix: str) -> dict[str, Any]:
     return {f"{prefix}.{name}": value for name, value in values.items()}
 
 
@@ -207,7 +211,7 @@ def _require_new_names(robot: Robot, prefix: str) -> None:
 def _joined(
     model: pin.Model, joint: int, other: pin.Model, placement: pin.SE3, prefix: str
 ) -> pin.Model:
-    """Return the model with the other's joints after all joints on the grasping joint."""
+    """Return a model that has the other's joints after all joints carried by `joint`."""
     bodies = model.inertias.tolist()
     bodies[joint] = bodies[joint] + placement.act(other.inertias[ROOT])
     names = [f"{prefix}.{name}" for name in other.names]

@@ -1,6 +1,6 @@
-"""The engines of the loop, and the compiled one: eight runs of a plan side by side in lanes.
+"""Choice of the engine, and the compiled loop, which simulates eight runs of a plan at once.
 
-A single run is in all lanes.
+Each run has a lane. A single run fills all lanes.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, ClassVar, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,28 +33,28 @@ from fflin.simulation.run import STOPS, Recording, ending_of, go, stop_condition
 
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
-# Steps beyond which a single run goes by the compiled loop, if its machine code is there.
+# Number of steps above which a single run uses the compiled loop, if its machine code is stored.
 LONG = 20_000
-# A run in Python of more than so many seconds is followed by a line on the compiled loop, which
-# takes about this fraction of the time and must be compiled once.
+# After a run in Python of more than _LONG_RUN seconds, a message recommends the compiled loop. It
+# takes about the given fraction of the time, and is compiled once in _COMPILING seconds.
 _LONG_RUN, _FRACTION, _COMPILING = 20.0, 0.1, 30.0
 
 _log = logging.getLogger("fflin")
 
-_MEMORY = 2**22  # [bytes] of rows that are there at a time
-_SPAN = 4096  # steps between looks at Ctrl-C
+_MEMORY = 2**22  # [bytes] memory for recorded rows
+_SPAN = 4096  # steps between checks for Ctrl-C
 
-# Values of runs (N, size) by the names of arrays of the loop, see `Dispersions.in_lanes`.
+# {name of an array of the loop: values of N runs (N, size)}; see `Dispersions.in_lanes`.
 Runs: TypeAlias = Mapping[str, Array]
 
 
 def noise_generator(seed: float) -> np.random.Generator:
-    """Return the generator of the noise of a run."""
+    """Return the random generator for the noise of a run."""
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
 
 
 def noises(plan: Plan, size: int, step: int, last: int) -> tuple[NDArray[np.intp], Array]:
-    """Return the samples (k,) from a step up to another, and the policy's noise (k, size)."""
+    """Return the samples (k,) between two steps, and the policy's noise (k, size) in them."""
     times, noise = plan.times, noise_of(plan)
     at = np.arange(-(-step // times.sample), -(-last // times.sample))
     rows = np.zeros((len(at), size))
@@ -65,56 +65,54 @@ def noises(plan: Plan, size: int, step: int, last: int) -> tuple[NDArray[np.intp
 
 
 class Statistics(Protocol):
-    """Records of eight parallel runs, slice by slice."""
+    """Statistics of eight parallel runs, updated after each slice of steps."""
 
-    FIELDS: ClassVar[tuple[str, ...]]  # names of the outcomes
     every: int  # steps from one row to the next
     span: int  # steps between checks of `over`
 
-    @property
-    def over(self) -> NDArray[np.bool_]:
-        """Mask (LANES,) of the runs that may end early."""
+    def over(self, q: Array, v: Array) -> NDArray[np.bool_]:
+        """Return the mask (LANES,) of the runs that end early at these q and v (LANES, ..)."""
 
     def reset(self) -> None:
-        """Begin with eight other runs."""
+        """Prepare for eight new runs."""
 
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
-        """Add the rows (count, LANES, ..) of q, nu, u, momentum and centre of mass.
+        """Add rows (count, LANES, ..) of q, nu, u, momentum and centre of mass.
 
-        They begin at step `first`. `raw` (count * width, LANES) holds the same. A row may be added
-        again.
+        The first row is at step `first`. `raw` (count * width, LANES) contains the same values. The
+        same row may be added twice.
         """
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the outcomes of the runs after so many steps; `stop` are indices into STOPS."""
+        """Return the outcomes of the runs after `done` steps; `stop` are indices into STOPS."""
 
 
 class LaneLoop:
-    """The compiled loop over a plan, with arrays of its own: not to be shared by threads.
+    """The compiled loop over a plan. Threads cannot share it, because it has its own work space.
 
-    `parts` are the arguments of the loop, in lanes. A row consists of q, nu, u, momentum and centre
-    of mass, at `columns`.
+    `parts` are the laned arguments of the loop. A row consists of q, nu, u, momentum and centre of
+    mass, at the slices `columns`.
     """
 
     def __init__(self, plan: Plan, plant: Plant, runs: Runs | None = None) -> None:
-        if runs and "delay" in runs:  # so that there is room for the latest
+        if runs and "delay" in runs:  # provide space for the largest delay
             latest = int(runs["delay"].max())
             plan = replace(plan, times=plan.times._replace(delay=latest))
         parts, stop = packed(plan, plant), stop_conditions(plan)
         law = parts.law
         if runs and "seed" in runs and len(law.added) == len(law.y):
             law = law._replace(added=np.zeros(SLOTS * len(law.y)))
-        if runs:  # all are given with the base on the side of the chart where this is positive
+        if runs:  # all runs are given with a quaternion for which the sign is positive
             stop = stop._replace(sign=[abs(stop.sign[0])])
         parts = parts._replace(law=law, stop=parts.stop._replace(sign=stop.sign))
         self._plan, self._state = plan, plant.state
         self._ending, self._noisy = ending_of(plan, stop), len(law.added) > len(law.y)
-        # The arrays in lanes, each with a column of its initial values.
+        # Laned arrays, each with the column of its initial values.
         self._fresh: list[tuple[Array, Array]] = []
         self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self._fresh.append(pair))
         self._words = words_of(self.parts, loop.ARGUMENTS)
         self._work = work_space(self.parts.robot.layout.size)
-        self._advance = kernel("loop", "advance", "the loop of eight runs at a time")
+        self._advance = kernel("loop", "advance", "the loop that simulates eight runs at a time")
         robot, point = self.parts.robot, self.parts.point
         ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3]).tolist()
         self.width, self.steps, self.done = ends[-1], plan.times.steps, 0
@@ -127,11 +125,11 @@ class LaneLoop:
         }
 
     def rows(self, most: int) -> Array:
-        """Return room for so many rows or for fewer, that do not fill the memory."""
+        """Return work space for `most` rows, or for fewer rows if they exceed the memory limit."""
         return work_space(max(1, min(most, _MEMORY // (8 * LANES * self.width))) * self.width)
 
     def advance(self, clock: NDArray[np.intp], last: int, every: int, rows: Array) -> None:
-        """Advance to a step, see `kernel.loop.advance`."""
+        """Advance to the step `last`; see `kernel.loop.advance`."""
         self._advance(self._words, clock, last, every, rows, self._work)
 
     def split(self, raw: Array) -> list[Array]:
@@ -139,7 +137,7 @@ class LaneLoop:
         by_row = raw.reshape(-1, self.width, LANES).transpose(0, 2, 1)
         return [by_row[..., part] for part in self.columns]
 
-    # A motion that diverges overflows before it is stopped: that is no reason to warn.
+    # A diverging motion overflows before it is stopped, so NumPy need not warn.
     @np.errstate(over="ignore", invalid="ignore")
     def fly(self, statistics: Statistics, out: Runs, runs: Runs | None = None) -> list[str]:
         """Simulate up to eight runs, the plan's own by default, and return why each was stopped.
@@ -156,7 +154,11 @@ class LaneLoop:
         span = max(1, min((len(space) // self.width - 1) * every, statistics.span))
         if self._noisy:
             span = min(span, SLOTS * times.sample)
-        clock, going, told = np.zeros(1, dtype=np.intp), np.ones(count, dtype=bool), [""] * count
+        clock, going, messages = (
+            np.zeros(1, dtype=np.intp),
+            np.ones(count, dtype=bool),
+            [""] * count,
+        )
         bar = Progress(self._plan.progress)
         try:
             while clock[0] < steps and going.any():
@@ -171,24 +173,27 @@ class LaneLoop:
                 bar(done, steps)
                 v = self._state.spread(point.nu.T)
                 for lane in going.nonzero()[0]:
-                    told[lane] = self._ending(done * times.dt, point.q[:, lane], v[lane])
-                stop = np.array([float(stop_of(each)) for each in told])
-                ending = going & ((stop > 0.0) | (done == steps) | statistics.over[:count])
+                    messages[lane] = self._ending(done * times.dt, point.q[:, lane], v[lane])
+                stop = np.array([float(stop_of(each)) for each in messages])
+                if done % statistics.span == 0:
+                    over = statistics.over(point.q.T, v)[:count] & (stop == 0.0)
+                    stop[over] = STOPS.index("stopped")
+                ending = going & ((stop > 0.0) | (done == steps))
                 if not ending.any():
                     continue
                 self._end(statistics, ending, stop[of_lane], out)
                 going &= ~ending
-                # What has ended would stop the others: it goes on as one of them.
+                # A finished run would stop all lanes, so its lane continues as a copy of another.
                 if going.any():
                     over = ~going[of_lane]
                     for array, _ in self._fresh:
                         array[:, over] = array[:, [going.argmax()]]
         finally:
             bar.close()
-        return told
+        return messages
 
     def _begin(self, runs: Runs, of_lane: NDArray[np.intp]) -> Callable[[int, int], None]:
-        """Write what the runs begin with, and return what writes the errors of their sensors."""
+        """Write the initial values of runs, and return a function that writes sensor errors."""
         for array, initial in self._fresh:
             array[:] = initial
         for name, values in runs.items():
@@ -213,7 +218,7 @@ class LaneLoop:
 
         def sense(step: int, last: int) -> None:
             nonlocal drawn
-            if drawn == last:  # some of the others ended on the way
+            if drawn == last:  # the slice was interrupted by the end of a run
                 return
             drawn = last
             k, values = noises(self._plan, size, step, last)
@@ -227,24 +232,25 @@ class LaneLoop:
     def _end(
         self, statistics: Statistics, ending: NDArray[np.bool_], stop: Array, out: Runs
     ) -> None:
-        """Write the outcomes of the runs that end after the steps that are done."""
+        """Write the outcomes of the runs that end at the current step."""
         count = len(ending)
         diverged = (stop == STOPS.index("diverged"))[:count]
 
         def write(chosen: NDArray[np.bool_]) -> None:
-            for name, values in statistics.outcome(self.done, stop).items():
-                out[name][chosen] = values[:count][chosen]
+            found = statistics.outcome(self.done, stop)
+            for name, rows in out.items():
+                rows[chosen] = found[name][:count][chosen]
 
         if (ending & diverged).any():
             write(ending & diverged)
         if (ending & ~diverged).any():
-            # The last state is added, except if it diverged and is not finite.
+            # The last state is added, unless the run diverged and the state is not finite.
             last = self.last_row()
             statistics.add(self.done, self.split(last), last)
             write(ending & ~diverged)
 
     def last_row(self) -> Array:
-        """Return the row (width, LANES) of the step that was done last."""
+        """Return the row (width, LANES) of the current step."""
         point, kept = self.parts.point, self.parts.reference
         conserved = kept.start[:9] + kept.sums[:9]
         conserved[6:] += self.done * self._plan.times.dt * kept.per_mass * kept.start[:3]
@@ -252,14 +258,12 @@ class LaneLoop:
 
 
 class LaneRows:
-    """Rows of some runs of a loop, every so many steps, and how they end.
+    """Recorded rows of runs, one for each `every` steps, and the ends of the runs.
 
     The rows of run k before its end are ``kept[:counts[k], :, k]``, with the columns of the loop.
     """
 
-    FIELDS: ClassVar[tuple[str, ...]] = ("steps", "last")
     span = _SPAN
-    over = np.zeros(LANES, dtype=bool)
 
     def __init__(self, loop: LaneLoop, every: int, count: int) -> None:
         self.every, self._count = every, count
@@ -268,26 +272,30 @@ class LaneRows:
 
     @property
     def counts(self) -> list[int]:
-        """Numbers of rows before the ends of the runs."""
+        """Number of rows of each run before its end."""
         return [-(-int(steps) // self.every) for steps in self.ends["steps"]]
 
+    def over(self, q: Array, v: Array) -> NDArray[np.bool_]:
+        """Return that no run ends early."""
+        return np.zeros(len(q), dtype=bool)
+
     def reset(self) -> None:
-        """Begin with other runs."""
+        """Prepare for new runs."""
 
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
-        """Keep the rows, see `Statistics`."""
+        """Store rows; see `Statistics`."""
         begin, self._next = -(-first // self.every), -(-first // self.every) + len(rows[0])
         by_row = np.concatenate(rows, axis=2)[:, : self._count]
         self.kept[begin : self._next] = by_row.transpose(0, 2, 1)
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the step at which runs end, and the row that was added last."""
+        """Return the step at which runs end, and the last added row."""
         last = self.kept[self._next - 1].T
         return {"steps": np.full(self._count, float(done)), "last": last}
 
 
 def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
-    """Run a plan, or the one of its dispersed `runs`, by the compiled loop."""
+    """Simulate a plan, or a single dispersed run of it (`runs`), with the compiled loop."""
     every, dt, loop = plan.times.every, plan.times.dt, LaneLoop(plan, plant, runs)
     rows = LaneRows(loop, every, 1)
     try:
@@ -297,7 +305,7 @@ def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
             raise
         stopped = f"interrupted at t = {loop.done * dt:g} s"
     if runs is None and not np.isfinite(loop.parts.stages.u).all():
-        # The loop in Python raises the error that names the command.
+        # The Python loop raises an error that names the command.
         return go(plan, plant, conserved_by(plant.robot, plan.q, plant.field))
     count = -(-loop.done // every)
     t = np.append(every * np.arange(count) * dt, loop.done * dt)
@@ -307,11 +315,11 @@ def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
     return Recording(t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled")
 
 
-def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> str:
-    """Return the engine for a plan or many runs of it: as requested, or by the rule.
+def engine_of(engine: object, plan: Plan, plant: Plant, *, many: bool = False) -> str:
+    """Return the requested engine for a plan, or choose an engine.
 
-    Many runs go by the compiled loop where it can run them; one does if it is long and the machine
-    code is there already.
+    Many runs use the compiled loop if it supports the plan. A single run uses it only if the run is
+    long and the machine code is stored already.
     """
     if checked_engine(engine) == "python":
         return "python"
@@ -327,7 +335,7 @@ def engine_of(engine: Any, plan: Plan, plant: Plant, *, many: bool = False) -> s
 
 
 def _reason(plan: Plan, plant: Plant) -> str:
-    """Return why the compiled loop cannot run a plan; empty if it can."""
+    """Return why the compiled loop cannot run a plan, or an empty text if it can."""
     policy, robots = plan.policy, [plant.robot]
     if not numba_is_there():
         return "numba is not installed (pip install 'fflin[fast]')"
@@ -348,8 +356,8 @@ def _reason(plan: Plan, plant: Plant) -> str:
     return ""
 
 
-def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
-    """Say why a plan's compensator, if it has one, cannot have its samples."""
+def _unmeasured(plan: Plan, plant: Plant, policy: object) -> str:
+    """Return why the compiled loop cannot evaluate a plan's compensator, or an empty text."""
     if not isinstance(policy, _OF_OUTPUTS):
         return ""
     dt = policy.dt if isinstance(policy, LinearController) else policy.filter.dt
@@ -365,7 +373,7 @@ def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
 
 
 def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> Recording:
-    """Run a plan to its end by an engine; `plant` and `conserved` are of the robot that moves."""
+    """Simulate a plan with an engine; `plant` and `conserved` belong to the simulated robot."""
     if engine == "compiled":
         return recorded(plan, plant)
     began = time.perf_counter()

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Motion(Design):
-    """Simulated or recorded motion of a robot, one row per time.
+    """Simulated or recorded motion of a robot, with one row per time.
 
     Attributes
     ----------
@@ -42,15 +42,16 @@ class Motion(Design):
     v : ndarray (N, nv)
         Configuration and velocity in Pinocchio's order.
     x : ndarray (N, nx)
-        State in the chart of `reference` and `frame`. The angles of continuous joints grow beyond
-        a full turn.
+        State in the chart defined by `reference` and `frame`. The angles of continuous joints are
+        not wrapped at a full turn.
     u : ndarray (N, nu)
-        Inputs that act from time t on, in the axes of `frame`. The last two rows are equal.
+        Inputs just after each time t, in the axes of `frame`. The last row repeats the inputs of
+        the row before it, because no inputs are applied after the last time.
     target : ndarray (nx,) or (N, nx)
-        Target state, or the state of the followed trajectory at each time. The array is empty if
-        no target is known.
+        Target state; or, if the robot follows a trajectory, the trajectory's state at each time.
+        The array is empty if no target is known.
     prediction : ndarray (N, nx)
-        State that the linear model predicts under the same control law. The array has no rows if
+        States that the linear model predicts under the same control law. The array has no rows if
         there is no prediction.
     energy : ndarray (N,)
         Kinetic energy, plus the potential energy of gravity and springs [J]. In orbit, `energy`
@@ -60,53 +61,54 @@ class Motion(Design):
         Angular momentum about the centre of mass [N m s], then linear momentum [N s], in world
         axes. In orbit, `momentum` is the momentum of the motion relative to the orbital frame.
     momentum_drift : ndarray (N,)
-        Difference between the momentum and its expected value, the initial momentum plus the
-        impulse of external forces. The difference is divided by the largest momentum that the
-        kinetic energy permits, see (11.5) of docs/derivation.md:
+        Relative error of the simulated momentum. The expected momentum is the initial momentum
+        plus the impulse of external forces. The difference from the expected momentum is divided
+        by the largest momentum that the kinetic energy permits, see (11.5) of docs/derivation.md:
 
-        - Linear part: the mass times the root-mean-square speed of the mass elements in the
-          fastest row.
-        - Angular part: the linear part times the radius of gyration about the initial base
-          position, plus the momentum stored in wheels.
+        - Linear momentum is divided by the mass times the root-mean-square speed of the mass
+          elements in the row with the fastest motion.
+        - Angular momentum is divided by this value times the radius of gyration about the initial
+          base position, plus the momentum stored in wheels.
 
-        Momentum is not conserved in orbit. In orbit, the drift is the difference between `energy`
-        and its expected value, relative to the largest terms of the energy. The expected energy
-        is the initial energy plus the work of inputs and disturbances.
+        In orbit, momentum is not conserved. Therefore the drift in orbit is the relative error of
+        `energy`: the difference from the expected energy, divided by the largest terms of the
+        energy. The expected energy is the initial energy plus the work of inputs and disturbances.
     com_drift : ndarray (N,)
-        Distance [m] of the centre of mass from the position predicted by its initial velocity and
-        the impulse of external forces. The array is empty in orbit, or if the file lacks these
-        data.
+        Distance [m] between the centre of mass and its expected position, which follows from the
+        initial velocity and the impulse of external forces. The array is empty in orbit, or if the
+        motion was read from a file without these data.
     state_names, input_names, state_units, input_units : tuple of str
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
     robot, urdf_sha256 : str
     stopped : str
         Reason why the run ended early; empty if the run was completed.
     wheels : tuple of str
-        Joints that are reaction wheels. Wheel angles are not included in the errors.
+        Joints that are reaction wheels. The reported errors do not include wheel angles.
     wheel_inertias : ndarray (k,)
-        Inertias of the wheels about their axes [kg m^2]; empty if the file lacks the inertias.
+        Inertias of the wheels about their axes [kg m^2]; empty if the motion was read from a file
+        without these inertias.
     modes : tuple of str
-        Joints that are modes of flexible appendages or slosh. The report lists modes apart from
-        the joints.
+        Joints that are modes of flexible appendages or slosh. The report lists them separately
+        from the other joints.
     mode_rotations : ndarray (k,)
         Rotation [rad] of the structure per unit of each mode's amplitude; 0 if a mode causes no
-        rotation. Per unit of amplitude, a mode of a flexible appendage rotates the moving mass by
-        w, and displaces its centre of mass by v. With the vector c from the appendage's frame to
-        this centre of mass, the rotation is :math:`|w| + |v| / |c|`. The second term is omitted if
+        rotation. For a flexible appendage, the rotation is :math:`|w| + |v| / |c|`. Per unit of
+        amplitude, the mode rotates the moving mass by w and displaces its centre of mass by v; c is
+        the vector from the appendage's frame to this centre of mass. The second term is omitted if
         :math:`|c|` is below 5 % of the radius of gyration of the carrying body.
     steered : tuple of str
         States that the policy feeds back; empty if these states are not known.
     notes : tuple of str
-        Remarks on the run, which the report shows.
+        Remarks on the run that appear in the report.
     limit_names : tuple of str
         States and inputs that have limits.
     engine : str
-        Engine that ran the loop, "compiled" or "python"; empty if the engine is not known.
+        Engine that ran the simulation, "compiled" or "python"; empty if the engine is not known.
     limits : ndarray (k, 2)
-        Lower and upper limits of `limit_names`; infinite if there is no limit. All limits are
-        listed, also limits that the simulation does not enforce.
+        Lower and upper limits of the states and inputs in `limit_names`. A missing limit is
+        infinite. Limits that the simulation does not enforce are included.
     phases, starts : tuple of str, ndarray (k,)
-        Names and start times [s] of the phases of a motion that `then` joined.
+        Names and start times [s] of the phases, if `then` joined the motion from several phases.
 
     Examples
     --------
@@ -144,8 +146,8 @@ class Motion(Design):
     urdf_sha256: str
     stopped: str
     com_drift: Array = field(default_factory=lambda: np.zeros(0))
-    _robot: Any = field(default=None, kw_only=True)  # that was simulated; no file has it
-    _nominal: str = field(default="", kw_only=True)  # checksum of its campaign's robot; as _robot
+    _robot: Any = field(default=None, kw_only=True)  # simulated robot; not saved in files
+    _nominal: str = field(default="", kw_only=True)  # checksum of a campaign's robot; not saved
     wheels: tuple[str, ...] = field(default_factory=tuple)
     wheel_inertias: Array = field(default_factory=lambda: np.zeros(0))
     steered: tuple[str, ...] = field(default_factory=tuple)
@@ -155,7 +157,7 @@ class Motion(Design):
     engine: str = field(default_factory=str)
     phases: tuple[str, ...] = field(default_factory=tuple)
     starts: Array = field(default_factory=lambda: np.zeros(0))
-    _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; as _robot
+    _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; not saved
     circles: str = field(default_factory=str)  # the orbit, as text
     modes: tuple[str, ...] = field(default_factory=tuple)
     mode_rotations: Array = field(default_factory=lambda: np.zeros(0))
@@ -166,9 +168,9 @@ class Motion(Design):
         count = len(self.t)
         if any(len(x) != count for x in rows) or any(len(x) not in (0, count) for x in may_lack):
             raise InputError(f"a motion has {count} times; every history needs as many rows")
-        if self.target.size in (0, self.x.shape[1]):  # of .mat, which knows no vectors
+        if self.target.size in (0, self.x.shape[1]):  # .mat files have no vectors
             object.__setattr__(self, "target", self.target.ravel())
-        if not len(self.prediction):  # of json, which knows no empty matrices
+        if not len(self.prediction):  # .json files have no empty matrices
             object.__setattr__(self, "prediction", np.zeros((0, self.x.shape[1])))
         object.__setattr__(self, "limits", self.limits.reshape(len(self.limit_names), 2))
         super().__post_init__()
@@ -187,17 +189,20 @@ class Motion(Design):
 
     @property
     def reference(self) -> pin.SE3:
-        """Placement to which attitude and position are relative."""
+        """Placement relative to which the attitude and position of the base are measured."""
         return pin.XYZQUATToSE3(self.placement)
 
     @property
     def orbit(self) -> CircularOrbit | None:
-        """The circular orbit, or None. In orbit the world is the orbital frame named by `frame`."""
+        """Circular orbit of the robot, or None.
+
+        In orbit, the world is the orbital frame with the axes named by `frame`.
+        """
         return CircularOrbit.from_json(self.circles) if self.circles else None
 
     @property
     def kept(self) -> str:
-        """Name of the conserved quantity whose drift is `momentum_drift`."""
+        """Name of the conserved quantity whose error is `momentum_drift`."""
         return "Jacobi integral" if self.circles else "momentum"
 
     @property
@@ -207,10 +212,10 @@ class Motion(Design):
 
     @property
     def error(self) -> Array | None:
-        """Errors (N, nx), the states minus the target; None without a target.
+        """Errors (N, nx) of the states from the target; None without a target.
 
-        Relative to a moving target, the errors are in the target's axes, as in
-        `linearize_trajectory`.
+        For a fixed target, the error is the difference of the states. For a moving target, the
+        errors are in the axes of the target, as in `linearize_trajectory`.
         """
         if self.tracked:
             return moving_errors(self.frame, self.x, self.target)
@@ -218,46 +223,51 @@ class Motion(Design):
 
     @property
     def tracked(self) -> bool:
-        """Whether the target moves, so that `target` has one state per row."""
+        """Whether the target moves; `target` then contains one state per time."""
         return self.target.ndim == 2 and self.target.size > 0
 
     @property
     def attitude_error(self) -> Array | None:
-        """Angle (N,) [deg] between the attitudes of base and target; None without a target."""
+        """Angle (N,) [deg] between the base attitude and its target; None without a target."""
         return attitude_errors(self.x, self.target) if self.target.size else None
 
     def then(self, *later: Impact | Motion) -> Motion:
-        """Join this motion and its later phases: ``approach.then(caught, held)``.
+        """Join this motion and later phases into one motion.
+
+        For example, ``approach.then(caught, held)`` joins an approach, the result ``caught`` of a
+        capture, and the motion ``held`` after the capture.
 
         Parameters
         ----------
         *later : Impact or Motion
-            Later phases in order. An impact, from `capture` or `jam`, happens at the last row of
-            the phase before it. A motion, from `simulate`, starts where the last phase ended.
+            Later phases in order. An impact, which `capture` or `jam` returns, happens at the last
+            row of the phase before it. A motion, which `simulate` returns, starts where the phase
+            before it ended.
 
         Returns
         -------
         Motion
-            Joined motion on one time axis, in the states and the chart of this motion. A jammed
-            joint is at rest. In each phase, energy and momentum are computed for the robot of the
-            phase.
+            Joined motion on one time axis, with the states and the chart of this motion. The states
+            of a jammed joint remain, with zero velocity after the jam. The energy and momentum of
+            each phase are computed for the robot of that phase, for example with its payload.
 
         Raises
         ------
         InputError
             If a phase does not begin at the end of the phase before it, has another frame or more
-            inputs, or was read from a file.
+            inputs than this motion, or was read from a file.
         """
         from fflin.simulation.phases import carried_on
 
         return carried_on(self, later)
 
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
-        """Return the motion as a trajectory whose inputs are held or interpolated linearly.
+        """Return the motion as a trajectory, which can be linearised or tracked.
 
-        The interpolation of inputs between rows (held or linear) is the one that fits the
-        dynamics better. If inputs change continuously, the input at the last row, which is not
-        recorded, is extrapolated. A motion that was read from a file needs the `robot`.
+        Between rows, the inputs are either held or interpolated linearly, depending on which of the
+        two fits the dynamics better. If they are interpolated, the inputs at the last row are
+        extrapolated, because they are not recorded. `robot` is required only if the motion was read
+        from a file.
         """
         from fflin.linear.trajectory import along
 
@@ -265,21 +275,21 @@ class Motion(Design):
 
     @property
     def passed(self) -> tuple[Passed, ...]:
-        """Limit violations with value, time and limit; the largest relative violation first."""
+        """Limit violations with value, time and limit, sorted by relative size, largest first."""
         return passed(self.t, limited(self))
 
     @property
     def saturated(self) -> tuple[Saturated, ...]:
-        """Saturated inputs and wheel speeds, sorted by time in saturation, longest first."""
+        """Inputs and wheel speeds that saturated, sorted by time in saturation, longest first."""
         names = {*self.input_names, *(f"qdot_m.{name}" for name in self.wheels)}
         return saturated(self.t, (each for each in limited(self) if each[0] in names))
 
     def save(self, path: str | Path) -> None:
         """Save the motion to a .npz, .mat, .json or .csv file, atomically.
 
-        A .csv file is a table of times, states and inputs for other programs. The first line has
-        the names with units, such as ``omega_b.x [rad/s]`` and ``u.tau_b.x [N m]``. `load` cannot
-        read it.
+        A .csv file is a table of times, states and inputs for other programs; `load` cannot read
+        it. Its first line contains the names with units, such as ``omega_b.x [rad/s]`` and
+        ``u.tau_b.x [N m]``.
 
         Raises
         ------
@@ -297,11 +307,11 @@ class Motion(Design):
         write_table(target, columns, np.column_stack((self.t, self.x, self.u)))
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
-        """Draw the motion as `plot_motion` does, and save the figure if a path is given."""
+        """Draw the motion by `plot_motion`, and save the figure if a path is given."""
         return plot_motion(self, path, **options)
 
 
-def require_motion(motion: Any) -> Motion:
+def require_motion(motion: object) -> Motion:
     """Return the motion, or raise `InputError` if it is not a Motion."""
     found: Motion = instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
     return found
@@ -315,16 +325,16 @@ def plot_motion(
     Parameters
     ----------
     motion : Motion
-        Motion to draw. If the motion has a prediction, solid lines show the nonlinear robot and
-        dashed lines the linear model. The panel below each group of states shows the difference.
-        Along a trajectory, pale lines show the reference, and the panel below each group shows
-        the error. A dotted line marks the time at which
-        the reference comes to rest.
+        Motion to draw. If the motion has a prediction, solid lines show the nonlinear robot,
+        dashed lines show the linear model, and the panel below each group of states shows the
+        difference. If the robot follows a trajectory, pale lines show the reference, the panel
+        below each group shows the error, and a dotted line marks the time at which the reference
+        comes to rest.
     path : str or Path, optional
-        File to save to: .png, .pdf or .svg.
+        File to which the figure is saved: .png, .pdf or .svg.
     show : sequence of str, optional
         States and inputs to draw: names, groups or patterns such as ``q_m``, ``thrust``,
-        ``*.hinge_*``. All by default.
+        ``*.hinge_*``. By default, all states and inputs are drawn.
 
     Returns
     -------
@@ -335,7 +345,7 @@ def plot_motion(
     MissingPackageError
         If matplotlib is not installed.
     FileError
-        If the file has another ending or cannot be written.
+        If `path` has another ending or the file cannot be written.
     UnknownNameError
         If a name in `show` matches no state or input.
 

@@ -1,4 +1,4 @@
-"""Conversion of a plan into the arrays that the compiled loop reads."""
+"""Conversion of a plan into the arrays of the compiled loop."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fflin.simulation.plan import Plan
 from fflin.simulation.plant import MomentumReference, Plant, conserved_by, triads
 from fflin.simulation.run import stop_conditions
 
-SLOTS = 128  # samples whose noise is there at a time, and steps of a campaign
+SLOTS = 128  # number of samples whose noise is stored, and of steps in a slice of a campaign
 
 
 def packed(plan: Plan, plant: Plant) -> loop.Arguments:
@@ -31,7 +31,7 @@ def packed(plan: Plan, plant: Plant) -> loop.Arguments:
     h, state, method = plan.times.dt, plant.state, plan.method
     tree, conserved = batch_tree(plant.robot), conserved_by(plant.robot, plan.q, plant.field)
     assert tree is not None
-    size, (shift, speed) = 6 + state.robot.n, method.shares(h)
+    size, (shift, speed) = 6 + state.robot.n, method.step_weights(h)
     start = MomentumReference(conserved, method, h, plan.q, plan.v)
     stop = stop_conditions(plan)
     mechanics = mechanics_of(plant, tree)
@@ -47,7 +47,7 @@ def packed(plan: Plan, plant: Plant) -> loop.Arguments:
             moments=h * (np.array(method.moments) * h),
         ),
         law=_law(plan, plant, mechanics),
-        # What would act after the end needs no place to wait in.
+        # Commands that would act after the end need no space in the delay line.
         channel=channel_of(
             plan.limits, plan.initial, plan.times.sample, min(plan.times.delay, plan.times.steps)
         )._replace(delay=[float(plan.times.delay)]),
@@ -78,7 +78,7 @@ def packed(plan: Plan, plant: Plant) -> loop.Arguments:
 
 
 def mechanics_of(plant: Plant, tree: Tree) -> forward.Mechanics:
-    """Return a robot as the kernel reads it."""
+    """Return the kernel's parameters of a robot."""
     robot, actuation = plant.robot, plant.actuation
     fixed, springs = actuation.fixed, robot.springs
     loads = loads_of(robot, actuation, tree)
@@ -127,7 +127,7 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> policies.Law
 
 
 def no_law(state: StateMap, u: Array) -> policies.Law:
-    """Return the law without commands, which reads states and errors."""
+    """Return a law without commands, which only computes states and errors."""
     law = empty(policies.LAW)
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
@@ -202,7 +202,7 @@ def _filtered(
 
 
 def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
-    """Return how the commands of one robot's inputs are allocated to the other robot's inputs."""
+    """Return the allocation of one robot's commands (`asking`) to the other's inputs (`giving`)."""
     names, tree = plant.actuation.names, batch_tree(asking.robot)
     assert tree is not None
     size, asks = plant.state.nx // 2, mechanics_of(asking, tree)
@@ -220,7 +220,7 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
     )
 
 
-def _path(path: policies.Path, plan: Plan, policy: Any, asking: Plant) -> policies.Path:
+def _path(path: policies.Path, plan: Plan, policy: object, asking: Plant) -> policies.Path:
     state, count = asking.state, len(asking.actuation.names)
     if type(policy) is not TrajectoryFeedback:
         return path
@@ -260,5 +260,5 @@ def _path(path: policies.Path, plan: Plan, policy: Any, asking: Plant) -> polici
     )
 
 
-def _places(indices: Any) -> Any:
+def _places(indices: object) -> Any:
     return np.array(indices, dtype=np.intp)

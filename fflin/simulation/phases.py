@@ -16,12 +16,12 @@ from fflin.dynamics.impact import Impact, joint_called
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import ROOT, Robot
 
-# Phases meet where no rate and no displacement differs by more.
+# Largest difference of rates and displacements between the end and the beginning of phases.
 _MET = 1e-6
 
 
 def carried_on(first: Any, later: tuple[Any, ...]) -> Any:
-    """Return one motion of several, see `Motion.then`."""
+    """Join several phases to one motion; see `Motion.then`."""
     if not later or isinstance(later[-1], Impact):
         raise InputError(
             "the last phase is an impact, expected a Motion; simulate the robot after the impact"
@@ -50,19 +50,20 @@ def carried_on(first: Any, later: tuple[Any, ...]) -> Any:
 def _require_met(
     what: str, robot: Robot, q: Array, v: Array, other: Robot, other_q: Array, other_v: Array
 ) -> None:
-    """Raise `InputError` where a phase does not begin where the one before has ended."""
+    """Raise `InputError` if a phase does not begin in the final state of the previous phase."""
     seen, rates = _seen(robot, other, q, other_q[None], other_v[None])
     apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(axis=0)
     if apart.max() > _MET * max(1.0, np.abs(v).max()):
         at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())
         raise InputError(
-            f"'{what}' does not begin where the motion before it ended: '{robot.model.names[at]}' "
-            f"differs by {apart.max():.2g} in position or rate; start from q and v of the last row"
+            f"'{what}' does not begin where the motion before it ended: "
+            f"'{robot.model.names[at]}' differs by {apart.max():.2g} in position or rate; start "
+            "from q and v in the last row of that motion"
         )
 
 
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return another robot's rows in this robot's coordinates; missing joints are at rest."""
+    """Convert rows of another robot to this robot's coordinates; missing joints are at rest."""
     own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
     for name in list(robot.model.names)[ROOT:]:
         if other.model.existJointName(name):
@@ -73,7 +74,7 @@ def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[
 
 
 def _longer(whole: Any, motion: Any, name: str) -> Any:
-    """Return the motion with another's rows at its end, in its own chart, joints and inputs."""
+    """Append the rows of another motion, converted to this motion's chart, joints and inputs."""
     if (motion.frame, motion.circles) != (whole.frame, whole.circles):
         where, before = (f"'{m.frame}'{' in orbit' * bool(m.circles)}" for m in (motion, whole))
         raise InputError(
@@ -111,7 +112,7 @@ def _longer(whole: Any, motion: Any, name: str) -> Any:
 
 
 def _inputs(whole: Any, state: StateMap, motion: Any, there: StateMap) -> Array:
-    """Return a motion's inputs (N, nu) in the order of the whole; inputs that it lacks are zero."""
+    """Return a motion's inputs (N, nu) in the order of the whole; missing inputs are zero."""
     if more := [name for name in motion.input_names if name not in whole.input_names]:
         raise InputError(
             f"a phase has the input {more[0]}, which the first phase lacks; give the first robot "

@@ -24,11 +24,11 @@ from fflin.control.tracking import (
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import Integrator, integrator
-from fflin.dynamics.rnea import rotor_names
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
 from fflin.robot.limits import chosen_limits
+from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 from fflin.simulation.plant import Disturbance, Plant
 from fflin.simulation.prediction import Predictor, predictor
@@ -41,7 +41,7 @@ Event: TypeAlias = Callable[[float, Array, Array], float]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 Limits: TypeAlias = "float | str | Mapping[str, Any] | Sequence[Any]"
 
-# A share of a step that is no longer part of what comes after it.
+# Fraction of a step by which the last stage is evaluated earlier if inputs jump at knots.
 _BEFORE = 1e-6
 
 
@@ -72,30 +72,30 @@ class SimulationOptions:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A simulation to be done, which nothing changes while it runs: arrays and whole numbers."""
+    """Checked plan of a simulation, which does not change during the run."""
 
     q: Array  # (nq,)
     v: Array  # (nv,)
     times: Times
-    policy: Any  # of which the law is
-    law: Law | None  # nothing but `initial` acts where there is none
-    initial: Array  # (nu,), what acts until the first command arrives
-    limits: Saturation  # what acts of a command
-    wheels: list[int]  # where v has the speeds of the wheels whose speed is limited
-    known: dict[str, Range]  # limits of states and inputs, whether they cut or not
+    policy: Any  # policy of the law
+    law: Law | None  # without a law, only `initial` acts
+    initial: Array  # (nu,) inputs until the first command arrives
+    limits: Saturation  # limits of the inputs
+    wheels: list[int]  # indices in v of the wheels with a speed limit
+    known: dict[str, Range]  # all limits of states and inputs, including reported ones
     method: type[Integrator]
-    project: bool  # whether momentum and centre of mass are kept, which they are in no orbit
-    turning: Array  # the velocities whose turn within a step has a bound
-    chart: StateMap | None  # that ends the run where the base leaves it
+    project: bool  # whether momentum and centre of mass are projected; false in orbit
+    turning: Array  # indices in v of the velocities whose rotation per step is bounded
+    chart: StateMap | None  # the run ends when the base leaves this chart
     events: tuple[Event, ...]
     callback: Callback | None
-    progress: bool | None  # whether a bar is shown; None shows it where the run takes long
-    near: Array | None  # the state (nx,) from which continuous joints count turns
-    target: Array | None  # the state (nx,) that is steered to, where one is known
-    reference: Reference | None  # the motion that is followed, where there is one
-    steered: tuple[str, ...]  # the states that are known to be fed back
-    notes: Callable[[], tuple[str, ...]]  # returns the remarks for the report, which take a moment
-    predictor: Predictor | None  # of the linear motion under the same law
+    progress: bool | None  # whether a bar is shown; None shows it if the run takes long
+    near: Array | None  # state (nx,) from which continuous joints count turns
+    target: Array | None  # target state (nx,), if known
+    reference: Reference | None  # followed motion, if any
+    steered: tuple[str, ...]  # states that are known to be fed back
+    notes: Callable[[], tuple[str, ...]]  # computes the notes of the report
+    predictor: Predictor | None  # prediction of the linear motion under the same law
 
     @property
     def last_node(self) -> float:
@@ -123,7 +123,7 @@ def start_of(
     v0: ArrayLike | None,
     reference: Reference | None,
 ) -> tuple[Array, Array]:
-    """Return the initial configuration and velocity (nq,), (nv,)."""
+    """Return the initial configuration (nq,) and velocity (nv,)."""
 
     def default() -> tuple[Array, Array]:
         if reference:
@@ -137,12 +137,12 @@ def start_of(
 
 
 def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array | None:
-    """Return the state (nx,) that is given, or that a model's point is; None where none is."""
+    """Return the target state (nx,): the given state, or the point of a given model, or None."""
     if target is None:
         return None
     if not isinstance(target, LinearModel):
         goal: Array = vector("target", target, state.nx, "a state (12 + 2n)").copy()
-        state.to_pinocchio(goal)  # refuses what is no attitude
+        state.to_pinocchio(goal)  # raises an error for an invalid attitude
         return goal
     theirs = set(target.state_names) <= set(state.names) and len(target.q) == state.robot.nq
     if target.moving or not theirs:
@@ -154,7 +154,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
         said = f"target is a model in frame '{target.frame}', expected '{state.frame}'"
         raise InputError(f"{said}, the frame of the motion; q differs between orbital frames")
     goal = state.read(target.q, target.v)
-    # Where the model has another reference or frame, its state of the base is another.
+    # The base states of a model with another reference or frame cannot be copied.
     same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)
     for name, value in zip(target.state_names, target.x0, strict=True):
         if same or group_of(name) == "q_m":
@@ -162,16 +162,16 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
     return goal
 
 
-def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law | None:
-    """Return the policy bound to the robot, with checked inputs."""
+def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
+    """Bind the policy to the robot, and return the law, which checks its commands."""
     if policy is None:
         return None
     within = (limits.low, limits.high)
     return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
 
 
-def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan, Plant]:
-    """Return the checked plan of `simulate` with these options, and the robot that moves."""
+def planned(robot: Robot, policy: object, options: SimulationOptions) -> tuple[Plan, Plant]:
+    """Return the checked plan of `simulate` with these options, and the plant."""
     policy = followed(policy, robot)
     times = times_of(policy, options)
     policy = followed(policy, robot, held=times.sample * times.dt)
@@ -179,7 +179,7 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
     follows = reference_of(policy)
     state = _state_of(robot, policy, options.frame, options.reference)
     plant = Plant(state, options.disturbance)
-    foresees = predictor(plant, policy, options.linear)
+    foresees = None if options.linear is False else predictor(plant, policy, options.linear)
     method = integrator(options.method)
     if times.fastest * times.dt > method.reach:
         raise InputError(
@@ -211,7 +211,7 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
         known=known,
         method=method,
         project=truth("project", options.project) and robot.orbit is None,
-        turning=_turning(robot),
+        turning=_rotating(robot),
         chart=None if lin is None else state,
         events=_checked_functions(options.events, options.callback),
         callback=options.callback,
@@ -227,14 +227,14 @@ def planned(robot: Robot, policy: Any, options: SimulationOptions) -> tuple[Plan
 
 
 def _state_of(
-    robot: Robot, policy: Any, frame: Frame | None, reference: pin.SE3 | None
+    robot: Robot, policy: object, frame: Frame | None, reference: pin.SE3 | None
 ) -> StateMap:
-    """Return the state of a motion, in the frame and reference of its policy if these are known."""
+    """Return the state map of a motion, with the frame and reference of its policy if known."""
     lin, _ = feedback_of(policy)
     own_frame, own_reference = axes_of(policy)
     if lin is not None and (frame is not None or reference is not None):
         raise InputError(
-            "frame or reference is given, but the policy's model fixes both; leave them out"
+            "frame or reference is given, but the model of the policy defines both; leave them out"
         )
     if tracking_of(policy):
         if frame not in (None, own_frame):
@@ -257,10 +257,10 @@ def _state_of(
 
 
 def _initial_inputs(policy: Any, plant: Plant, limits: Saturation) -> Array:
-    """Return the inputs (nu,) until the first command; warn if the policy's exceed the limits."""
+    """Return the inputs (nu,) before the first command; warn if the policy's exceed the limits."""
     robot, actuation, (lin, _) = plant.robot, plant.actuation, feedback_of(policy)
     along = tracking_of(policy)
-    # The model's inputs are others where they are allocated to the robot's.
+    # With allocation, the model's inputs differ from the robot's inputs.
     if lin is not None and lin.input_names == actuation.names:
         where, inputs, initial = "at its target", lin.u0[None], np.asarray(lin.u0)
     elif along is policy is not None:
@@ -274,7 +274,7 @@ def _initial_inputs(policy: Any, plant: Plant, limits: Saturation) -> Array:
 
 
 def _checked_functions(events: Sequence[Event], callback: Callback | None) -> tuple[Event, ...]:
-    """Return the events, or raise `InputError` if one of them or the callback is no function."""
+    """Return the events; raise `InputError` if an event or the callback is not a function."""
     called = tuple(instance("events", events, Sequence, "a list of functions event(t, q, v)"))
     for each in called if callback is None else (*called, callback):
         if not callable(each):
@@ -284,9 +284,12 @@ def _checked_functions(events: Sequence[Event], callback: Callback | None) -> tu
     return called
 
 
-def _turning(robot: Robot) -> Array:
-    """Return the velocities whose rotation within a step is bounded: all but those of rotors."""
-    # A rotor may spin as fast as it will: nothing depends on its angle.
+def _rotating(robot: Robot) -> Array:
+    """Return the indices in v of the angular velocities of the base and of all joints but rotors.
+
+    Their rotation within a step is bounded. Rotors may spin fast, because nothing depends on their
+    angle.
+    """
     rotors = rotor_names(robot)
     joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]
     return np.array([3, 4, 5, *(joint.idx_v for joint in joints)])

@@ -25,24 +25,24 @@ from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import require_inertia
 from fflin.robot.robot import Robot
 
-# Returns of (t, q, v) a generalised force (nv,) in Pinocchio's order: on the base linear, then
-# angular, in base axes; then on the joints.
+# Function of (t, q, v) that returns a generalised force (nv,) in Pinocchio's order: force and
+# torque on the base in base axes, then joint forces.
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
 _aba, _crba, _placement = pin.aba, pin.crba, pin.XYZQUATToSE3
-# Velocity from which on a disturbance need not be finite: the motion is not.
+# Velocity above which an infinite disturbance is accepted, because the motion has diverged.
 _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
 
 def triads(actuation: Actuation) -> list[int]:
-    """Return the first of the three inputs of each vector on the base."""
+    """Return the index of the first of the three inputs of each vector on the base."""
     found = [actuation.groups[key] for key in ("tau_b", "F_b") if key in actuation.groups]
     return sorted(int(entries[0]) for entries in found)
 
 
 class Plant:
-    """The nonlinear robot under inputs in the axes of a state's frame, and a disturbance."""
+    """The nonlinear robot under inputs (in the axes of the state's frame) and a disturbance."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Plant:
         self._columns = np.column_stack(
             [state.lift(self.actuation.torques(unit)) for unit in np.eye(nu)]
         )
-        # Where nothing but u acts, and that along fixed columns.
+        # Whether only u acts on the robot, with a constant input matrix.
         self._plain = (
             state.S is None
             and not self.actuation.carried
@@ -86,15 +86,16 @@ class Plant:
         self.field = self._aba.field
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        """Return dv/dt (nv,), and the wrench (6,) on the base but gravity's, in base axes.
+        """Return dv/dt (nv,), and the external wrench (6,) without gravity, in base axes.
 
-        In orbit the power [W] of all but the orbit and springs, and zeros, instead of the wrench.
+        In orbit, the wrench is replaced by zeros behind the power [W] of inputs, disturbance and
+        dampers.
         """
         if self._faulty:
             given = np.empty(len(u))
             apply_faults(self.faults, self._triads, t, u, given)
             u = given
-        if self.actuation.held:  # in reference axes: in base axes at any turn
+        if self.actuation.held:  # rotated by R instead of the chart, which is singular at 180 deg
             R, u = self.state.rotation(q), u.copy()
             for held in self.actuation.held:
                 u[held] = u[held].dot(R)
@@ -132,19 +133,19 @@ class Plant:
 
 
 class Histories(NamedTuple):
-    """Energy (N,), momentum (N, 6) about the centre of mass (N, 3), and the sizes it may have."""
+    """Histories of energy, of momentum about the centre of mass, and of the centre of mass."""
 
-    energy: Array
-    momentum: Array
-    center: Array
-    sizes: Array  # (N, 2), the largest linear momentum and that about the point, see (11.5)
+    energy: Array  # (N,)
+    momentum: Array  # (N, 6)
+    center: Array  # (N, 3)
+    sizes: Array  # (N, 2) upper bounds of linear momentum, and of angular about the point (11.5)
 
 
 class Conserved:
     """Energy, and momentum: linear, then angular about a fixed point, in world axes."""
 
-    # The point, near the base of `start`, stands in for the world's origin throughout, for digits
-    # would be lost far away from it.
+    # The fixed point is the base's position in `start`. It replaces the world's origin, because
+    # digits would be lost far away from the origin.
 
     def __init__(self, robot: Robot, start: Array) -> None:
         self._robot, self.mass = robot, robot.mass
@@ -153,7 +154,7 @@ class Conserved:
         self._M = data.M[:6]  # CRBA writes into it
         self._M_bb = self._M[:, :6]
         self._start = np.concatenate((start[:3], np.zeros(4)))
-        self._x, self._y, self._z = start[:3].tolist()  # sums of arrays take longer
+        self._x, self._y, self._z = start[:3].tolist()  # numbers are faster than arrays
         self._root = robot.model.jointPlacements[ROOT]
         self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
         self._free = self._root.isIdentity(0.0)
@@ -165,7 +166,7 @@ class Conserved:
         return np.hstack((p, about_center + np.cross(history.center, p)))
 
     def wrench(self, q: Array, push: Array) -> Array:
-        """Return the wrench (6,) about the point, in world axes, of a plant's push and gravity."""
+        """Return the wrench (6,) of a plant's push and gravity about the point, in world axes."""
         total: Array = self._base(q).toDualActionMatrix().dot(push)
         if self._weight is not None:
             near = q.copy()
@@ -176,10 +177,10 @@ class Conserved:
         return total
 
     def impose(self, q: Array, v: Array, momentum: Array, center: Array) -> None:
-        """Shift the base of `q` and set its velocity in `v` in place, to conserve both."""
-        # r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m); the velocity is corrected by
-        # what the momentum lacks, so that rounding is of the second order. M is in base axes, and
-        # a shift leaves it as it is.
+        """Set the base's position in `q` and velocity in `v` by centre of mass and momentum."""
+        # r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m). The velocity is corrected by the
+        # deviation of the momentum, so rounding errors are relative to this small correction. M is
+        # in base axes, so it does not depend on the base's position.
         _crba(self._model, self._data, q)
         if self._stored:
             pin.forwardKinematics(self._model, self._data, q)
@@ -189,10 +190,10 @@ class Conserved:
         if not self._free:
             base = self._root * base
         base.translation = center
-        # M_bb has -m [c]x beside m 1.
-        place = base.act(self._M[(1, 2, 0), (5, 3, 4)] / -self.mass)
-        base.translation = place
-        x, y, z = (place if self._free else self._root.actInv(place)).tolist()
+        # The off-diagonal block of M_bb is -m [c]x.
+        position = base.act(self._M[(1, 2, 0), (5, 3, 4)] / -self.mass)
+        base.translation = position
+        x, y, z = (position if self._free else self._root.actInv(position)).tolist()
         q[0], q[1], q[2] = x + self._x, y + self._y, z + self._z
         lack: Array = momentum.dot(base.toActionMatrix()) - self._M.dot(v)
         v_b = v[:6]
@@ -208,7 +209,7 @@ class Conserved:
         for i, (q_i, v_i) in enumerate(zip(q, v, strict=True)):
             energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
             pin.ccrba(model, data, q_i, v_i)
-            # Not CCRBA's own sum, which is taken about the origin and rounds more.
+            # The momentum of CCRBA is summed about the origin and has larger rounding errors.
             momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
             center[i] = data.com[0]
             polar[i] = 0.5 * np.trace(data.Ig.inertia) + self.mass * center[i].dot(center[i])
@@ -224,7 +225,7 @@ class Conserved:
         return Histories(energy, momentum, center, sizes)
 
     def momentum_drift(self, history: Histories, expected: Array) -> Array:
-        """Return how far the momentum is off, relative to the largest there may be: (11.5)."""
+        """Return the error of the momentum (N,), relative to its upper bounds (11.5)."""
         scale = history.sizes.max(axis=0)
         scale[1] += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
         missing = self.about_point(history) - expected
@@ -234,7 +235,7 @@ class Conserved:
         return largest
 
     def _of_wheels(self) -> Array:
-        """Return the stored momentum (3,) where the links were put last."""
+        """Return the stored momentum (3,) at the last evaluated link poses, in world axes."""
         total: Array = np.zeros(3)
         for joint, stored in self._stored:
             total += self._data.oMi[joint].rotation @ stored
@@ -250,7 +251,7 @@ class MomentumReference:
     """Momentum and centre of mass from the external impulse, step by step (11.2)."""
 
     momentum: Array  # (6,) about the point
-    wrenches: tuple[Array, ...]  # (6,) of the stages of a step, about the point, to be written
+    wrenches: tuple[Array, ...]  # (6,) about the point for each stage; the caller writes them
 
     def __init__(
         self, conserved: Conserved, method: type[Integrator], h: float, q: Array, v: Array
@@ -259,11 +260,11 @@ class MomentumReference:
         per_mass = 1.0 / conserved.mass
         self.momentum = conserved.about_point(history)[0]
         self._momentum, self._start = self.momentum, history.center[0]
-        # The line that is followed while nothing pushes: place and velocity.
+        # Position and velocity of the centre of mass without external forces, as columns.
         self._line = np.column_stack((self._start, self.momentum[:3] * per_mass))
         self._time = np.ones(2)
-        # The impulse, and the way that it makes besides that of the initial velocity, above the
-        # wrenches of a step. Where nothing pushes they stay zero, so that no rounding adds up.
+        # Rows: the impulse; the displacement that it causes in addition to the initial velocity;
+        # the wrenches of a step. Without external forces all are exactly zero.
         self._stack = np.zeros((2 + len(method.weights), 6))
         self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
         weights, moments = h * np.array(method.weights), h * h * np.array(method.moments)
@@ -272,29 +273,29 @@ class MomentumReference:
     def center(self, t: float) -> Array:
         """Return the centre of mass (3,) relative to the point."""
         self._time[1] = t
-        place: Array = self._line.dot(self._time)
-        return place
+        position: Array = self._line.dot(self._time)
+        return position
 
     def advance(self) -> None:
-        """Go on by a step with the wrenches that have been written."""
-        self._sums[:] = impulse, way = self._after.dot(self._stack)
+        """Advance by a step with the written wrenches."""
+        self._sums[:] = impulse, displacement = self._after.dot(self._stack)
         self.momentum = self._momentum + impulse
-        self._line[:, 0] = self._start + way[:3]
+        self._line[:, 0] = self._start + displacement[:3]
 
 
 class Jacobi(Conserved):
-    """Energy relative to the frame, and the work done on it in place of the impulse."""
+    """Jacobi integral in orbit: the energy in the rotating frame, compared with the work done."""
 
     def __init__(self, robot: Robot, start: Array, field: OrbitField) -> None:
         super().__init__(robot, start)
         self._field, self._scale = field, 0.0
 
     def about_point(self, history: Histories) -> Array:
-        """Return zeros (N, 6), to which the work is added in the first place."""
+        """Return zeros (N, 6); the work since the start is added to the first column."""
         return np.zeros_like(history.momentum)
 
     def wrench(self, q: Array, push: Array) -> Array:
-        """Return the power (1,) and zeros (5,) of a plant's push."""
+        """Return a plant's push in orbit: the power (1,) and zeros (5,)."""
         return push
 
     def histories(self, q: Array, v: Array) -> Histories:
@@ -307,7 +308,7 @@ class Jacobi(Conserved):
         return found._replace(energy=found.energy + potential)
 
     def momentum_drift(self, history: Histories, expected: Array) -> Array:
-        """Return how far the integral is from its first value and the work since, relative."""
+        """Return the relative error of the integral from its initial value plus the work done."""
         missing = np.abs(history.energy - history.energy[0] - expected[:, 0])
         return missing / (self._scale or 1.0)
 

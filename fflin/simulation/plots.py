@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 _OF_JOINTS = ("q_m", "qdot_m")
 _MOST_IN_A_PANEL, _ACROSS = 6, 3
-_PALE: dict[str, Any] = {"lw": 3.6, "alpha": 0.3}  # of a reference, below what follows it
-_DASHED: dict[str, Any] = {"ls": "--", "lw": 1.0}  # of a prediction, on top
+_PALE: dict[str, Any] = {"lw": 3.6, "alpha": 0.3}  # style of a reference, below the motion
+_DASHED: dict[str, Any] = {"ls": "--", "lw": 1.0}  # style of a prediction, above the motion
 _GROUPS = {
     "q_b": "attitude q_b",
     "r_b": "position r_b",
@@ -36,10 +36,10 @@ _GROUPS = {
 _WHEELS = {"speed": "wheel speeds", "wheel": "wheel torques", "momentum": "wheel momenta"}
 
 
-# A limit is drawn where a curve comes to this fraction of it.
+# A limit is drawn if a curve reaches this fraction of it.
 _NEAR = 1.0 / 3.0
 
-# Between rows a target that moves less than this, in SI units, stands still.
+# A target that moves less than this between rows, in SI units, is at rest.
 _STILL = 1e-12
 
 
@@ -57,7 +57,7 @@ class Curve(NamedTuple):
 
     @property
     def short(self) -> str:
-        """The name without its group."""
+        """Name without its group."""
         return self.name.partition(".")[2] or self.name
 
     @property
@@ -67,14 +67,14 @@ class Curve(NamedTuple):
         return [level for level in levels if level and (self.values / level).max() >= _NEAR]
 
     def momentum(self, inertia: float) -> Curve:
-        """Return the momentum [N m s] of a wheel whose speed this is."""
+        """Convert the speed of a wheel to its momentum [N m s]."""
         linear, reference = (None if x is None else inertia * x for x in self[6:])
         scaled = inertia * self.values, inertia * self.limits, linear, reference
         return Curve(self.key, "momentum", self.name, "N m s", *scaled)
 
 
 def curves(motion: Any, wheels: Mapping[str, float]) -> Iterator[Curve]:
-    """Yield states and inputs, and speed and momentum of wheels {name: inertia, 0 if unknown}."""
+    """Yield curves of states, inputs, and speed and momentum of wheels {name: inertia or 0}."""
     limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     unlimited = np.full(2, np.inf)
     for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
@@ -108,7 +108,7 @@ def resting_from(motion: Any) -> float | None:
 
 
 def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None) -> Figure:
-    """Draw a motion, see `plot_motion`."""
+    """Draw a motion; see `plot_motion`."""
     states, panels = _selected(motion, show)
     what, errors = _errors(motion)
     per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of states and of their errors below
@@ -148,7 +148,7 @@ def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None
 
 
 def _selected(motion: Any, show: Any) -> tuple[dict[str, list[Curve]], dict[str, list[Curve]]]:
-    """Return the states to show by group, and inputs, speeds and momenta of wheels by title."""
+    """Return the chosen states by group, and chosen inputs, wheel speeds and momenta by title."""
     names = (*motion.state_names, *input_keys(motion))
     show = [show] if isinstance(show, str) else show
     if not (show is None or isinstance(show, Sequence)):
@@ -175,7 +175,7 @@ def _draw_panels(
     panels: Mapping[str, list[Curve]],
     joints: dict[str, Line2D] | None,
 ) -> None:
-    """Draw inputs and wheels; below, name the joints and the curves of panels with many."""
+    """Draw panels of inputs and wheels, with the legends for joints and large panels below."""
     lines = joints or {}
     colors = {name: line.get_color() for name, line in lines.items()}
     for place, (title, found) in enumerate(panels.items()):
@@ -187,9 +187,11 @@ def _draw_panels(
         elif len(found) > _MOST_IN_A_PANEL:
             _below(figure, _named(axes), title, "center" if joints is None else "right")
         else:
-            axes.legend(ncols=2 if len(found) > 3 else 1, handlelength=1.6)
+            if many := len(found) > 3:
+                axes.margins(y=0.3)  # room for the names above the curves
+            axes.legend(ncols=2 if many else 1, handlelength=1.6)
     if joints is not None:
-        # Joints are many, have long names, and are the same in three panels.
+        # One legend below, because three panels share the joints, whose names are long.
         limit = {"limit": lines.pop("limit")} if "limit" in lines else {}
         _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
 
@@ -207,13 +209,13 @@ def _panel_of(curve: Curve, wheels: Mapping[str, float]) -> str:
     """Return the title of the panel of an input, or of speeds and momenta of wheels."""
     if curve.group in ("speed", "momentum") or curve.short in wheels:
         return _WHEELS[curve.group]
-    if curve.group == "tau_m":  # nearly always all turn, or all slide
+    if curve.group == "tau_m":  # most robots have only revolute or only prismatic joints
         return "joint inputs tau_m" if curve.unit == "N m" else "joint forces tau_m"
     return "torques" if curve.unit == "N m" else "forces"
 
 
 def _errors(motion: Any) -> tuple[str, dict[str, Curve]]:
-    """Return the errors from a reference, of attitude in degrees, or from the linear model."""
+    """Return the errors from a reference (attitude in degrees), or else from the linear model."""
     names, units, linear = motion.state_names, motion.state_units, motion.linear
     rows, what = [], "error"
     if motion.tracked:
@@ -237,7 +239,7 @@ def _draw(
     colors: Mapping[str, Any] | None = None,
     **look: Any,
 ) -> None:
-    """Draw curves over their pale references, predictions dashed on top, and limits."""
+    """Draw curves, their references (pale), predictions (dashed) and limits."""
     if found[0].group == "q_b":
         found = _with_gaps(found)
     full = title and found[0].group not in _GROUPS and title not in _WHEELS.values()
@@ -269,12 +271,12 @@ def _with_gaps(found: Sequence[Curve]) -> list[Curve]:
 
 
 def _named(axes: Axes) -> dict[str, Line2D]:
-    """Return the lines that a legend names."""
+    """Return {label: line} of the lines with a label."""
     return {str(x.get_label()): x for x in axes.get_lines() if str(x.get_label())[0] != "_"}
 
 
 def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -> None:
-    """Name lines below all panels, in as many columns as there is space for."""
+    """Add a legend below all panels, with as many columns as fit."""
     letters = 150 if side == "center" else 75
     columns = min(len(lines), 8, max(1, letters // (max(map(len, lines)) + 6)))
     place: Any = f"outside lower {side}"
@@ -283,7 +285,7 @@ def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -
 
 
 def _drifts(axes: Axes, motion: Any) -> None:
-    # Zero has no place on a logarithmic axis: nothing is below the rounding of one.
+    # Drifts below the rounding error of 1 are raised to it, since a logarithmic axis has no zero.
     drifts = {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift}
     shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}
     for color, (label, drift) in zip(COLORS, shown.items(), strict=False):

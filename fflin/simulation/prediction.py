@@ -13,21 +13,21 @@ from fflin.control.policies import Compensation
 from fflin.linear.model import LinearModel
 from fflin.simulation.plant import Plant
 
-# Returns the command (nu,) at a deviation (nx,) from a linear model's point.
+# Function of a deviation (nx,) from a linear model's point that returns the command (nu,).
 LinearLaw: TypeAlias = Callable[[Array], Array]
 
 
 class Predictor(NamedTuple):
-    """Linear model, and a factory of its law in the initial state.
+    """Linear model, and a function that creates its law in the initial state.
 
-    States of a controller that are integrated along stand behind the robot's.
+    States of a continuous-time controller follow the robot's states in the deviation.
     """
 
     lin: LinearModel
     law: Callable[[], LinearLaw]
 
 
-def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | None:
+def predictor(plant: Plant, policy: Any, linear: object) -> Predictor | None:
     """Return the predictor of a run: the policy's own model, or the given model."""
     if isinstance(linear, bool | np.bool_) and not linear:
         return None
@@ -47,7 +47,7 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | None:
 
 
 def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
-    """Return the model that is to predict, or raise `InputError` where it is of another run."""
+    """Return the given model, or raise `InputError` if it does not fit the simulation."""
     instance("linear", linear, LinearModel, "a fflin.LinearModel, True or False")
     state = plant.state
     names = (state.names, plant.actuation.names, state.frame)
@@ -56,15 +56,15 @@ def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
         same = same and linear.output_names == policy.lin.output_names
     if not same or not linear.reference.isApprox(state.reference, 1e-9):
         raise InputError(
-            f"linear is a model of '{linear.robot}' with other states, inputs, frame or reference "
-            f"than the simulation of '{plant.robot.name}'; linearise that robot in the policy's "
-            "frame and reference"
+            f"linear is a model of '{linear.robot}' with other states, inputs, frame or "
+            f"reference than the simulation of '{plant.robot.name}'; linearise the simulated "
+            "robot with the frame and the reference of the policy"
         )
     return linear
 
 
-def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
-    """Return a factory of a policy's law in deviations from a point, if the policy is linear."""
+def _law(policy: object, lin: LinearModel) -> Callable[[], LinearLaw] | None:
+    """Return a function that creates a policy's law in deviations; None for a nonlinear policy."""
     if policy is None:
         return lambda: lambda _: np.zeros(len(lin.u0))
     if isinstance(policy, LinearController):
@@ -86,12 +86,12 @@ def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
     return lambda: lambda e: own.u0 - K @ (e[fed] + apart)
 
 
-# A prediction that overflows is none.
+# An overflow is no reason to warn: the prediction is then omitted.
 @np.errstate(over="ignore", invalid="ignore")
 def predict(plan: Any, x: Array, steps: int) -> Array:
-    """Return the states (N, nx) of the linear model in closed loop; no rows where it has none."""
+    """Return the predicted states (N, nx) of the linear model in closed loop, if there are any."""
     lin = plan.predictor and plan.predictor.lin.generator
-    if lin is None:  # what happens between its samples is not known
+    if lin is None:  # no model, or one in discrete time without its motion between samples
         return x[:0]
     dt, _, every, sample, delay, *_ = plan.times
     x0, u0, limits = lin.x0, lin.u0, plan.limits
@@ -109,7 +109,7 @@ def predict(plan: Any, x: Array, steps: int) -> Array:
     stepped = not sample and channel.cuts
     held = lin.discretize(dt) if sample else lin
     A, B, f0 = held.A, held.B, held.f0
-    if not (sample or stepped):  # then a step is a matrix and a shift
+    if not (sample or stepped):  # a step is then e -> A e + f0
         f0 = _after(dt, np.zeros(len(e)), slope)
         A = np.column_stack([_after(dt, unit, slope) - f0 for unit in np.eye(len(e))])
     for step in range(steps):
@@ -122,7 +122,7 @@ def predict(plan: Any, x: Array, steps: int) -> Array:
 
 
 def _after(dt: float, e: Array, slope: Callable[[Array], Array]) -> Array:
-    """Return e one step later, by the classical Runge-Kutta method, from its derivative."""
+    """Advance e by one step of the classical Runge-Kutta method; `slope` is its derivative."""
     first = slope(e)
     second = slope(e + 0.5 * dt * first)
     third = slope(e + 0.5 * dt * second)

@@ -13,22 +13,22 @@ from fflin.base.tables import folded, grid
 from fflin.base.validation import Array
 from fflin.dynamics.impact import Impact
 
-# An error has settled once it stays below this share of its largest.
+# An error has settled when it stays below this fraction of its largest value.
 SETTLED = 0.02
 
-# An error, in SI units, that is never above this was there all the time; below the other it is
-# shown as none. Rounding moves a robot that stands still by less than either.
+# An error [SI units] that never exceeds THERE is at the target throughout. An error below _NOTHING
+# is not shown. Rounding errors move a robot at rest by less than both.
 THERE, _NOTHING = 1e-9, 1e-14
 
-# Share of the rows for which it must have stayed so by the end.
+# Fraction of the rows, at the end, for which a settled error must have stayed small.
 DWELL = 0.05
 
-# Beyond its limit is what is so by more than this share of it: less is the integration's.
+# Smallest violation of a limit, relative to the limit; less may be an integration error.
 _SHARE = 1e-3
 
-_MOST, _NAMED = 8, 4  # lines of a report, and names of what is saturated in its first line
+_MOST, _NAMED = 8, 4  # most lines of a list, and most saturated inputs named in the first line
 
-# What has limits: its name, history (N,), unit, and least and largest value (2,).
+# Signal with limits: its name, history (N,), unit, and least and largest value (2,).
 Limited: TypeAlias = "tuple[str, Array, str, Array]"
 
 _OF_PHASES = (
@@ -43,7 +43,7 @@ _OF_MODES = {"q_m": ("modes", "slosh"), "qdot_m": ("mode rates", "slosh rates")}
 _ALL_OF_MODES = {title for titles in _OF_MODES.values() for title in titles}
 _MODAL = "kg^0.5 m"  # unit of the amplitudes of flexible appendages
 
-# The model is linear in a modal amplitude: beyond this rotation [deg] it is not accurate.
+# Rotation [deg] up to which a modal amplitude is accurate; the model is linear in it.
 _LINEAR = 5.0
 
 
@@ -55,7 +55,7 @@ class Passed(NamedTuple):
     time: float
     limit: float
     unit: str
-    at_first: bool  # whether it was beyond from the start
+    at_first: bool  # whether the violation is there from the start
 
     def __str__(self) -> str:
         value = f"{_shown(self.value)} {self.unit}".removesuffix(" 1")
@@ -98,7 +98,7 @@ def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
         Saturated(name, limit, unit, float(held[near].sum() / held.sum()))
         for name, values, unit, limits in histories
         for limit in limits[np.isfinite(limits) & (limits != 0.0)].tolist()
-        # The speed of a wheel creeps up to its limit, an input is cut to it.
+        # A wheel speed approaches its limit slowly; an input is cut exactly at its limit.
         if held[
             near := np.abs(values - limit) <= (1e-3 if "qdot_m." in name else 1e-9) * abs(limit)
         ].any()
@@ -107,7 +107,7 @@ def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
 
 
 def limited(motion: Any) -> Iterator[Limited]:
-    """Yield what of a motion has limits."""
+    """Yield the states and inputs of a motion that have limits."""
     names = motion.state_names + motion.input_names
     units = motion.state_units + motion.input_units
     found = dict(
@@ -140,7 +140,7 @@ def settled_at(sizes: Array) -> NDArray[np.intp]:
 def is_late(settled: Array | NDArray[np.intp] | int, count: int) -> Any:
     """Return whether errors settle too late in a run of `count` rows to count as settled.
 
-    An error that passes through zero is small for a moment.
+    So an error that only passes through zero at the end does not count as settled.
     """
     return settled > (1.0 - DWELL) * count
 
@@ -165,11 +165,11 @@ class ErrorHistory(NamedTuple):
 
     @property
     def last(self) -> str:
-        """Its last value, for a sentence."""
+        """Title, final value and unit, for a sentence."""
         return f"{self.title}\u00a0{self.size[-1]:.2g}\u00a0{self.unit}"
 
     def row(self, t: Array) -> list[str]:
-        """Return its row of the table."""
+        """Return the row of this error in the table."""
         values = (self.size[0], self.size.max(), self.size[-1])
         cells = ["." if value < _NOTHING else f"{value:.3g}" for value in values]
         not_yet = "not yet" if self.steered else "not controlled"
@@ -181,7 +181,7 @@ class ErrorHistory(NamedTuple):
 
 def motion_report(motion: Any) -> str:
     """Return the report of a motion: settling, inputs, violations, and conserved quantities."""
-    kinds = courses(motion)
+    kinds = error_histories(motion)
     head = [verdict(motion, kinds)] if kinds or motion.stopped else []
     by = ", compiled" if motion.engine == "compiled" else ""
     run = f"{motion.t[-1]:g} s, {len(motion.t)} rows, frame {motion.frame}{by}"
@@ -189,7 +189,7 @@ def motion_report(motion: Any) -> str:
     parts = [folded([*head, f"{motion.robot}: {run}", *circling, *motion.notes])]
     if not (kinds or motion.target.size):
         rows = [["change from the start", "unit", "largest", "final"]]
-        gone = [each.row(motion.t) for each in courses(replace(motion, target=motion.x[0]))]
+        gone = [each.row(motion.t) for each in error_histories(replace(motion, target=motion.x[0]))]
         rows += [
             [*each[:2], *each[3:5]] for each in gone if each[0] in (*_PLACES, *_OF_MODES["q_m"])
         ]
@@ -217,7 +217,7 @@ def motion_report(motion: Any) -> str:
         parts.append(f"largest deviation of the centre of mass from its predicted path: {far}")
     if motion.linear is not None:
         apart = np.abs(motion.x - motion.linear).max(axis=0)
-        # Nothing depends on the angle of a wheel, which outgrows all else.
+        # Wheel angles are excluded: they grow without bound, and nothing depends on them.
         apart[[motion.state_names.index(f"q_m.{name}") for name in motion.wheels]] = 0.0
         most = int(apart.argmax())
         size = f"{apart[most]:.3g} {motion.state_units[most]}".removesuffix(" 1")
@@ -227,7 +227,7 @@ def motion_report(motion: Any) -> str:
 
 
 def motion_record(motion: Any) -> dict[str, Any]:
-    """Return the figures of the report by name."""
+    """Return the numbers of the report by name."""
     t = motion.t
     errors = {
         each.title: {
@@ -237,7 +237,7 @@ def motion_record(motion: Any) -> dict[str, Any]:
             "final": each.size[-1],
             "settled": None if each.late else t[each.settled],
         }
-        for each in courses(motion)
+        for each in error_histories(motion)
     }
     return {
         "stopped": motion.stopped,
@@ -261,7 +261,7 @@ def motion_record(motion: Any) -> dict[str, Any]:
 
 
 def _phases(motion: Any) -> list[list[str]]:
-    """Return the table of phases; a motion from a file does not know the impacts before them."""
+    """Return the table of phases; it has no impacts for a motion from a file."""
     table = [["phase", "", "t [s]", "energy [J]", "|p| [N s]", "|h| [N m s]"]]
 
     def row(name: str, when: str, time: float, energy: float, momentum: Array) -> None:
@@ -285,8 +285,11 @@ def _phases(motion: Any) -> list[list[str]]:
     return table
 
 
-def courses(motion: Any) -> list[ErrorHistory]:
-    """Return the errors of each kind, none without a target; wheels and modes are no joints."""
+def error_histories(motion: Any) -> list[ErrorHistory]:
+    """Return the errors of each kind, or an empty list without a target.
+
+    Wheel speeds and modes have their own kinds. Wheel angles are left out.
+    """
     if motion.error is None or motion.attitude_error is None:
         return []
     steered = set(motion.steered or motion.state_names)
@@ -310,7 +313,7 @@ def courses(motion: Any) -> list[ErrorHistory]:
     return found
 
 
-def pushed(of: Any) -> bool:
+def pushed(of: object) -> bool:
     """Return whether an input of a motion or similar object is a force on the base."""
     return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
@@ -324,6 +327,7 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
         kind for kind in kinds if kind.steered and kind.title not in _ALL_OF_MODES
     ]
     moved = [kind for kind in judged if kind.size.max() > THERE]
+    aside = [kind.last for kind in places if kind.late and not kind.steered]
     if motion.tracked and not motion.phases:
         said = f"tracking errors at the end: {_and([kind.last for kind in judged])}"
     elif failed := [kind.last for kind in moved if kind.late]:
@@ -333,21 +337,18 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
         said = f"settled after {when:.3g}\u00a0s to within {100.0 * SETTLED:g}\u00a0%"
         if late := [kind.last for kind in kinds if kind.late and kind.steered]:
             what = "positions" if judged[0].title in _PLACES else "rates"
-            said = f"{what} {said}; not yet: {_and(late)}"
+            said = f"{what} {said}; not yet settled: {_and(late)}"
     else:
-        said = "settled: at the target throughout the run"
-    aside = {k.title: k.last for k in places if k.late and not k.steered}
-    loose = not pushed(motion) and aside.pop("position", "")
+        which = f"{_and([kind.title for kind in judged])} " * bool(aside)
+        said = f"settled: {which}at the target throughout the run"
     if aside:
-        said += f"; not controlled: {_and([*aside.values()])}"
-    if loose:
-        said += "; position is not controlled"
+        said += f"; not controlled: {_and(aside)}"
     return f"{said}; saturated inputs: {_full(motion)}"
 
 
 def _full(motion: Any) -> str:
-    """Name the inputs and wheels that were at a limit, with their fraction of the run."""
-    shares: dict[str, float] = {}  # at either limit
+    """Return the inputs and wheels that were at a limit, with their fraction of the run."""
+    shares: dict[str, float] = {}  # sum for both limits
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share
     said = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]
@@ -376,8 +377,9 @@ def _largest_modes(motion: Any) -> str:
     if not far:
         return table
     said = (
-        "warning: the motion is not accurate: the model is linear in the modal amplitudes, and "
-        f"some of these bend the structure by more than {_LINEAR:g} deg: {_and(far)}"
+        "warning: the motion is not accurate, because the model is linear in the modal "
+        f"amplitudes, but some amplitudes bend the structure by more than {_LINEAR:g} deg: "
+        f"{_and(far)}"
     )
     return f"{table}\n{folded([said])}"
 
@@ -390,5 +392,5 @@ def _largest_inputs(motion: Any) -> str:
             key = (group_of(name), unit.replace(" ", "\u00a0"))
             kinds[key] = max(kinds.get(key, 0.0), float(value))
     shown = [f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()]
-    # Name, value and unit stay on one line.
+    # Non-breaking spaces keep name, value and unit on one line.
     return folded([f"largest inputs: {', '.join(shown) or 'none'}"])

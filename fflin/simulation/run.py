@@ -16,13 +16,13 @@ from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Conserved, MomentumReference, Plant
 from fflin.simulation.times import LARGEST_TURN
 
-# Take one step from (t, q, v) under u as it begins; return q and v at its end.
+# Function that takes one step from (t, q, v) with initial inputs u, and returns q and v at its end.
 Advance: TypeAlias = Callable[[float, Array, Array, Array], tuple[Array, Array]]
 
 STOPS = ("", "diverged", "left the chart", "stopped")
 
-_LOOK = 16  # steps between looks at the clock
-_LARGEST_SAID = 1e3  # [rad] per step, beyond which the number says no more
+_LOOK = 16  # steps between checks of the clock
+_LARGEST_SHOWN = 1e3  # [rad] per step, above which a message does not give the number
 
 
 class Recording(NamedTuple):
@@ -32,17 +32,17 @@ class Recording(NamedTuple):
     q: Array
     v: Array
     u: Array
-    momentum: Array  # (N, 6), as the impulse from outside makes it, see `Conserved`
-    center: Array  # (N, 3), of mass, where that momentum takes it
-    steps: int  # that were begun
-    stopped: str  # why it ended before its time, if it did
-    engine: str  # that ran
+    momentum: Array  # (N, 6) from the external impulse; see `Conserved`
+    center: Array  # (N, 3) centre of mass from this momentum
+    steps: int  # number of steps that were begun
+    stopped: str  # reason if the run ended early, or an empty text
+    engine: str  # name of the engine
 
 
-# A motion that diverges overflows before it is stopped: that is no reason to warn.
+# A diverging motion overflows before it is stopped, so NumPy need not warn.
 @np.errstate(over="ignore", invalid="ignore")
 def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
-    """Run a plan to its end; `plant` and `conserved` are of the robot that moves."""
+    """Simulate a plan in Python; `plant` and `conserved` belong to the simulated robot."""
     times, q, v = plan.times, plan.q, plan.v
     dt, channel = times.dt, plan.channel()
     reference = MomentumReference(conserved, plan.method, dt, q, v)
@@ -96,26 +96,26 @@ def _advance(
     reference: MomentumReference,
     channel: Channel | None,
 ) -> Advance:
-    """Return what takes one step."""
+    """Return the function that takes one step."""
     take = plan.method(plant.robot.model, plan.times.dt).step
     ask = channel.ask if channel is not None and channel.continuous else None
     pushed = not plant.isolated(driven=channel is not None)
     stage, wrench, wrenches = plant.stage, conserved.wrench, reference.wrenches
     latest = plan.last_node * plan.times.dt
-    follow, shares = plan.law and plan.law.advance, plan.method.shares(plan.times.dt)[1]
+    follow, weights = plan.law and plan.law.advance, plan.method.step_weights(plan.times.dt)[1]
 
     def asked(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
         stages, last = 0, t + latest
 
         def f(t: float, q: Array, v: Array) -> Array:
             nonlocal stages
-            # The first stage is the point that was asked about already.
+            # The policy has already been evaluated at the first stage.
             a, push = stage(t, q, v, ask(min(t, last), q, v) if ask and stages else u)
             if pushed:
                 wrenches[stages][:] = wrench(q, push)
             stages += 1
             if follow:
-                follow(shares[stages - 1, : stages + 1], stages == len(shares))
+                follow(weights[stages - 1, : stages + 1], stages == len(weights))
             return a
 
         end = take(f, t, q, v)
@@ -127,7 +127,7 @@ def _advance(
 
 
 def stop_conditions(plan: Plan) -> StopConditions:
-    """Return when a run ends, with squares of rates in the order of v (nv,)."""
+    """Return the stop conditions of a run, with squared rates in the order of v (nv,)."""
     squares = np.full(len(plan.v), LARGEST_SPEED**2)
     squares[plan.turning] = (LARGEST_TURN / plan.times.dt) ** 2
     sign = float(np.sign(plan.chart.scalar(plan.q))) if plan.chart else 0.0
@@ -135,7 +135,7 @@ def stop_conditions(plan: Plan) -> StopConditions:
 
 
 def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array], str]:
-    """Return a function that returns why a run ends; empty if the run continues."""
+    """Return a function that returns why a run ends, or an empty text if the run continues."""
     # The entries of a list are read faster than the entries of an array.
     stop = stop._replace(squares=stop.squares.tolist())
     anywhere = stop._replace(sign=[0.0])
@@ -162,13 +162,13 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
             return f"left the chart at t = {t:g} s: the base rotated by 180 deg from the reference"
         dt, turn = plan.times.dt, float(np.abs(v[plan.turning]).max()) * plan.times.dt
         detail = f": a joint or the base rotates by {turn:.2g} rad per step"
-        known = LARGEST_TURN <= turn <= _LARGEST_SAID
+        known = LARGEST_TURN <= turn <= _LARGEST_SHOWN
         return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}; give a smaller dt"
 
     return ending
 
 
 def stop_of(message: str) -> int:
-    """Return the index into STOPS of the message with which a run ended."""
+    """Return the index in STOPS for the message with which a run ended."""
     found = (at for at, word in enumerate(STOPS) if word and message.startswith(word))
     return next(found, len(STOPS) - 1) if message else 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def simulate(
     robot: Robot,
-    policy: Policy | StateFeedback | GainSchedule | Any = None,
+    policy: Policy | StateFeedback | GainSchedule | object = None,
     *,
     x0: ArrayLike | None = None,
     q0: ArrayLike | None = None,
@@ -54,113 +54,123 @@ def simulate(
 ) -> Motion:
     r"""Simulate the nonlinear robot under a policy.
 
-    The integrator takes steps of fixed size on the manifold, by default with the commutator-free
-    method CF4 of order 4. After each step a projection restores two conserved quantities:
+    A policy is a control law policy(t, q, v) -> u. The integrator takes steps of fixed size on the
+    configuration manifold, by default with the commutator-free method CF4 of order 4. After each
+    step, a projection removes the integration errors of two quantities that follow from the initial
+    momentum and the external impulse:
 
-    - The base is shifted so that the centre of mass has the position determined by momentum and
-      impulse.
-    - The base velocity is set to :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`. The momentum H
-      is integrated from the external impulse with the weights of the method.
+    - the position of the centre of mass: the base is shifted to restore it;
+    - the momentum H: the base velocity is set to
+      :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`. H is integrated from the external forces
+      with the weights of the method.
 
-    Thrusters never pull: a negative thrust is saturated at zero.
+    Thrusters never pull, so a negative thrust is saturated at zero.
 
-    In orbit, q and v are relative to the orbital frame, also in the arguments of policies.
-    Momentum is not conserved in orbit, so that the projection is off.
+    In orbit, q and v are relative to the orbital frame, also in the arguments of policies. The
+    projection is off in orbit, because momentum is not conserved there.
 
     Parameters
     ----------
     robot : Robot
     policy : callable, optional
-        Function policy(t, q, v) -> u (nu,) over the robot's inputs, such as
-        ``StateFeedback(lin, gain.K)``. A `GainSchedule` acts as the feedback along its trajectory.
-        By default all inputs are zero.
+        Function policy(t, q, v) -> u (nu,) that returns the inputs of the robot, such as
+        ``StateFeedback(lin, gain.K)``. A `GainSchedule` is also accepted, and then tracks its
+        trajectory. By default all inputs are zero.
     x0 : array_like (nx,), optional
-        Initial state in the chart of the policy's model, or of `frame` and `reference`.
+        Initial state in the chart defined by `frame` and `reference`, which is by default the chart
+        of the policy's model.
     q0 : array_like (nq,), optional
     v0 : array_like (nv,), optional
-        Initial configuration and velocity in Pinocchio's order, instead of `x0`. If only one of
-        q0 and v0 is given, the other is neutral or zero. Without x0, q0 and v0, the motion starts
-        at the start of the followed trajectory or at the robot's `start`.
+        Initial configuration and velocity in Pinocchio's order, instead of `x0`. If only v0 is
+        given, q0 is neutral; if only q0 is given, v0 is zero. If x0, q0 and v0 are all omitted,
+        the motion starts at the start of the followed trajectory or at the robot's `start`.
     duration : float, optional
         Simulated time [s]; by default the duration of the followed trajectory.
     dt : float, optional
-        Step [s]; by default 0.01, or less if the loop's fastest pole or the samples require a
-        shorter step. For continuous policies without delay, the step is adjusted to divide the
-        duration.
+        Integration step [s]; by default 0.01, or less if the fastest pole of the loop or the
+        sample time requires a shorter step. For continuous-time policies without delay, the step
+        is adjusted so that the duration is a whole number of steps.
     method : {"cf4", "semi_implicit_euler"}
+        Integration method.
     project : bool
         Whether the projection after each step restores momentum and centre of mass.
     sample : float, optional
-        Sample time [s] of the policy, a multiple of dt; u is held between samples. By default the
-        sample time of the policy's model. With a continuous model, the policy is evaluated at
-        every stage of every step.
+        Sample time [s] of the policy, a multiple of dt; u is held between samples. The default is
+        the sampling time of the policy's model. If this model is in continuous time, the policy is
+        evaluated at every stage of every integration step.
     delay : float
-        Time [s] from a sample to the effect of its command, a multiple of dt. Until the first
+        Time [s] from a sample until its command takes effect, a multiple of dt. Until the first
         command takes effect, the input is u0 of the policy's model, or zero without a model. If
         `delay` is given without `sample`, the policy is sampled every dt.
     limits : "urdf", float, mapping or list of them, optional
-        Limits at which the inputs saturate; by default none:
+        Limits at which the inputs saturate. By default, inputs do not saturate. Limits are one of
 
         - "urdf": all limits of the robot (efforts of the URDF, `min` and `max` of the inputs, the
-          largest wheel speeds, `Robot.limits`).
-        - A number: the largest magnitude of every input.
-        - {input, group or pattern: magnitude, or (lower, upper)}.
-        - A list such as ``["urdf", {"tau_m": 5.0}]``: explicit limits take precedence over "urdf".
+          largest wheel speeds, `Robot.limits`);
+        - a number: the largest magnitude of every input;
+        - a mapping {input, group or pattern: magnitude, or (lower, upper)};
+        - a list in which explicit limits take precedence over "urdf", such as
+          ``["urdf", {"tau_m": 5.0}]``.
 
-        On-off thrusters always fire in pulses. `Motion.passed` lists the violated limits.
+        On-off thrusters fire in pulses, whatever the limits. `Motion.passed` lists violated limits.
     disturbance : callable, optional
         Function disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order.
     events : sequence of callable
-        Functions event(t, q, v) -> float. The run ends after the step in which a value becomes
-        zero or negative.
+        Functions event(t, q, v) -> float. The run ends after the step in which the value of an
+        event becomes zero or negative.
     callback : callable, optional
-        Function callback(t, q, v, u), called at every recorded row.
+        Function callback(t, q, v, u) that is called at every recorded row.
     linear : LinearModel or bool, optional
-        Model that predicts the motion under the same control law; by default the policy's own
-        model, False for no prediction. A motion can be predicted for a StateFeedback, an
-        OutputFeedback or LinearController (without its noise), or no policy.
-        There is no prediction for a sampled model that was read from a file.
+        Model that predicts the motion under the same control law. The default is the policy's own
+        model; with False, there is no prediction. The motion can be predicted without a policy,
+        and for a StateFeedback, an OutputFeedback or a LinearController, but not for a
+        discrete-time model that was read from a file. The prediction ignores noise.
     target : LinearModel or array_like (nx,), optional
         Target state from which errors are measured, or a model whose operating point is the
-        target. By default the operating point of the policy's own model, or the followed
-        trajectory's state at each time. Other policies have no target.
+        target. The default is the operating point of the policy's own model, or the state of the
+        followed trajectory at each time. If the policy has neither, there is no target.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
     reference : pin.SE3, optional
-        Frame and reference placement of x and u. The default is the frame and reference of the
-        policy. Without a policy, the frame is "hybrid" ("lvlh" in orbit), and the reference is
-        the identity.
+        Frame and reference placement of x and u, see `StateMap`. The default is the frame and
+        reference of the policy. Without a policy, the default frame is "hybrid" ("lvlh" in orbit),
+        and the default reference is the identity.
     every : int, optional
-        Number of steps from one recorded row to the next; by default 1. The default is larger for
-        more than 100,000 steps, so that about 10,000 rows are recorded, as the motion's `notes`
-        report.
+        Number of steps from one recorded row to the next. The default is 1 for up to 100,000
+        steps. For more steps, the default is larger, so that about 10,000 rows are recorded; the
+        motion's `notes` then report this number.
     progress : bool, optional
-        Whether to show a progress bar on stderr; by default on a terminal, for long runs.
+        Whether to show a progress bar on stderr. By default, long runs show it on a terminal.
     engine : {"python", "compiled"}, optional
-        Engine that runs the loop. The default is Python, except that a run of more than 20,000
-        steps uses the compiled engine if this engine has already been compiled. The compiled
-        engine needs numba. The compiled engine supports no orbits, and no policies, events,
-        callbacks or disturbances written in Python. The Python engine and the compiled engine
+        Engine that runs the simulation. The default is "python". But a run of more than 20,000
+        steps uses "compiled" by default if this engine has already been compiled. The compiled
+        engine needs numba. It does not support orbits. It also does not support functions written
+        in Python, such as policies, events, callbacks and disturbances. The results of both engines
         agree to machine precision.
 
     Returns
     -------
     Motion
         Simulated motion. If the motion ended early, ``stopped`` gives the reason: an event, an
-        interrupt (Ctrl-C), or a loop that left the chart or diverged (with the step size).
+        interrupt (Ctrl-C), an attitude beyond the range of the chart, or a diverging simulation,
+        with its step size.
 
     Raises
     ------
     InputError
-        If an argument has a wrong size or value, a policy or disturbance returns an invalid input
-        or force, or dt is too large for the loop.
+        If one of these conditions is true:
+
+        - an argument has a wrong size or value;
+        - a policy returns invalid inputs, or a disturbance returns an invalid force;
+        - dt is too large for the fastest pole of the loop.
     UnknownNameError
         If a method or input is unknown.
 
     Warns
     -----
     FflinWarning
-        If the loop's fastest pole requires more than 50,000 steps, or springs and gravity at the
-        target require inputs beyond the limits. The warning names the pole or the inputs.
+        If the fastest pole of the loop requires more than 50,000 steps, or if inputs beyond their
+        limits are required to balance springs and gravity at the target. The warning names the
+        pole or the inputs.
 
     References
     ----------
@@ -205,7 +215,7 @@ def simulate(
         return motion_of(plan, plant, conserved, run)
     except MemoryError:
         raise InputError(
-            f"{plan.times.rows} rows of '{robot.name}' exceed the available memory; take a larger "
+            f"{plan.times.rows} rows of '{robot.name}' exceed the available memory; use a larger "
             "dt or `every`"
         ) from None
 
@@ -229,7 +239,7 @@ def motion_of(plan: Plan, plant: Plant, conserved: Conserved, run: Recording) ->
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
         momentum_drift=conserved.momentum_drift(history, run.momentum),
-        # In orbit the centre of mass keeps to no line.
+        # In orbit, the centre of mass does not move along a straight line.
         com_drift=np.linalg.norm(history.center - run.center, axis=1)[: 0 if robot.orbit else None],
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,

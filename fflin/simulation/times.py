@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -20,14 +20,17 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from fflin.simulation.plan import SimulationOptions
 
-# Of a run whose duration is not given [s], and between looks at the linear loop.
+# Bounds of an automatic duration [s], and the step of the linear loop that determines it [s].
 SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
-LARGEST_TURN = 1.0  # within one step [rad], beyond which no integrator follows
+LARGEST_TURN = 1.0  # [rad] largest rotation within a step for which integrators are accurate
 _STEP = 0.01  # [s]
 _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
-_MANY_STEPS, _ENDLESS = 50_000, 10_000_000  # half a minute, and some hours that nobody asked for
-_MANY_ROWS, _FEW_ROWS = 100_000, 10_000  # that nobody reads, and that a page or a plot shows
-_FOREVER = 1e100  # [s]; the square of its inverse is still a number
+# Steps above which an automatically chosen step is reported (half a minute of computing), and
+# refused (some hours).
+_MANY_STEPS, _ENDLESS = 50_000, 10_000_000
+# Rows above which only some steps are recorded, and the number of rows then.
+_MANY_ROWS, _FEW_ROWS = 100_000, 10_000
+_FOREVER = 1e100  # [s]; its inverse squared does not underflow
 
 
 class Times(NamedTuple):
@@ -35,37 +38,37 @@ class Times(NamedTuple):
 
     dt: float
     steps: int
-    every: int  # from one recorded row to the next
-    sample: int  # between samples of the law; 0 where it is asked at every stage of every step
-    delay: int  # from a sample to its effect
-    fastest: float  # magnitude of the loop's poles [1/s]; 0 where it is not known
-    thinned: bool  # whether `every` was chosen here
+    every: int  # steps between recorded rows
+    sample: int  # steps between samples of the law; 0 if it is evaluated at all stages
+    delay: int  # steps from a sample to its effect
+    fastest: float  # largest magnitude of the loop's poles [1/s]; 0 if unknown
+    thinned: bool  # whether `every` was chosen automatically
 
     @property
     def rows(self) -> int:
-        """Most rows that are recorded."""
+        """Largest number of recorded rows."""
         return self.steps // self.every + 2
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the recorded rows, for the report."""
-        said = f"one of {self.every} steps is recorded; every=1 (--every 1) records all "
+        said = f"one in {self.every} steps is recorded; every=1 (--every 1) records all "
         notes: tuple[str, ...] = (f"{said}{self.steps:,} steps",) if self.thinned else ()
         if self.sample and self.every % self.sample and self.sample % self.every:
             aside = (
                 f"a row is recorded every {self.every} steps, but the controller samples every "
-                f"{self.sample} steps; the "
+                f"{self.sample} steps, so the "
             )
             notes += (f"{aside}rows are not a valid trajectory",)
         return notes
 
     @property
     def slow(self) -> float:
-        """Square of the largest velocity at which the rotation per step is small enough."""
+        """Square of the largest angular velocity at which the rotation per step is small enough."""
         return float((LARGEST_TURN / self.dt) ** 2)
 
     def require_room(self, width: int, *, chosen: bool) -> None:
-        """Refuse too many rows or steps; warn of many steps that were `chosen` automatically."""
+        """Raise an error for too many rows or steps; warn of many automatically `chosen` steps."""
         most = _ENDLESS if self.thinned else _MOST_STEPS
         if self.rows * width > _MOST_ENTRIES or self.steps > most:
             raise InputError(
@@ -75,16 +78,16 @@ class Times(NamedTuple):
             )
         if chosen and self.fastest * _STEP > 1.0 and self.steps > _MANY_STEPS:
             warnings.warn(
-                f"the simulation takes long: the loop's fastest pole at {self.fastest:.3g} 1/s "
-                f"requires {self.steps:,} steps of {self.dt:.3g} s; give dt=, sample= or a slower "
-                "gain",
+                "the simulation takes long, because the fastest pole of the loop at "
+                f"{self.fastest:.3g} 1/s requires {self.steps:,} steps of {self.dt:.3g} s; give "
+                "dt=, sample= or a slower gain",
                 FflinWarning,
                 stacklevel=3,
             )
 
 
-def times_of(policy: Any, options: SimulationOptions) -> Times:
-    """Return the times of a simulation of a policy."""
+def times_of(policy: object, options: SimulationOptions) -> Times:
+    """Return the times of a simulation from the options and the policy."""
     duration, dt, every, sample = options.duration, options.dt, options.every, options.sample
     follows = tracking_of(policy)
     if sample is not None:
@@ -116,8 +119,8 @@ def times_of(policy: Any, options: SimulationOptions) -> Times:
     if abs(steps * dt - duration) > 1e-6 * duration:
         if sample or delay:
             raise InputError(
-                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s, as "
-                "the input is sampled or delayed; choose dt accordingly"
+                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s, "
+                "because the input is sampled or delayed; choose dt accordingly"
             )
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
@@ -125,13 +128,13 @@ def times_of(policy: Any, options: SimulationOptions) -> Times:
         sample = dt if delay else 0.0
     samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
     thinned = every is None and steps > _MANY_ROWS
-    if every is None:  # rows of a sampled loop fall on its samples
+    if every is None:  # rows of a sampled loop are at its samples
         part = max(samples, 1)
         every = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
     return Times(dt, steps, every, samples, late, fastest, thinned)
 
 
-def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> float:
+def _fastest_pole(policy: object, follows: TrajectoryFeedback | None) -> float:
     """Return the largest magnitude [1/s] of a continuous loop's poles; 0 if it is not known."""
     if follows is not None:
         return largest_rate(follows.schedule)
@@ -142,7 +145,7 @@ def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> float:
 
 
 def _in_steps(name: str, time: float, dt: float) -> int:
-    """Return a time [s] in steps."""
+    """Convert a time [s] to a number of steps."""
     if abs(round(time / dt) * dt - time) > 1e-6 * dt:
         raise InputError(
             f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
@@ -152,7 +155,7 @@ def _in_steps(name: str, time: float, dt: float) -> int:
 
 
 def _part_of(sample: float, largest: float, *times: float) -> float:
-    """Return a step of which the sample and, where there is one, the other times are multiples."""
+    """Return a step of which the sample time and, if possible, the other times are multiples."""
     least = int(np.ceil(sample / largest))
     for parts in range(least, least + 1000):
         dt = sample / parts
@@ -161,7 +164,7 @@ def _part_of(sample: float, largest: float, *times: float) -> float:
     return sample / least
 
 
-def _positive(name: str, value: Any) -> float:
+def _positive(name: str, value: object) -> float:
     time = number(name, value)
     if not 1.0 / _FOREVER < time <= _FOREVER:
         raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_FOREVER:g} s")
@@ -171,7 +174,10 @@ def _positive(name: str, value: Any) -> float:
 def time_to_settle(
     robot: Robot, policy: StateFeedback | LinearController, q: Array, v: Array | None
 ) -> float:
-    """Return when [s] the linear loop stays within 1 % of each error; in tens of seconds."""
+    """Return the time [s] at which the errors of the linear loop stay below 1 % of their maxima.
+
+    The time is rounded up to tens of seconds.
+    """
     lin = policy.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     start = state.read(q, np.zeros(robot.nv) if v is None else v, near=state.read(lin.q, lin.v))
@@ -187,10 +193,10 @@ def time_to_settle(
     kinds = [[f"{group}.{axis}" for axis in "xyz"] for group in ("q_b", "r_b")] + [places]
     fed = {*fed_back(policy)}
     rows = [[i for i, name in enumerate(lin.state_names) if name in fed & {*k}] for k in kinds]
-    course = [e]
+    history = [e]
     for _ in range(math.ceil(LONGEST / step)):
-        course.append(loop @ course[-1])
-    errors = np.array([np.abs(np.array(course)[:, of]).max(axis=1, initial=0.0) for of in rows])
+        history.append(loop @ history[-1])
+    errors = np.array([np.abs(np.array(history)[:, of]).max(axis=1, initial=0.0) for of in rows])
     away = (errors > 0.01 * errors.max(axis=1, keepdims=True)).any(axis=0)
     last = float(np.flatnonzero(away).max(initial=0)) * step
     return max(SHORTEST, 10.0 * math.ceil(last / 10.0)) if last < 0.99 * LONGEST else SHORTEST

@@ -27,8 +27,9 @@ class LFT(Design):
     .. math:: \dot x = A x + B_1 w + B_2 u,\quad z = C_1 x + D_{11} w + D_{12} u,\quad
               y = C_2 x + D_{21} w + D_{22} u,\quad w = \Delta z
 
-    :math:`\Delta` is diagonal. :math:`\Delta` contains every delta, a number between -1 and 1,
-    one or more times. Printing the model lists its blocks.
+    Each uncertain parameter has a normalised value delta between -1 and 1. :math:`\Delta` is a
+    diagonal matrix that contains every delta one or more times. ``print`` shows the range of every
+    parameter and the number of its repetitions.
 
     Attributes
     ----------
@@ -39,14 +40,15 @@ class LFT(Design):
     C2, D21, D22 : ndarray (ny, nx), (ny, nw), (ny, nu)
         Matrices of the outputs y.
     parameters : tuple of str
-        Uncertain parameters in the order of the blocks. Tied parameters are listed once, under
-        their pattern.
+        Uncertain parameters in the order in which their deltas occur in :math:`\Delta`. Tied
+        parameters, which share one delta, are listed once, under their pattern.
     repeats : ndarray (k,)
-        Number of times that each delta is repeated in :math:`\Delta`.
+        Number of times that each delta occurs in :math:`\Delta`.
     middle, half : ndarray (k,)
-        A parameter is ``middle + half * delta``. Tied parameters have one common number ``middle +
-        half * delta``: their value if their range is in their unit, and the factor that multiplies
-        their nominal values if their range is relative.
+        Middle and half width of each range: a parameter has the value ``middle + half * delta``.
+        For tied parameters, ``middle + half * delta`` is their common value if their range was
+        given as a pair. If their range is relative, ``middle + half * delta`` is the factor that
+        multiplies their nominal values.
     units : tuple of str
         Units of the parameters; "1" for a factor.
     state_names, input_names, output_names : tuple of str
@@ -94,16 +96,19 @@ class LFT(Design):
             ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
             rows.append((name, "." if unit == "1" else unit, *ends, f"{repeats:g}"))
         many, count = counted(len(self.repeats), "parameter"), f"{self.repeats.sum():g}"
-        said = f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count} in all"
+        said = f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count}"
         return f"{folded([said])}\n\n{grid(cut(rows), 'll')}"
 
     @property
     def dt(self) -> float:
-        """Sampling time: 0, because the model is continuous."""
+        """Sampling time, which is 0 because the model is in continuous time."""
         return 0.0
 
     def deltas(self, values: Mapping[str, float]) -> Array:
-        """Return delta (k,) for {parameter or pattern: value}; 0 for unnamed parameters."""
+        """Return the deltas (k,) for parameter values {parameter or pattern: value}.
+
+        The delta of every other parameter is 0.
+        """
         found = np.zeros(len(self.parameters))
         for key, value in numbers("values", values, "parameter", "value").items():
             for at in matching("parameter", key, self.parameters):
@@ -111,24 +116,25 @@ class LFT(Design):
         return found
 
     def at(self, values: Mapping[str, float] | Array) -> tuple[Array, Array, Array, Array]:
-        r"""Return A, B, C and D at values of the parameters.
+        r"""Return A, B, C and D at given values of the parameters.
 
         Parameters
         ----------
         values : mapping or array_like (.., k)
-            {parameter: value}, or rows of deltas. Unnamed parameters are at the middle of their
-            ranges.
+            Values {parameter: value}, or rows of k deltas. Parameters that are not named are at the
+            middle of their ranges.
 
         Returns
         -------
         A, B, C, D : ndarray
-            :math:`A + B_1 \Delta (E - D_{11} \Delta)^{-1} C_1` and so on, for each row, with E the
-            identity.
+            Matrices of the model for each row. For example, the state matrix is
+            :math:`A + B_1 \Delta (E - D_{11} \Delta)^{-1} C_1`, with the identity E.
 
         Raises
         ------
         InputError
-            If a row does not have k finite deltas, or the inertia M is singular at these values.
+            If a row does not have k finite deltas, or the inertia matrix M is singular at these
+            values.
         """
         if isinstance(values, Mapping):
             values = self.deltas(values)
@@ -159,8 +165,8 @@ class LFT(Design):
     def to_control(self) -> Any:
         """Return a `control.StateSpace` from (w, u) to (z, y), with signal names.
 
-        The channels of w and z are named ``w.PARAMETER.1`` and ``z.PARAMETER.1``, with
-        underscores instead of dots.
+        The channels of w and z have names such as ``w_PARAMETER_1`` and ``z_PARAMETER_1``. Dots in
+        all signal names are replaced by underscores.
 
         Raises
         ------

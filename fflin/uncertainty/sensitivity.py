@@ -20,8 +20,9 @@ from fflin.linear.model import LinearModel
 from fflin.uncertainty.derivatives import ModelDerivatives, difference
 from fflin.uncertainty.parameters import Parameter, Parameters
 
-# Poles closer than this, relative to the largest, have no derivative of their own.
+# Poles closer than this, relative to the largest pole, count as equal and have no derivative.
 _EQUAL = 1e-6
+_ROUNDING = 1e-12  # smaller effects, relative to the largest entry, are rounding errors
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,36 +59,37 @@ class Derivatives(FrozenArrays):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivity:
-    """Derivatives of a linear model with respect to each robot parameter: ``S["arm.mass"].dA``.
+    """Derivatives of a linear model with respect to the parameters of the robot.
 
-    The name of a link is its name in the URDF. A body is a group of links fixed to each other,
-    and has the name of its joint or ``base``. The parameters of a link or body are:
+    ``S["arm.mass"].dA`` is the derivative of A with respect to one parameter. Most parameters
+    belong to a link or to a body. The name of a link is its name in the URDF. A body is a group of
+    links that are fixed to each other; its name is the name of its joint, or ``base``. The
+    parameters of a link or body are
 
-    - ``LINK.mass`` [kg], with constant centre of mass and constant inertia about the centre of
-      mass;
-    - ``LINK.com.x`` [m] in the link's axes, with constant mass and inertia about the centre of
-      mass;
+    - ``LINK.mass`` [kg]; centre of mass and inertia about the centre of mass stay constant;
+    - ``LINK.com.x`` [m] in the link's axes; mass and inertia about the centre of mass stay
+      constant;
     - ``LINK.inertia.xx`` .. ``.yz`` [kg m^2] about the centre of mass, in the axes of the URDF's
-      <inertial>; for a body, in the axes of its joint;
-    - ``LINK.density``, a relative factor on mass and inertia.
+      <inertial> for a link, or in the axes of its joint for a body;
+    - ``LINK.density``, a factor that multiplies mass and inertia.
 
-    A pattern selects links. A pattern that matches no link selects bodies.
+    A pattern selects links, or bodies if the pattern matches no link.
 
-    Modes of flexible appendages and slosh have ``MODE.frequency`` [Hz] and ``MODE.damping``, the
-    damping ratio, both with the link clamped. A change of the frequency does not change the
-    damping ratio.
+    A mode of a flexible appendage or slosh has the parameters ``MODE.frequency`` [Hz] and
+    ``MODE.damping`` (the damping ratio), both for a clamped link. The damping ratio stays constant
+    if the frequency is changed.
 
     Other parameters are ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
-    ``THRUSTER.direction.x`` (a change of its length has no effect) and ``WHEEL.inertia``. The
-    inertia of a carrier includes its wheels. A larger wheel inertia therefore reduces the inertia
-    of the rest of the carrier.
+    ``THRUSTER.direction.x`` and ``WHEEL.inertia``. A change of the length of ``THRUSTER.direction``
+    has no effect. The inertia of a wheel's carrier includes the wheel, so a larger wheel inertia
+    reduces the inertia of the rest of the carrier.
 
     Attributes
     ----------
     lin : LinearModel
-        The linear model.
+        Linear model whose derivatives are computed.
     parameters : Parameters
-        {name: Parameter} in the robot's order.
+        Mapping from names to the parameters of the robot.
 
     Examples
     --------
@@ -123,20 +125,21 @@ class Sensitivity:
         found = self.parameters.find(name)
         if len(found) > 1:
             raise InputError(
-                f"'{name}' matches {len(found)} parameters, expected one; for several use "
-                "along({...})"
+                f"'{name}' matches {len(found)} parameters, expected one; to change several "
+                "parameters together, use along({...})"
             )
         return self.parameters[found[0]]
 
     def along(self, direction: Mapping[str, float]) -> Derivatives:
-        """Return the directional derivatives along a change of several parameters.
+        """Return the derivatives for a simultaneous change of several parameters.
 
         Parameters
         ----------
         direction : mapping
-            {parameter or pattern: change per unit of the direction, in the parameter's unit}.
-            ``{"payload.density": 0.1}`` increases mass and inertia of the payload by a tenth.
-            ``{"panel_*.stiffness": 1.0}`` changes all matching stiffnesses together.
+            Changes {parameter or pattern: change}, each in the parameter's unit. The results are
+            the first-order changes of A, B and so on for these changes. For example, the change
+            0.1 of ``payload.density`` increases mass and inertia of the payload by a tenth, and
+            the change 1.0 of ``panel_*.stiffness`` changes all matching stiffnesses together.
         """
         given = numbers("direction", direction, "parameter", "change")
         named = {name: value for key, value in given.items() for name in self.parameters.find(key)}
@@ -168,17 +171,18 @@ class Sensitivity:
         return self._all[4]
 
     def poles(self, gain: Any = None) -> tuple[Array, Array]:
-        """Return the poles (nx,) of A - B K and their derivatives (P, nx).
+        """Return the closed-loop poles (nx,) of A - B K and their derivatives (P, nx).
 
         Parameters
         ----------
         gain : Gain or array_like (nu, nx), optional
-            Gain K; zero by default.
+            Gain K; zero by default, for the poles of A.
 
         Returns
         -------
         poles, derivatives : ndarray
-            Derivatives of coincident poles are NaN, because such poles are not differentiable.
+            Poles, and one row of derivatives per parameter. Derivatives of coincident poles are
+            NaN, because such poles are not differentiable.
         """
         lin = self.lin
         K = np.zeros(lin.B.T.shape) if gain is None else getattr(gain, "K", gain)
@@ -197,8 +201,8 @@ class Sensitivity:
     def check(self, names: Sequence[str] | None = None) -> dict[str, float]:
         """Compare the derivatives of A and B with finite differences.
 
-        Each parameter is changed in small steps. At each step, A and B are computed independently
-        from the derivatives of ABA.
+        The finite differences are independent of the exact derivatives: each parameter is changed
+        by small steps, and A and B are computed at each step from Pinocchio's derivatives of ABA.
 
         Parameters
         ----------
@@ -208,8 +212,8 @@ class Sensitivity:
         Returns
         -------
         dict
-            {parameter: largest difference, relative to the derivatives}. The expected difference
-            is about 1e-9, the accuracy of the finite differences.
+            Largest differences {parameter: difference}, relative to the derivatives. Differences
+            of about 1e-9 are expected, which is the accuracy of the finite differences.
         """
         if names is None:
             names = [name for name, one in self.parameters.items() if one.bodies]
@@ -224,16 +228,17 @@ class Sensitivity:
     def table(self, top: int = 15, only: str | None = None) -> str:
         """Return a table of the parameters with the largest effect on A and B.
 
-        The effect is the change of A and B if a parameter changes by 10 %, or a position or
-        centre of mass by 1 cm.
+        The effect of a parameter is the change of A and B if the parameter changes by 10 %, or by
+        1 cm for a position or a centre of mass.
 
         Parameters
         ----------
         top : int
             Number of rows.
         only : str, optional
-            Restriction to a kind, link or pattern: ``mass``, ``link_3``, ``*.density``. Bodies
-            whose links are listed are omitted.
+            Parameters to which the table is restricted: a kind such as ``mass``, a link such as
+            ``link_3``, or a pattern such as ``*.density``. Bodies whose links are listed are
+            omitted.
         """
         shown = self.parameters.ranked(only)
         lin, sizes = self.lin, [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
@@ -244,7 +249,7 @@ class Sensitivity:
             effect = [step * np.abs(d).max() / of for d, of in zip((dA, dB), sizes, strict=True)]
             if one.name in shown and max(effect) > 0.0:
                 unit = "." if one.unit == "1" else one.unit
-                percents = (f"{100.0 * x:.2g}" for x in effect)
+                percents = (f"{100.0 * x:.2g}" if x > _ROUNDING else "." for x in effect)
                 rows.append(
                     (max(effect), one.name, unit, f"{one.value:.5g}", f"{step:.3g}", *percents)
                 )
@@ -252,11 +257,17 @@ class Sensitivity:
         most = [row[1:] for row in rows[: whole("top", top, 1)]]
         if not most:
             return f"{lin.robot}: none of these parameters changes A or B"
-        largest = f"{most[0][0]} changes A and B most, by {100.0 * rows[0][0]:.2g} %"
-        title = folded([f"{lin.robot}: {largest} of their largest entry, to first order"])
+        name, unit, _, step, *_ = most[0]
+        change = step if unit == "." else f"{step} {unit}"
+        title = folded(
+            [
+                f"{lin.robot}: {name} changes A and B most: if it changes by {change}, A or B "
+                f"changes by {100.0 * rows[0][0]:.2g} % of its largest entry, to first order"
+            ]
+        )
         heads = ("parameter", "unit", "value", "change", "A [%]", "B [%]")
         more = f"... and {len(rows) - top} more, see --top"
-        return "\n".join([title, grid([heads, *most], "ll"), *[more] * (len(rows) > top)])
+        return "\n".join([title, "", grid([heads, *most], "ll"), *[more] * (len(rows) > top)])
 
     def save(self, path: str | Path) -> None:
         """Write the derivatives to a .npz, .mat or .json file, atomically.
@@ -286,27 +297,28 @@ def sensitivity_record(found: Sensitivity) -> Record:
 def sensitivity(lin: LinearModel) -> Sensitivity:
     r"""Return the exact derivatives of a linear model with respect to the robot's parameters.
 
-    M and RNEA are linear in the dynamic parameters of the bodies. The derivatives of A, B and f0
-    therefore follow from the equations of the linear model itself, such as
+    The inertia matrix M and the inverse dynamics (RNEA) are linear in the dynamic parameters of the
+    bodies. Therefore the equations of the linear model can be differentiated exactly. For example,
+    the derivative of :math:`M^{-1}` with respect to a parameter p is
     :math:`(M^{-1})_p = -M^{-1} M_p M^{-1}`; see docs/derivation.md.
 
     Parameters
     ----------
     lin : LinearModel
-        Result of `linearize` in this session, about any point and in any frame. For a model
-        sampled by `discretize`, the sampled A, B and f0 are differentiated.
+        Result of `linearize` in this session, about any operating point and in any frame. If
+        `discretize` returned the model, the discrete-time A, B and f0 are differentiated.
 
     Returns
     -------
     Sensitivity
-        Derivatives are computed at first access.
+        Derivatives of the model, which are computed at first access.
 
     Raises
     ------
     InputError
         If the model was loaded from a file.
     ModelError
-        If the robot was changed after the model was made.
+        If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
     Examples
     --------

@@ -23,21 +23,21 @@ from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.parameters import Parameter, Variants
 from fflin.uncertainty.worst import Worst, searched
 
-# Draws for one that makes a robot, before it is said that hardly any does.
+# Number of rejected draws per valid draw above which the ranges are refused.
 _TRIES = 1000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Uncertain:
-    """Robot with uncertain parameters, each in a range; made by `uncertain`.
+    """Robot whose uncertain parameters each have a range, as returned by `uncertain`.
 
     Attributes
     ----------
     robot : Robot
         The nominal robot.
     blocks : tuple of Block
-        Blocks of the uncertainty. A block is a parameter or several tied parameters, and has one
-        delta.
+        Blocks of the uncertainty. A block is one parameter, or several tied parameters. The
+        parameters of a block vary with one delta, a number between -1 and 1.
 
     Examples
     --------
@@ -58,12 +58,12 @@ class Uncertain:
 
     @property
     def ranges(self) -> tuple[Range, ...]:
-        """Ranges of the parameters, block by block: `middle` and half width `half` of each."""
+        """Ranges of the parameters in the order of the blocks; `half` is half the width."""
         return tuple(each for block in self.blocks for each in block.ranges)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the blocks: the parameter's name, or the pattern of tied parameters."""
+        """Names of the blocks: the name of one parameter, or the pattern of tied parameters."""
         return tuple(block.name for block in self.blocks)
 
     def lft(self, q: Array | None = None) -> LFT:
@@ -77,9 +77,9 @@ class Uncertain:
         Raises
         ------
         InputError
-            If an output depends on accelerations or masses, or the point is not a fixed point for
-            all parameters. The point can depend on the parameters if there is gravity, an orbit,
-            stored momentum or a deflected spring.
+            If an output depends on accelerations or masses, or if the operating point is not a
+            fixed point for all values of the parameters. The operating point can depend on the
+            parameters because of gravity, an orbit, stored momentum or a deflected spring.
         """
         robot = self.robot
         lin = linearize(robot, q)
@@ -95,10 +95,11 @@ class Uncertain:
         return _lft(self, lin)
 
     def at(self, values: Mapping[str, float]) -> Robot:
-        """Return the robot with the parameters {parameter or pattern: value}.
+        """Return the robot with the given parameter values {parameter or pattern: value}.
 
-        Parameters that are not named keep their nominal values. For the pattern of tied parameters,
-        give their common value, or the common factor on their nominal values.
+        All other parameters keep their nominal values. Tied parameters are named by their pattern.
+        The value given for a pattern is their common value or, if their range is relative, the
+        factor that multiplies their nominal values.
 
         Raises
         ------
@@ -119,7 +120,7 @@ class Uncertain:
         return found
 
     def makes(self, delta: Array) -> bool:
-        """Return whether the deltas (k,) give a physically realisable robot."""
+        """Return whether the robot with the deltas (k,) is physically realisable."""
         return not self._refusal(delta)
 
     def _refusal(self, delta: Array) -> str:
@@ -128,9 +129,9 @@ class Uncertain:
         return self._variants.refusal({name: x for of in of_blocks for name, x in of.items()})
 
     def draws(self, n: int, *, seed: int = 0) -> tuple[Array, int]:
-        """Return deltas (n, k) drawn uniformly from the ranges, and the number of rejected draws.
+        """Return deltas (n, k) drawn uniformly from [-1, 1], and the number of rejected draws.
 
-        A draw is rejected if its robot is not physically realisable.
+        A draw is rejected if the robot with these deltas is not physically realisable.
         """
         count, draw = whole("n", n, 1), np.random.default_rng(whole("seed", seed, 0))
         found, lost = list[Array](), 0
@@ -148,7 +149,7 @@ class Uncertain:
         return np.array(found), lost
 
     def values(self, delta: Array) -> dict[str, float]:
-        """Return {name: value} for deltas (k,), the argument of `at`."""
+        """Return the parameter values {name: value} at deltas (k,), for use as argument of `at`."""
         pairs = zip(self.blocks, delta, strict=True)
         return {each.name: float(each.middle + each.half * d) for each, d in pairs}
 
@@ -165,25 +166,26 @@ class Uncertain:
         Returns
         -------
         list of Robot
-            Only physically realisable robots. A draw is repeated if the pseudo-inertia of a body
-            is not positive definite.
+            Robots that are all physically realisable. A draw is repeated if it gives a body whose
+            pseudo-inertia is not positive definite.
 
         Raises
         ------
         InputError
-            If almost no draw is physically realisable.
+            If almost none of the drawn robots is physically realisable.
         """
         return [self.at(self.values(delta)) for delta in self.draws(n, seed=seed)[0]]
 
     def worst(
-        self, gain: Any, q: Array | None = None, *, samples: int = 200, seed: int = 0
+        self, gain: object, q: Array | None = None, *, samples: int = 200, seed: int = 0
     ) -> Worst:
-        """Search the uncertainty set for the worst closed loop u = -K x, and bound the stable set.
+        """Search the ranges for the worst closed loop u = -K x.
 
-        The result is at least as bad as every corner and draw that was tried. The gains of the
-        worst case are accurate to five digits. With more samples and the same seed, the result is
-        at least as bad as with fewer samples, because the search first repeats the smaller
-        search.
+        The result also contains the central fraction of each range in which stability is
+        guaranteed. The worst loop is at least as bad as the loop at every tried corner of the
+        ranges and at every random draw. The reported gains of the worst loop are accurate to five
+        digits. With more samples and the same seed, the result cannot be better, because the search
+        first repeats the search with fewer samples.
 
         Parameters
         ----------
@@ -192,8 +194,8 @@ class Uncertain:
         q : array_like (nq,), optional
             Configuration, as in `lft`.
         samples : int
-            Number of random draws, tried after the corners of the set. A local search starts from
-            each loop that is worse than all loops before it.
+            Number of random draws from the ranges. They are tried after the corners. If a loop is
+            worse than all loops before it, a local search starts from this loop.
         seed : int
             The same seed gives the same draws.
 
@@ -204,29 +206,32 @@ class Uncertain:
         Raises
         ------
         InputError
-            If K has a wrong size, or the loop at the middle of the ranges is unstable, or `lft`
-            raises the error.
+            If K has a wrong size, the loop at the middle of the ranges is unstable, or `lft` raises
+            an `InputError` for this robot.
         """
         return searched(self, self.lft(q), gain, whole("samples", samples, 1), seed)
 
 
-def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
+def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     """Define the uncertain parameters of a robot and their ranges.
 
     Parameters
     ----------
     robot : Robot
     ranges : mapping
-        {parameter or pattern: range}, with the parameters of `sensitivity`. A range is one of
+        Ranges {parameter or pattern: range}, with the parameter names of `Sensitivity`. A range is
+        one of
 
-        - a number: the relative half width, such as 0.2 for 20 %;
-        - a pair: the least and the largest value;
-        - ``{"range": 0.2, "tied": True}`` for a pattern whose parameters are tied.
+        - a number: the relative half width, such as 0.2 for plus or minus 20 % of the nominal
+          value;
+        - a pair: the smallest and the largest value;
+        - for a pattern whose parameters vary together, one of these ranges with ``"tied": True``,
+          such as ``{"range": 0.2, "tied": True}``.
 
         Several parameters of a link may be given as ``{link: {"mass": .., "inertia.xx": ..}}``. By
-        default, each parameter of a pattern varies independently, with a separate delta. Tied
-        parameters share one delta. Tied parameters with a relative range are multiplied by a
-        common factor. Tied parameters with a pair have a common value.
+        default, the parameters that match a pattern vary independently. Tied parameters vary
+        together: if their range is relative, one factor multiplies all of them; if their range is a
+        pair, they all have the same value.
 
     Returns
     -------
@@ -241,14 +246,14 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
 
         - a range is empty, or relative to a nominal value of 0;
         - the robot at the middle of the ranges is not physically realisable;
-        - a mass, density, wheel inertia or frequency may become 0 or less;
-        - a stiffness or damping may become negative;
-        - a tied parameter is given a second range.
+        - the range of a mass, density, wheel inertia or frequency contains 0 or negative values;
+        - the range of a stiffness or damping contains negative values;
+        - a tied parameter has a second range.
 
     References
     ----------
-    P. M. Wensing, S. Kim and J.-J. E. Slotine, IEEE Robotics and Automation Letters 3(1), 2018, on
-    the physical realisability of an inertia.
+    For the physical realisability of an inertia, see P. M. Wensing, S. Kim and J.-J. E. Slotine,
+    IEEE Robotics and Automation Letters 3(1), 2018.
 
     Examples
     --------
@@ -279,7 +284,9 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     made = Uncertain(robot, (*alone.values(), *together), variants)
     _refuse_overlap(variants.pieces, made.ranges)
     if why := made._refusal(np.zeros(len(made.blocks))):
-        raise InputError(f"no robot exists at the middle of the ranges: {why}; give other ranges")
+        raise InputError(
+            f"the robot at the middle of the ranges is not valid: {why}; give other ranges"
+        )
     return made
 
 
@@ -287,8 +294,8 @@ def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> N
     names = [each.parameter.name for each in ranges]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(
-            f"'{twice[0]}' is tied to other parameters and also has another range; give only one "
-            "of the two"
+            f"'{twice[0]}' is tied to other parameters and also has a range of its own; give "
+            "only one of these ranges"
         )
     asked = {each.parameter.of for each in ranges} & pieces.keys()
     for name, other in permutations(asked, 2):
@@ -298,7 +305,7 @@ def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> N
             )
 
 
-def _range(one: Parameter, value: Any) -> Range:
+def _range(one: Parameter, value: object) -> Range:
     if one.part[:9] == "direction":
         said = (
             "rotates a unit vector, so that the model is not a rational function of it; use "
@@ -318,7 +325,7 @@ def _range(one: Parameter, value: Any) -> Range:
     expected = "" if least < largest else "least < largest"
     if least < 0.0 and one.part in ("stiffness", "damping"):
         expected = "values of 0 or more"
-    # The inertia is a wheel's.
+    # "inertia" without an entry is the inertia of a wheel.
     if least <= 0.0 and one.part in ("mass", "density", "inertia", "frequency"):
         expected = "values above 0"
     if expected:
@@ -330,7 +337,7 @@ def _range(one: Parameter, value: Any) -> Range:
 
 
 def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
-    """Return the block of parameters that have one delta."""
+    """Return the block of tied parameters, which have a common delta."""
     ranges = [_range(one, value) for one in parameters]
     units = {one.unit for one in parameters}
     if isinstance(value, tuple | list):
@@ -342,7 +349,7 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
     relative = abs(float(value))
-    # Of what is below 0 too, more is further from 0.
+    # A relative half width has the sign of the nominal value: delta > 0 increases the magnitude.
     scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
     return Block(key, "1", 1.0, relative, tuple(scaled))
 

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 SCENES = ("space", "lab")
 
-# A picture with its panel, and one of several without.
+# Sizes [px] of a picture with its panel, of a picture in a strip, and of a GIF.
 _PICTURE, _STRIP, _GIF = (1280, 720), (640, 480), (640, 400)
 
-# A motion that takes longer than this to watch is shown faster.
+# Longest duration of an animation [s]; longer motions are shown faster.
 _LONGEST = 60.0
 
 
@@ -55,57 +55,63 @@ def visualize(
 ) -> Live | Path | None:
     """Show a robot live, or write a motion of a robot to one HTML file for offline use.
 
-    The page of a motion shows:
+    The page of a motion shows
 
-    - the robot in its colours, with triads at base and tool;
-    - the trails of the tool and of the centre of mass;
-    - arrows of force and torque on the base, thrusters, plumes with lengths proportional to u(t),
-      and wheels at their frames;
+    - the robot in its colours, with axes at base and tool;
+    - the paths of the tool and of the centre of mass;
+    - arrows for force and torque on the base;
+    - thrusters, with plumes whose lengths are proportional to u(t), and wheels at their frames;
     - a translucent robot at the target, and another translucent robot at the linear prediction;
-    - a time slider, views of the camera, and a panel with errors and inputs over time. A click
-      enlarges a chart, and a click on a link shows the link's mass and pose.
+    - a time slider, camera views, and a panel with charts of errors and inputs over time.
 
-    Along a trajectory, a translucent robot moves with the reference. Dashed lines are the reference
-    paths of base and tool; pale curves are the reference joint positions. A dotted line marks the
-    time at which the reference comes to rest. Every body is a node ``meshcat/robot/JOINT`` of
-    meshcat's scene, at the pose of the joint's frame.
+    A click on a chart enlarges it, and a click on a link shows the link's mass and pose.
+
+    If the robot follows a trajectory, a translucent robot moves with the reference, dashed lines
+    show the reference paths of base and tool, and pale curves show the reference joint positions. A
+    dotted line marks the time at which the reference comes to rest.
+
+    For scripts that change meshcat's scene: every body is the node ``meshcat/robot/JOINT``, at the
+    pose of the joint's frame.
 
     Parameters
     ----------
     robot : Robot
         Robot to show.
     motion : Motion or Modes, optional
-        Motion from `simulate` or `Campaign.replay`, or modes from `modes`. The page lists modes by
-        name and frequency, and animates one of them. Without a motion or modes, a live page shows
-        the robot with a slider for each joint.
+        Motion from `simulate` or `Campaign.replay`, or modes from `modes`. For modes, the page
+        lists their names and frequencies, and animates one of them. If `motion` is omitted, a live
+        page shows the robot with a slider for each joint.
     html : path, optional
-        File to write; a temporary one by default.
+        HTML file to write; a temporary file by default.
     png, gif : path, optional
         Files for a picture (.png) and an animation (.gif); both need Chromium.
     times : sequence of float, optional
-        Times [s] of the pictures, four by default. With one time, the picture shows one image
-        with its panel. With several times, the picture is a strip of images.
+        Times [s] of the images in the picture `png`; four times by default. With one time, the
+        picture shows one image with its panel. With several times, the picture is a strip of
+        images.
     open : bool, optional
-        Whether to open a browser. By default a browser is opened if no file is given.
+        Whether to open a browser. By default, a browser is opened if no output file is given.
     scene : {"space", "lab"}, optional
-        "space" shows sky and planet; "lab" shows a floor with a grid, the default under gravity. In
-        orbit the planet is the central body, below and in its true size. The planet and
-        the stars rotate with the orbital motion; the sunlight keeps its direction in the view.
+        "space" shows stars and a planet. "lab" shows a floor with a grid, and is the default under
+        gravity. In orbit, the planet is the central body, below the robot and in its true size. The
+        planet and the stars rotate with the orbital motion, but the sunlight keeps its direction in
+        the view.
     fps : float
         Frames per second of playback.
     speed : float, optional
-        Seconds of motion per second of playback; by default 1, or more for motions longer than a
-        minute. A live simulation is slowed down to this speed.
+        Seconds of motion per second of playback. The default is 1, or more for motions longer than
+        a minute. A live simulation is slowed down to this speed.
     follow : bool, optional
-        Whether the camera follows the base; by default only for paths so long that the robot
-        would appear as a dot.
+        Whether the camera follows the base. By default, the camera follows only if the path is so
+        long that the robot would otherwise appear as a dot.
     target : array_like (nq,), optional
-        Configuration from which errors are measured; by default the motion's target. Without a
+        Configuration from which errors are measured; by default the motion's target. If there is no
         target, the page shows the change from the start, and no translucent robot.
     tool : str, optional
-        Frame whose trail is drawn; by default "tool", or the last link of the longest chain.
+        Frame whose path is drawn; by default "tool", or the last link of the longest chain.
     q : array_like (nq,), optional
-        Initial configuration of a live robot; by default its `start`, or neutral.
+        Initial configuration of a live robot; by default the robot's `start`, or the neutral
+        configuration.
     port : int
         Port of the live page; a free port by default.
     frame : {"lvlh", "hill"}, optional
@@ -114,20 +120,23 @@ def visualize(
     Returns
     -------
     Live, Path or None
-        Live page, or path of the HTML file; None if only pictures were requested.
+        The live page, or the path of the HTML file; None if only pictures were requested.
 
     Raises
     ------
     InputError
-        If the motion or modes belong to another robot or a reduced model, or no mode oscillates.
-        The error is also raised if pictures of modes are requested, a value is invalid, or the
-        port is in use.
+        If one of these conditions is true:
+
+        - the motion or modes belong to another robot, or the modes to a reduced model;
+        - no mode oscillates;
+        - `png` or `gif` is given for modes, which have no pictures;
+        - an argument is invalid, or the port is in use.
     FileError
         If a file cannot be written. Files are written atomically.
     UnknownNameError
         If the frame `tool` is unknown.
     MissingPackageError
-        If a picture is requested and Chromium is not installed.
+        If a picture is requested, but Chromium is not installed.
 
     Warns
     -----
@@ -154,7 +163,8 @@ def visualize(
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
             raise InputError(
-                "a file is named but no motion is given; give one, as fflin.simulate returns it"
+                "a file is named but no motion is given; give a motion, as fflin.simulate "
+                "returns it"
             )
         port = whole("port", port, 0, 2**16 - 1)
         start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
@@ -173,7 +183,9 @@ def visualize(
     contents: dict[Path, bytes] = {}
     if isinstance(motion, Modes):
         if {*outputs} - {".html"}:
-            raise InputError("png or gif is given with modes, which have no pictures; give html=")
+            raise InputError(
+                "png or gif is given, but modes can be shown only in an HTML page; give html="
+            )
         from fflin.view.mode_page import mode_page
 
         page, notes = mode_page(robot, motion, scene=scene, tool=tool)
@@ -206,7 +218,7 @@ def _temporary(name: str) -> Path:
 
 
 def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, Path]:
-    """Return {ending: path} of the files that are named, or raise where one cannot be written."""
+    """Return {ending: path} of the given files, or raise an error if one cannot be written."""
     outputs = {}
     for ending, file in files.items():
         if file is None:
@@ -225,13 +237,13 @@ def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, 
 
 
 def check_tool(robot: Robot, tool: str | None) -> None:
-    """Raise UnknownNameError where there is no such frame."""
+    """Raise `UnknownNameError` if the robot has no frame `tool`."""
     if tool is not None:
         find_frame(robot.model, tool)
 
 
 def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float, float]:
-    """Return frames per second and speed, one that suits the duration [s] where it is None."""
+    """Return the checked fps and speed; for speed=None, a speed that suits the duration [s]."""
     fps = number("fps", fps)
     if not 0.0 < fps <= 240.0:
         raise InputError(f"fps is {fps:g}, expected more than 0 and at most 240")
@@ -271,7 +283,7 @@ def _configuration(robot: Robot, name: str, value: Array) -> Array:
 
 
 def check_times(times: Sequence[float], start: float, end: float) -> list[float]:
-    """Return the times [s] of pictures, or raise where one is not in the motion."""
+    """Return the times [s] of pictures, or raise an error if one is outside the motion."""
     times = [number("a time", time) for time in times]
     if not times or not all(start <= time <= end for time in times):
         raise InputError(f"times are {times}, expected times from {start:g} to {end:g} s")
@@ -287,9 +299,9 @@ def _pictures(
 
     start, end = float(motion.t[0]), float(motion.t[-1])
     if times is None:
-        # What settles moves most at first, what follows a trajectory all the time.
-        shares = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
-        times = [start + share * (end - start) for share in shares]
+        # A motion that settles is fastest at the beginning; tracking moves all the time.
+        fractions = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
+        times = [start + fraction * (end - start) for fraction in fractions]
     times = check_times(times, start, end)
     contents = {}
     with tempfile.TemporaryDirectory(prefix="fflin-") as folder:

@@ -10,6 +10,7 @@ from fflin.campaign.funnel import ellipsoid_axes, runs_from
 from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.state import StateMap
 from tests.support.commands import refused, run
+from tests.support.messages import says
 
 OUTCOME, DURATION = {"within": 0, "lost": 1, "beyond": 2, "missed": 3}, 12.0
 
@@ -203,7 +204,7 @@ def test_sizes_and_contains(arm, found):
 
 
 def test_it_prints_saves_and_is_drawn(arm, found, tmp_path):
-    assert max(map(len, str(found).splitlines())) <= 80 and "95 % confidence" in str(found)
+    assert max(map(len, str(found).splitlines())) <= 80 and says(str(found), "95 % confidence")
     assert len(found.rate) == 3 and (found.rate[:, 0] <= found.rate[:, 1]).all()
     for ending in ("npz", "json", "mat"):
         found.save(tmp_path / f"a.{ending}")

@@ -20,7 +20,7 @@ import fflin
 from fflin.campaign.report import influences, worst_runs
 from fflin.campaign.runs import ARRAYS, CampaignJob
 from fflin.campaign.statistics import KINDS
-from fflin.simulation.report import courses
+from fflin.simulation.report import error_histories
 from tests.support.campaigns import both
 from tests.support.measured import FELT, POSITIONS, designed
 from tests.support.messages import any_wording, says
@@ -519,7 +519,7 @@ def test_the_time_to_settle_is_that_of_the_motions_table(robots):
     )
     for run in range(3):
         motion = campaign.replay(run)
-        made = {course.title: course for course in courses(motion)}
+        made = {each.title: each for each in error_histories(motion)}
         # A motion and a campaign call the kinds of error by the same names.
         assert [*made] == [*KINDS]
         for title, course in made.items():
@@ -702,14 +702,20 @@ def test_a_file_of_anything_else_is_replaced_only_on_request(ending, robots, tmp
     foreign = b"notes", (tmp_path / "other.npz").read_bytes()
     for content in foreign:
         path.write_bytes(content)
-        with pytest.raises(fflin.FileError, match="did not make it"), monkeypatch.context() as no:
+        with (
+            pytest.raises(fflin.FileError, match="was not written by this call"),
+            monkeypatch.context() as no,
+        ):
             no.setattr("fflin.campaign.monte_carlo.run_chunks", None)  # the runs
             fly()
         assert path.read_bytes() == content and len(list(tmp_path.iterdir())) == 2
     first = fly(overwrite=True)
     before = path.read_bytes()
     for changes in ({"seed": 1}, {"runs": 3}, {"duration": 0.2}, {"until": "end > 0", "seed": 1}):
-        with pytest.raises(fflin.FileError, match="did not make it"), monkeypatch.context() as no:
+        with (
+            pytest.raises(fflin.FileError, match="was not written by this call"),
+            monkeypatch.context() as no,
+        ):
             no.setattr("fflin.campaign.monte_carlo.run_chunks", None)  # the runs
             fly(**changes)
         assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 2
@@ -746,7 +752,7 @@ def test_a_file_of_another_policy_or_robot_is_refused_before_compiling(
         {"seed": 1},
         {"histories": 3},
     ):
-        with pytest.raises(fflin.FileError, match="did not make it"):
+        with pytest.raises(fflin.FileError, match="was not written by this call"):
             fly(**changes)
         assert path.read_bytes() == before
     assert np.array_equal(fly().x, first.x)

@@ -189,7 +189,7 @@ def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(3), 0.0, 0.4, 0.0)
     job = settling_runs(loop, False, None, 0.0)
-    job.rule.checked_every, times, e = 1, job.plan.times, x - lin.x0
+    times, e = job.plan.times, x - lin.x0
     step, sizes = expm(loop.rate * times.dt), []
     for _ in range(times.steps):
         sizes.append(loop.size(e))
@@ -197,7 +197,7 @@ def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
     settles = next(k for k, size in enumerate(sizes) if size <= 1e-3 * sizes[0])
     for steps, outcome in ((settles, 1.0), (settles - 1, 0.0)):
         job.plan = replace(job.plan, times=times._replace(steps=steps))
-        assert job.run(Draws((x - lin.x0)[None], np.zeros(1)), 0).arrays["outcome"] == [outcome]
+        assert job.run(Draws((x - lin.x0)[None]), 0).arrays["outcome"] == [outcome]
 
 
 @pytest.mark.compiled

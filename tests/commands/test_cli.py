@@ -698,3 +698,5 @@ def test_an_unknown_option_is_answered_with_the_help_of_its_command():
     assert err == (
         "fflin: error: unrecognized arguments: --target-joint a=0.3 (see fflin lqr --help)\n"
     )
+    _, _, err = run("lqr", "cubesat", "--brison", "q_b=0.1")
+    assert says(err, "--brison", "did you mean --bryson?")

@@ -29,3 +29,17 @@ def test_other_files_are_refused(tmp_path):
     assert "not a Gain" in refused("export", tmp_path / "model.npz", "-o", tmp_path / "c")
     assert "No such file" in refused("export", tmp_path / "none.npz", "-o", tmp_path / "c")
     assert not (tmp_path / "c").exists()
+
+
+@needs_compiler
+def test_a_gain_with_allocated_thrusters_is_written_for_the_wrench(tmp_path):
+    robot, gain = "servicer_7dof.toml", tmp_path / "gain.npz"
+    assert run("lqr", robot, "-o", gain)[0] == 0
+    assert fflin.Gain.load(gain).input_names[0] == "tau_b.x"
+    options = ("--robot", robot, "--limits", "urdf")
+    code, out, _ = run("export", gain, *options, "-o", tmp_path / "c")
+    assert code == 0 and "_test.c" in out
+    assert outcome(tmp_path / "c", COMPILERS[0])[0] == 0
+    header = (tmp_path / "c" / "controller.h").read_text()
+    assert all(name in header for name in ("tau_b.x", "F_b.z", "tau_m.joint_7"))
+    assert "back_left_top" not in header

@@ -75,7 +75,7 @@ def test_what_is_wrong_is_one_line(tmp_path):
     assert "NAME=FRACTION" in refused(*vary, "base.mass")
     assert "NAME=FRACTION" in refused(*vary, "base.mass=1:2:3")
     assert "least < largest" in refused(*vary, "base.mass=3:2")
-    assert "two values" in refused(*vary, "base.mass=0.1", "--vary", "base.mass=0.2")
+    assert "more than once" in refused(*vary, "base.mass=0.1", "--vary", "base.mass=0.2")
     assert "--vary" in refused("uncertain", "cubesat")
     assert "base.mass" in refused(*vary, "base.mass=-3:1", "-o", tmp_path / "u.mat")
     assert "0.2 for 20 %" in refused(*vary, "base.mass=20", "-o", tmp_path / "u.mat")

@@ -56,13 +56,25 @@ def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots)
     assert said["quantiles"]["attitude"]["0.99"][2] is None  # of 30 runs there is no bound
 
 
+def test_tables_are_those_of_the_campaign(folder):
+    command = ("montecarlo", "planar_detumble", *SHORT, "--runs", 6)
+    assert run(*command, "-o", "runs.npz", cwd=folder)[0] == 0
+    fflin.Campaign.load(folder / "runs.npz").save(folder / "runs.csv")
+    (folder / "u.csv").write_text("of another program")
+    assert says(refused(*command, "-o", "u.csv", cwd=folder), "u.csv already exists", "--force")
+    assert (folder / "u.csv").read_text() == "of another program"
+    code, out, _ = run(*command, "-o", "u.csv", "--force", cwd=folder)
+    assert code == 0 and "wrote u.csv" in out
+    assert (folder / "u.csv").read_text() == (folder / "runs.csv").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (("--runs", "0"), "--runs"),
         (("--runs", "1000000000000"), "1,000,000,000,000 rows.*memory"),
         (("--runs", "1000000000000", "-o", "x.h5"), "x.h5 needs .*free"),
-        (("--runs", "3", "-o", "x.csv"), "x.csv"),
+        (("--runs", "3", "-o", "x.json"), "x.json"),
         (("--runs", "3", "--goal", "attitude < 1 m"), "deg"),
         (("--runs", "3", "--until", "nosuch < 1"), "'nosuch'"),
         (("--runs", "3", "--plot", "x.gif"), "x.gif"),
@@ -95,7 +107,7 @@ def test_noise_has_a_report_and_another_campaign_is_replaced_by_force(folder, mo
     assert (code, error) == (0, "")
     before = (folder / "c.npz").read_bytes()
     code, _, error = run(*command, "--seed", "1")
-    assert code == 2 and "did not make it" in error and "--force" in error
+    assert code == 2 and "was not written by this call" in error and "--force" in error
     assert (folder / "c.npz").read_bytes() == before
     code, _, error = run(*command, "--seed", "1", "--force")
     assert (code, error) == (0, "")

@@ -46,6 +46,21 @@ def test_an_equilibrium_has_its_inputs_and_its_stability(tmp_path):
     assert "--effort" in refused("equilibrium", ROBOT, "--effort", "tau_m.joint_1=1")
 
 
+def test_an_equilibrium_beyond_the_limits_is_told():
+    heavy = ("equilibrium", "servicer_7dof", "--gravity", 0, 0, -9.81)
+    said = json.loads(run(*heavy, "--json")[1])
+    robot = fflin.load("servicer_7dof", gravity=(0.0, 0.0, -9.81))
+    u = fflin.equilibrium(robot).u
+    limits = fflin.linearize(robot).limits
+    names = fflin.linearize(robot).input_names
+    pairs = zip(names, np.abs(u), strict=True)
+    expected = [name for name, size in pairs if size > limits.get(name, np.inf)]
+    assert expected and set(said["beyond_limits"]) == set(expected)
+    assert f"beyond their limits: {said['beyond_limits'][0]}" in run(*heavy)[1]
+    light = run("equilibrium", "servicer_7dof", "--json")[1]
+    assert json.loads(light)["beyond_limits"] == []
+
+
 def test_predictive_control_keeps_the_limits(tmp_path):
     command = ("simulate", ROBOT, "--joint", "joint_1=0.3", "--duration", 4, "--dt", 0.05)
     mpc = ("--mpc", "--sample", 0.2, "--horizon", 10, "--limit", "tau_m=0.1")

@@ -1,5 +1,6 @@
 """fflin lqr."""
 
+import json
 import re
 import warnings
 
@@ -151,11 +152,44 @@ def test_the_speeds_of_wheels_are_chosen_and_weighed(capsys, tmp_path):
 def test_thrusters_that_are_to_pull_are_warned_of_where_they_are_designed_with(capsys):
     with warnings.catch_warnings():
         warnings.simplefilter("always", fflin.FflinWarning)
-        code, out, err = run(capsys, "cubesat", "--inputs", "cubesat")
-        assert code == 0 and "pull" not in out
-        assert says(err, "fflin: warning: ", "pull", "x_plus_top")
+        code, out, err = run(capsys, "cubesat", "--inputs", "cubesat", "--no-allocate")
+        assert code == 0 and "negative thrust" not in out
+        assert says(err, "fflin: warning: ", "negative thrust", "x_plus_top")
         code, out, err = run(capsys, "cubesat")
-        assert (code, err) == (0, "") and "pull" not in out
+        assert (code, err) == (0, "") and "negative thrust" not in out
+
+
+def test_the_loop_that_lqr_reports_is_the_loop_that_is_simulated(capsys, tmp_path):
+    path, other = tmp_path / "gain.npz", tmp_path / "thrusts.npz"
+    robot = ("cubesat", "--inputs", "cubesat")
+    code, out, err = run(capsys, *robot, "-o", str(path))
+    assert (code, err) == (0, "") and "--no-allocate" in out
+    gain = fflin.Gain.load(path)
+    assert gain.input_names[:6] == tuple(f"{x}.{axis}" for x in ("tau_b", "F_b") for axis in "xyz")
+    runs = []
+    for options in ((), ("--gain", str(path))):
+        told = ("simulate", *robot, "--rpy", "5", "0", "0", "--duration", "2", *options)
+        assert main([*told, "-o", str(tmp_path / "run.npz"), "--force"]) == 0
+        runs.append(fflin.Motion.load(tmp_path / "run.npz"))
+    assert (runs[0].u == runs[1].u).all() and (runs[0].u[:, :12] >= 0.0).all()
+    assert runs[0].u[:, :12].max() > 1e-4
+    # The thrusters themselves are weighted only if they are to be commanded one by one.
+    code, _, err = run(capsys, *robot, "--r", "thrust=1")
+    assert code == 2 and says(err, "no input named 'thrust'", "--no-allocate")
+    assert run(capsys, *robot, "--r", "thrust=1", "--no-allocate", "-o", str(other))[0] == 0
+    assert fflin.Gain.load(other).input_names[0] == "x_plus_top"
+
+
+def test_margins_and_allocation_are_in_json(capsys):
+    assert main(["lqr", "cubesat", "--inputs", "cubesat", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    wheels = [each for each in robot.inputs if isinstance(each, fflin.ReactionWheel)]
+    design = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce(), *wheels])
+    margins = fflin.lqr(fflin.linearize(design)).margins
+    assert found["allocated"] is True
+    assert found["margins"]["disk"] == pytest.approx(margins.disk, rel=1e-9)
+    assert found["margins"]["gain"] == pytest.approx(margins.gain, rel=1e-9)
 
 
 def test_what_the_limits_cannot_hold_in_gravity_is_said_and_not_refused(capsys):

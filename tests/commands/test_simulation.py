@@ -85,7 +85,7 @@ def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
         assert motion.attitude_error[0] == pytest.approx(20.0)
         assert motion.attitude_error[-1] < 0.1
         settled.append(motion.t[motion.attitude_error > 0.4].max())
-        assert says(done.stderr, "pull", "cut at zero") if option else not done.stderr
+        assert says(done.stderr, "negative thrust", "cut at zero") if option else not done.stderr
     # Half of what the thrusters were to give was cut; the wheels gave their part.
     assert settled[1] < 0.85 * settled[0]
     assert "--allocate" in refused("simulate", "ets_vii", "--allocate")

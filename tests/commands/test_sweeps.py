@@ -22,7 +22,7 @@ def test_grid_random_and_file_say_the_same(tmp_path, robots):
         *("--joint", "joint_1=0.2", "-o", tmp_path / "g.h5"),
     )
     assert code == 0 and says(out, "g.h5", "6 points, 24 states, 12 inputs")
-    assert re.match(r"fflin: 6 points of 'ets_vii', [\d.]+ kB to .*g\.h5\n", err)
+    assert re.match(r"fflin: linearising 'ets_vii' about 6 points; .*g\.h5 takes [\d.]+ kB\n", err)
     batch = fflin.LinearBatch.load(tmp_path / "g.h5", robot)
     assert batch.joint_positions[:, :4] == pytest.approx(
         np.array([[0.2, a, 0.0, b] for a in (-1.0, 0.0, 1.0) for b in (-2.0, 0.0)])

@@ -86,7 +86,7 @@ def test_a_box_of_thrusters_has_the_force_and_torque_of_its_pairs():
     robot = fflin.load("cubesat", inputs=nozzles)
     # A force needs one pair, which gives 4 N; so does a torque, of 2 N m.
     report = thrusters_at(robot, tilted(robot), np.zeros(3))
-    assert "least 4 N without" in report and "2 N m without" in report
+    assert "least 4 N\n  without" in report and "2 N m without" in report
     # It is the centre of mass that counts.
     center = np.array([0.2, -0.3, 0.1])
     moved = [replace(each, position=tuple(each.position + center)) for each in nozzles]
@@ -94,7 +94,8 @@ def test_a_box_of_thrusters_has_the_force_and_torque_of_its_pairs():
     assert thrusters_at(moved, moved.neutral(), center) == report
     assert thrusters_at(moved, moved.neutral(), np.zeros(3)) != report
     few = robot.replace(inputs=nozzles[:-1])
-    assert "not push every way" in thrusters_at(few, few.neutral(), np.zeros(3))
+    said = thrusters_at(few, few.neutral(), np.zeros(3))
+    assert "cannot produce a force and a torque in every direction" in said
     free = robot.replace(inputs=[fflin.Thruster("base", x.position, x.direction) for x in nozzles])
     assert "limit" in thrusters_at(free, free.neutral(), np.zeros(3))
 

@@ -226,7 +226,9 @@ def test_a_point_that_asks_for_more_than_the_limits_is_told(loops):
     asked = dict(zip(lin.input_names, np.abs(lin.u0), strict=True))
     beyond = [name for name in asked if asked[name] > lin.limits.get(name, np.inf)]
     said = fflin.lqr(lin).weights
-    words = f"; already at or beyond the URDF limit at the operating point: {', '.join(beyond)}"
+    words = (
+        f"; inputs already at or beyond the URDF limit at the operating point: {', '.join(beyond)}"
+    )
     assert beyond and said.endswith(words)
 
 
@@ -508,7 +510,7 @@ def test_largest_values_of_all_are_brysons_rule_and_of_some_are_on_its_scale(loo
     Q, R, _, rule = rule_weights(lin, None, {"bryson": {"q_b": own}})
     scale = R[0, 0] / gain.R[0, 0]
     assert scale * np.exp(np.log(gain.Q.diagonal()[:3]).mean()) == pytest.approx(own**-2, rel=1e-9)
-    assert R == pytest.approx(scale * gain.R, rel=1e-12) and rule.endswith("with this rule alone)")
+    assert R == pytest.approx(scale * gain.R, rel=1e-12) and rule.endswith("for this rule alone)")
     # The tighter one is held, the more of every input it takes.
     norms = []
     for size in (own, 0.1 * own, 0.01 * own):
@@ -528,8 +530,8 @@ def test_a_gain_says_which_thrusters_it_lets_pull():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     gain = fflin.lqr(fflin.linearize(robot))
     thrusters = [each.name for each in robot.inputs if isinstance(each, fflin.Thruster)]
-    assert f"pull ({', '.join(thrusters[:6])}" in one_sided(gain)
-    assert "warning: the design requires thrusters to pull" in str(gain)
+    assert f"negative thrust ({', '.join(thrusters[:6])}" in one_sided(gain)
+    assert "warning: the gain commands negative thrust" in str(gain)
     assert not one_sided(fflin.lqr(fflin.linearize(fflin.load("cubesat"))))
     pushing = replace(gain, u0=np.ones_like(gain.u0))
     assert not one_sided(pushing)

@@ -348,7 +348,7 @@ def test_a_gain_prints_in_80_columns(gain, lin):
         assert max(map(len, text.splitlines())) <= 80
         rates = np.log(each.poles) / each.dt if each.dt else each.poles
         assert f"{each.residual:.1e}" in text and f"decay {-rates.real.max():.3g} 1/s" in text
-    assert "save() writes every entry" in str(gain) and "qdot_m.joint_3" in str(small)
+    assert "writes every entry" in str(gain) and "qdot_m.joint_3" in str(small)
 
 
 def test_a_motion_that_is_not_steady_is_sent_to_its_trajectory():

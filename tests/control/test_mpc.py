@@ -181,7 +181,7 @@ def test_what_cannot_be_kept_is_passed_by_the_least(servicer):
     assert price @ excess[m.soft] == pytest.approx(least.fun, rel=0.02)
     ahead = Receding(policy.horizon)
     ahead.step(0.0, e)
-    assert says(ahead.notes[0], "1 plans of 12 samples of 0.1 s", "qdot_m.joint")
+    assert says(ahead.notes[0], "each of 12 samples of 0.1 s: 1", "qdot_m.joint")
 
 
 def test_what_the_robot_passes_is_said_though_no_plan_does(servicer):
@@ -197,7 +197,7 @@ def test_what_the_robot_passes_is_said_though_no_plan_does(servicer):
         over = (sampled > 0.1 + 2e-4).any(axis=1)
         assert over.any() == passes == ("robot" in motion.notes[0])
         if passes:
-            assert f"{over[:-1].sum()} samples" in motion.notes[0]
+            assert f"exceeds a soft limit: {over[:-1].sum()} (" in motion.notes[0]
             assert f" by {sampled[:-1].max() - 0.1:.2g} at " in motion.notes[0]
 
 
@@ -216,8 +216,8 @@ def test_slews_that_break_the_regulator_are_held(servicer):
     assert flown.attitude_error[-1] < 2.0 and swung.attitude_error[-1] > 10.0
     joints = [np.abs(each.error[:, 6:15]).max(axis=0) for each in (flown, swung)]
     assert joints[0].max() < 0.5 and joints[1].max() > 3.0 and flown.saturated
-    assert says(flown.notes[-1], "240 plans of 20 samples of 0.25 s")
-    assert "240 plans of 20 samples" in motion_report(flown)
+    assert says(flown.notes[-1], "each of 20 samples of 0.25 s: 240")
+    assert says(motion_report(flown), "each of 20 samples of 0.25 s: 240")
     # The same again, to the last bit.
     again = fflin.simulate(robot, policy, **options)
     assert (again.u == flown.u).all() and (again.q == flown.q).all()
@@ -343,7 +343,7 @@ def test_campaigns_fly_it_and_the_compiled_loop_says_why_not(servicer):
     options = {"duration": 2.0, "dt": 0.05, "limits": ["urdf", WEAK]}
     campaign = fflin.monte_carlo(robot, policy, {"q_b": 0.05, "*.mass": 0.05}, runs=3, **options)
     again = campaign.replay(1)
-    assert len(campaign) == 3 and "8 plans of 8 samples" in again.notes[-1]
+    assert len(campaign) == 3 and "each of 8 samples of 0.25 s: 8" in again.notes[-1]
     with pytest.raises(fflin.InputError, match="Mpc"):
         fflin.simulate(robot, policy, engine="compiled", **options)
     with pytest.raises(fflin.InputError, match="`sample`"):

@@ -57,7 +57,8 @@ def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_pat
     compiled.compile("long")
     assert signatures == ["double", "long"]
     assert [record.message for record in caplog.records] == [
-        f"fflin: compiling the batch kernel once; the code is stored in {tmp_path}"
+        f"fflin: compiling the batch kernel; this happens only once, because the "
+        f"code is stored in {tmp_path}"
     ]
 
 

@@ -177,7 +177,7 @@ def test_passive_joints_relax_on_their_springs():
     expected = {"joint_2": 0.4, "panel_left": 0.2}
     assert np.array_equal(held.q[:7], q[:7]) and not held.u.any()
     assert at == pytest.approx([expected.get(n, 0.0) for n in robot.joint_names], abs=1e-15)
-    assert str(held) == "u: all zero\nsags: panel_left = -1e-06 rad, panel_right = -0.3 rad"
+    assert str(held) == "u: all zero\ndeflections: panel_left = -1e-06 rad, panel_right = -0.3 rad"
     fflin.lqr(fflin.linearize(robot, held.q, u=held.u))
     again = fflin.equilibrium(robot, held.q)
     assert again.q == pytest.approx(held.q, abs=1e-15) and str(again) == "u: all zero"
@@ -233,7 +233,7 @@ def test_in_orbit_panels_sag_against_the_gradient():
     for reference in (None, random_pose(np.random.default_rng(5), 40.0)):
         q = fflin.configuration(robot, base=turned)
         held = fflin.equilibrium(robot, q, reference=reference)
-        assert 1e-9 < np.abs(held.sag).max() < 1e-4 and "sags: panel_left = " in str(held)
+        assert 1e-9 < np.abs(held.sag).max() < 1e-4 and "deflections: panel_left = " in str(held)
         lin = fflin.linearize(robot, held.q, u=held.u, reference=reference)
         assert lin.is_equilibrium(1e-12)
         # The spring's torque on a panel is that of the gradient.

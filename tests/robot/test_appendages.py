@@ -317,7 +317,10 @@ def test_wheels_and_modes_keep_each_other():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"frequency": [0.5, -0.1]}, "mode 2 of flexible appendage 'base' has -0.1 Hz"),
+        (
+            {"frequency": [0.5, -0.1]},
+            "mode 2 of flexible appendage 'base' has the frequency -0.1 Hz",
+        ),
         ({"frequency": [0.5, 0.0]}, "mode 2"),
         ({"damping": [0.1, 1.5]}, "mode 2"),
         ({"damping": [0.1, 0.1, 0.1]}, "shape"),
@@ -360,7 +363,7 @@ def test_what_the_link_cannot_have_is_refused():
     robot = hub_with_rod(1.0, 0.1, 1.0, 1.0)
     heavy = fflin.FlexibleAppendage("root_joint", [1.0, 2.0], [[0, 0], [0, 0], [0.5, 1.5]],
                                     np.zeros((3, 2)), name="array")  # fmt: skip
-    with pytest.raises(InputError, match="'array_mode_2' has more participation"):
+    with pytest.raises(InputError, match="modes up to 'array_mode_2' exceed the inertia"):
         robot.replace(appendages=[heavy])
     liquid = fflin.Slosh("root_joint", 2.5, (0, 0, 0), frequency=0.1)
     with pytest.raises(InputError, match="'root_joint_slosh_x'"):
@@ -402,7 +405,7 @@ def test_slosh_and_modes_must_leave_mass_to_a_body():
     robot = hub_with_rod(9.0, 1.0, 1.0, 1.0)
     all_liquid = fflin.Slosh("root_joint", 10.0, (0.05, 0, 0), frequency=0.1, name="tank")
     along = fflin.FlexibleAppendage("root_joint", 1.0, [[0.0], [0.0], [1.0]], np.zeros((3, 1)))
-    with pytest.raises(InputError, match=r"leaves it|more participation"):
+    with pytest.raises(InputError, match=r"without the sloshing liquid|exceed the inertia"):
         robot.replace(appendages=[all_liquid, along])
 
 

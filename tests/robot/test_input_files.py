@@ -85,7 +85,7 @@ def test_example_of_the_docstring(written):
 
     text = fflin.load_inputs.__doc__
     body = re.search(r"content ::\n\n(.*?)\n\n +gives", text, re.DOTALL)[1]
-    shown = re.search(r"gives ``(.*?)``", text)[1]
+    shown = re.search(r"gives the inputs\s+``(.*?)``", text)[1]
     assert fflin.load_inputs(written(dedent(body))) == eval(shown, vars(fflin) | {})
 
 

@@ -67,7 +67,7 @@ def test_the_headline_names_the_rates_that_the_table_calls_unsettled():
     x[:, at] = 1e-3
     headline = " ".join(motion_report(replace(motion, x=x)).split("ets_vii:")[0].split())
     assert headline.startswith("positions settled after 7.83")
-    assert says(headline, "not yet: omega_b 0.001 rad/s") and "joint rates" not in headline
+    assert says(headline, "not yet settled: omega_b 0.001 rad/s") and "joint rates" not in headline
     assert cells(replace(motion, x=x), "omega_b")[-2:] == ["not", "yet"]
     # A rate that is not fed back never settles, and its row says so.
     loose = replace(motion, x=x, steered=("q_b.x", "q_m.joint_1"))
@@ -165,6 +165,16 @@ def test_wheels_are_no_joints():
     assert "joint" not in report
     assert cells(motion, "wheel speeds") == ["rad/s", "3", "3", "3", "not", "yet"]
     assert first(motion).startswith("settled") and says(first(motion), "target")
+
+
+def test_a_base_that_no_force_pushes_is_off_its_target_by_a_figure():
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat")[-3:])  # wheels
+    lin = fflin.linearize(robot)
+    x0 = np.zeros(len(lin.x0))
+    x0[3] = 1.0
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    said = motion_report(fflin.simulate(robot, policy, x0=x0, duration=1.0))
+    assert says(said, "settled: attitude at the target", "not controlled: position 1 m;")
 
 
 def test_lengths_and_angles_of_joints_have_rows_of_their_own():

@@ -408,7 +408,7 @@ def test_csv_has_names_and_rows(tmp_path):
         ({"duration": 1.0, "limits": -2.0}, "'tau_b'"),
         ({"duration": 1.0, "limits": {"tau_b": (1.0, -1.0)}}, "least, largest"),
         ({"duration": 1.0, "x0": np.zeros(5)}, "x"),
-        ({"duration": 1.0, "x0": np.zeros(24), "v0": np.zeros(12)}, "x0 alone"),
+        ({"duration": 1.0, "x0": np.zeros(24), "v0": np.zeros(12)}, "either x0"),
         ({"duration": 1.0, "every": 0}, "every"),
         ({"duration": 1.0, "events": [3]}, "function"),
         ({"duration": 1.0, "disturbance": lambda t, q, v: [1.0]}, "disturbance(t, q, v)"),

@@ -27,7 +27,7 @@ def test_runs_of_up_to_100000_rows_are_recorded_step_by_step():
     asked = of(1000.01, every=1)
     assert asked.every == 1 and not asked.notes
     assert many.notes == (
-        "one of 11 steps is recorded; every=1 (--every 1) records all 100,001 steps",
+        "one in 11 steps is recorded; every=1 (--every 1) records all 100,001 steps",
     )
 
 
@@ -51,7 +51,7 @@ def test_a_thinned_run_is_the_run_at_some_of_its_rows(monkeypatch):
     assert len(full.t) == 204 and not full.notes
     for key in ("t", "x", "u", "linear", "energy"):
         np.testing.assert_array_equal(getattr(thin, key), getattr(full, key)[kept])
-    assert says(motion_report(thin), "one of 21", "203", "every=1 (--every 1)")
+    assert says(motion_report(thin), "one in 21", "203", "every=1 (--every 1)")
     short = fflin.simulate(robot, policy, **options | {"duration": 1.0})
     assert len(short.t) == 101 and not short.notes
 
@@ -75,7 +75,7 @@ def test_the_pole_that_makes_a_run_slow_is_told():
     (line,) = [str(each.message) for each in said]
     assert says(line, f"{fastest:.3g} 1/s", "0.000977 s", "122,880", "dt=", "sample=")
     assert motion.notes == (
-        "one of 13 steps is recorded; every=1 (--every 1) records all 122,880 steps",
+        "one in 13 steps is recorded; every=1 (--every 1) records all 122,880 steps",
     )
 
 

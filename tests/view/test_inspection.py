@@ -146,6 +146,30 @@ def test_a_hidden_curve_leaves_the_chart_and_its_csv(flown, watched):
     assert all(shown for _, shown in read(watched).values())
 
 
+def test_the_bar_keeps_its_rows_while_the_motion_plays(watched):
+    def tops():
+        return [each.bounding_box()["y"] for each in watched.page.locator("#bar > *").all()]
+
+    found = []
+    for time in (0.0, 9.99, 20.0):
+        watched.do(f"fflin.seek({time})")
+        found.append(tops())
+    assert found[0] == found[1] == found[2]
+    button, slider, clock, speed = watched.page.locator("#bar > *").all()[:4]
+    one_row = [each.bounding_box() for each in (button, slider, clock, speed)]
+    middles = [box["y"] + box["height"] / 2 for box in one_row]
+    assert max(middles) - min(middles) < 4.0
+
+
+def test_a_large_window_has_charts_that_can_be_read(flown, browser):
+    with Watched(browser, flown[2].as_uri() + "#pause", size=(1600, 900)) as watched:
+        tall = [each.bounding_box() for each in watched.page.locator(".plot canvas").all()]
+        assert min(box["height"] for box in tall) > 46.0
+        panel = watched.page.locator("#panel").bounding_box()
+        assert panel["width"] < 0.4 * 1600
+        assert all(box["y"] + box["height"] <= panel["y"] + panel["height"] for box in tall)
+
+
 def screen(watched, point):
     """Return the CSS pixel of a point of the world."""
     x, y, z = np.asarray(point).tolist()

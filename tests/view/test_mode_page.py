@@ -127,7 +127,7 @@ def test_a_mode_is_picked_by_name_and_frequency(shown):
         half = len(mode.shape) // 2
         largest = found.state_names[int(np.abs(mode.shape[:half]).argmax())]
         body, part = next(iter(mode.energy.items()))
-        assert row.locator("b").text_content().startswith(f"{body} {100.0 * part:.0f} %")
+        assert row.locator("b").text_content().startswith(f"{body} {100.0 * part:.0f}\u00a0%")
         shape = watched.page.locator(".shape span").first.text_content()
         assert shape == largest
     watched.page.keyboard.press("ArrowUp")

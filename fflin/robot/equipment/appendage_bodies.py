@@ -1,8 +1,8 @@
 r"""Modes of appendages as bodies on joints, subtracted from the links that carry them.
 
-Each mode is equivalent to one ball on one screw joint, whose spatial inertia I and twist S for a
-unit of the amplitude satisfy I S = L and S^T I S = 1, with the participation L of the mode. The
-ball is taken out of the link's inertia, so that the sum of both is the link in the URDF.
+Each mode with participation L is equivalent to one ball on one screw joint. The ball's spatial
+inertia I and the twist S per unit amplitude satisfy I S = L and S^T I S = 1. The ball is subtracted
+from the link's inertia, so that the sum of both is the link in the URDF.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from fflin.robot.equipment.mounting import Mounted, difference, inertia_of, turn
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.mass_properties import Piece, as_inertia
 
-# An eigenvalue of M_rr - L L^T below minus this share of the largest of M_rr is negative.
+# Eigenvalues of M_rr - L L^T below minus this fraction of the largest of M_rr count as negative.
 _NEGATIVE = 1e-9
-# Mass properties of a file and of the URDF that differ by less than this share agree.
+# Largest relative difference at which mass properties of a file and of the URDF agree.
 _AGREE = 1e-2
-# What the balls of a body's modes take of its mass at most. CRBA adds up the inertias from the
-# last joint on, which is only possible if each sum has a mass.
+# Largest fraction of a body's mass in the balls of its modes. CRBA sums inertias inwards, which
+# needs a positive mass for each sum.
 _LARGEST_SHARE = 0.9
-# A ball nearer to its appendage's frame than this share of the body's radius of gyration stands for
-# no rotation about it.
+# Least distance of a ball from its appendage's frame, relative to the body's radius of gyration,
+# for which the ball's motion counts as a rotation about the frame.
 _SHORTEST = 0.05
-# Nor may the balls be lighter than this share of the mass that needs no rotor.
+# Least mass of a ball, relative to the mass with which no rotor is needed.
 _LIGHTEST = 1e-6
-# Participation below this share of the other part, in the body's size, is none.
+# Translation (or rotation) part of a participation below this fraction of the other part is zero.
 _NONE = 1e-14
 
 
 class _Modes(NamedTuple):
-    """Appendage on the body that carries it: participation L (6, k) in the body's frame."""
+    """Appendage on a body, with its participation L (6, k) in the body's frame."""
 
     appendage: Appendage
     joint: int
@@ -53,7 +53,7 @@ def mounted_appendages(
     appendages: Sequence[Appendage],
     links: Mapping[str, Piece],
 ) -> tuple[list[Mounted], dict[str, dict[str, float]]]:
-    """Return the bodies of all modes, taken out of the bodies that carry them, and the springs."""
+    """Return the bodies and springs of all modes, and subtract the bodies from their carriers."""
     found = [_seen(model, item) for item in appendages]
     for item in found:
         _compare_inertia(item, bodies, links)
@@ -76,9 +76,9 @@ def mounted_appendages(
         lighter = min(1.0, _LARGEST_SHARE * bodies[joint].mass / mass) if mass else 1.0
         if lighter < _LIGHTEST:
             raise InputError(
-                f"mode '{of_body[0].name}' has a participation in translation, but the slosh of "
-                f"its body leaves it {bodies[joint].mass:.3g} kg; the mass in the URDF must "
-                "include the appendage and the liquid"
+                f"mode '{of_body[0].name}' moves the centre of mass of its body, but without the "
+                f"sloshing liquid this body has only {bodies[joint].mass:.3g} kg; the mass in "
+                "the URDF must include the appendage and the liquid"
             )
         for ball in of_body:
             part, removed = ball.mounted(joint, lighter)
@@ -98,8 +98,8 @@ def _seen(model: pin.Model, item: Appendage) -> _Modes:
 def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[str, Array]:
     """Return {mode: effective masses and moments of inertia (6,)} in the appendage's frame.
 
-    They are fractions of the inertia of the file for appendages that have one, and otherwise of the
-    body of `model` that carries the appendage, both about the origin of its frame.
+    The values are fractions of the rigid inertia about the frame's origin. This is the inertia of
+    the appendage's file, or without one, the inertia of the body that carries the appendage.
     """
     found: dict[str, Array] = {}
     for item in appendages:
@@ -130,9 +130,10 @@ def _compare_inertia(item: _Modes, bodies: list[pin.Inertia], links: Mapping[str
     if apart.max() > _AGREE * max(M[0, 0], of_file.mass):
         file, urdf = (f"{x.mass:.4g} kg at {_point(x.lever)} m" for x in (of_file, of_link))
         warnings.warn(
-            f"flexible appendage '{appendage.title}': its file has {file}, but {what} has {urdf} "
-            "in the axes of the frame, or other moments of inertia; correct the URDF, or use the "
-            "inertia of the file with rigid=True",
+            f"flexible appendage '{appendage.title}': the inertia in its file ({file}) differs "
+            f"from the inertia of {what} ({urdf} in the axes of the frame) in these values or in "
+            "the moments of inertia; correct the URDF, or use the inertia of the file with "
+            "rigid=True",
             FflinWarning,
             stacklevel=6,
         )
@@ -155,18 +156,19 @@ def _require_inertia(body: pin.Inertia, of: str, found: Sequence[_Modes]) -> Non
         least = float(_least_eigenvalue(*rows, L[:, :k])[0])
         if not least >= -_NEGATIVE:
             raise InputError(
-                f"mode '{mode}' has more participation than {of} with {body.mass:.4g} kg can have: "
-                f"M_rr - L L^T has the eigenvalue {least:.2g}, relative to the largest eigenvalue "
-                "of M_rr; the URDF's inertia must include the appendage as if it were rigid"
+                f"the effective masses of the modes up to '{mode}' exceed the inertia of {of} "
+                f"({body.mass:.4g} kg): M_rr - L L^T has the eigenvalue {least:.2g}, relative to "
+                "the largest eigenvalue of M_rr; the inertia in the URDF must include the "
+                "appendage as if it were rigid"
             )
 
 
 def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> Array:
     """Return the least eigenvalues (N,) of M_rr - L L^T, relative to the largest of M_rr.
 
-    For masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) about them.
+    M_rr follows from masses (N,), centres of mass (N, 3), and inertias (N, 3, 3) about them.
     """
-    # About the centre of mass, in units in which the mass and the radius of gyration are one.
+    # M_rr is scaled: about the centre of mass, with unit mass and unit radius of gyration.
     trace = np.trace(inertia, axis1=1, axis2=2)
     size = np.sqrt(np.maximum(trace, 1e-300) / np.maximum(2.0 * mass, 1e-300))[:, None, None]
     t, r = np.split(L, 2)
@@ -188,9 +190,10 @@ def first_impossible(
     appendages: Sequence[Appendage],
     bodies: Mapping[int, tuple[Array, Array, Array]],
 ) -> int | None:
-    """Return the first of N rows of bodies that cannot have the participation of their modes.
+    """Return the index of the first of N rows in which modes need more inertia than their body has.
 
-    `bodies` are masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) of joints of `model`.
+    `bodies` are masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) by joint of `model`.
+    Return None if all rows are possible.
     """
     found = [_seen(model, item) for item in appendages]
     impossible = []
@@ -202,33 +205,36 @@ def first_impossible(
 
 
 class _Ball(NamedTuple):
-    """A mode's ball: its participation (3,), (3,) in the body's frame, and where it is."""
+    """Ball that represents a mode, in the frame of the body that carries it."""
 
     name: str
-    t: Array
-    r: Array  # what remains about the ball's centre
+    t: Array  # (3,) translation part of the participation
+    r: Array  # (3,) rotation part of the participation about the ball's centre
     center: Array
-    mass: float  # [kg] with which no rotor is needed
-    moment: float  # [kg m^2]
-    lever: float  # [m] distance from the appendage's frame; 0 if it is too small to turn about
+    mass: float  # [kg] mass with which no rotor is needed
+    moment: float  # [kg m^2] moment of inertia of the ball
+    lever: float  # [m] distance from the appendage's frame; 0 if it is too small for a rotation
 
     @property
     def rotation(self) -> float:
         r"""Rotation [rad] of the structure per unit of the amplitude.
 
-        The ball turns by w, and moves by v at its distance c from the appendage's frame; the
-        rotation is at most :math:`|w| + |v| / |c|`.
+        The ball rotates by w, and moves by v at the distance c from the appendage's frame. The
+        value is the upper bound :math:`|w| + |v| / |c|` of the rotation.
         """
         turned = float(np.linalg.norm(self.r)) / self.moment if self.moment else 0.0
         moved = float(np.linalg.norm(self.t)) / self.mass if self.mass else 0.0
         return turned + (moved / self.lever if self.lever else 0.0)
 
     def mounted(self, joint: int, lighter: float) -> tuple[Mounted, pin.Inertia]:
-        """Return the ball on its joint, and the inertia to take out of the body."""
+        """Return the ball on its joint, and the inertia to subtract from the body.
+
+        The ball has the fraction `lighter` of `mass`.
+        """
         mass = lighter * self.mass
         v = self.t / mass if mass else np.zeros(3)
         w = self.r / self.moment if self.moment else np.zeros(3)
-        # A rotor supplies what a lighter ball lacks or has too much of: S^T I S + rotor = 1.
+        # The inertia of a rotor compensates a different mass of the ball: S^T I S + rotor = 1.
         rotor = 1.0 - float(self.t @ v + self.r @ w)
         moving, turning = float(np.linalg.norm(v)), float(np.linalg.norm(w))
         sphere = self.moment * np.eye(3)
@@ -267,13 +273,13 @@ def _balls(item: _Modes, body: pin.Inertia) -> list[_Ball]:
     balls = []
     for name, column in zip(item.appendage.modes, item.L.T, strict=True):
         t, r = column[:3], column[3:]
-        # About the appendage's frame; only there is a translation without a rotation one.
+        # Participation about the appendage's frame: only there, a pure translation has r = 0.
         r = r - np.cross(p, t)
         square = float(t @ t)
         center = np.zeros(3)
         if math.sqrt(square) * size > _NONE * float(np.linalg.norm(r)):
             center = np.cross(t, r) / square
-            # No farther out than the body is large.
+            # The ball's distance is at most the body's radius of gyration.
             center *= min(1.0, size / max(float(np.linalg.norm(center)), 1e-300))
         else:
             t, square = np.zeros(3), 0.0
@@ -291,13 +297,13 @@ def _balls(item: _Modes, body: pin.Inertia) -> list[_Ball]:
 
 
 def _liquid(slosh: Slosh, item: _Modes, bodies: list[pin.Inertia]) -> list[Mounted]:
-    """Return two joints, the second with the mass, which is taken out of the body."""
+    """Return two joints with the mass on the second, and subtract the mass from the body."""
     joint, placement = item.joint, item.placement
     x, y, z = (placement.rotation @ slosh.axes).T
     at, point = placement * np.array(slosh.position), np.zeros((3, 3))
     bodies[joint] = difference(bodies[joint], inertia_of(slosh.mass, at, point))
-    # On springs the mass slides along x and y. As a pendulum it moves along them by turning about
-    # -y, then about x.
+    # A mass on springs slides along x and y. A pendulum rotates about -y, then about x, and so also
+    # moves along x and y.
     slides = slosh.length is None
     arm = (slosh.length or 0.0) * z
     first, second = (turned_to(axis) for axis in ((x, y) if slides else (-y, x)))

@@ -1,12 +1,12 @@
 r"""Flexible appendages and slosh: passive degrees of freedom of a link, as bodies on joints.
 
-A clamped appendage with the twist V of its frame, modal amplitudes :math:`\eta` of unit modal mass
-and the participation L (6, k) has the kinetic energy
+An appendage that is clamped to a frame with the twist V, and has modal amplitudes :math:`\eta` of
+unit modal mass and the participation L (6, k), has the kinetic energy
 
 .. math:: T = \tfrac12 V^T M_{rr} V + V^T L \dot\eta + \tfrac12 \dot\eta^T \dot\eta.
 
-Each mode is equivalent to one ball on one screw joint, whose spatial inertia I and twist S for a
-unit of the amplitude satisfy I S = L and S^T I S = 1. The ball is taken out of the link's inertia,
+Each mode is equivalent to one ball on one screw joint. The ball's spatial inertia I and the twist S
+per unit amplitude satisfy I S = L and S^T I S = 1. The ball is subtracted from the link's inertia,
 so that the sum of both is the link in the URDF.
 """
 
@@ -25,7 +25,7 @@ from fflin.base.validation import Array, FrozenArrays, as_double, number, positi
 from fflin.robot.equipment.mounting import about_origin, inertia_of
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
-# First root of J_1'(x) = 0: k R of the first lateral mode of a circular cylinder.
+# First root of J_1'(x) = 0, which is k R of the first lateral mode in a circular cylinder.
 _FIRST_ROOT = 1.8411837813406593
 _FASTEST = 1e12  # [Hz]
 
@@ -33,39 +33,40 @@ _FASTEST = 1e12  # [Hz]
 class Appendage(FrozenArrays):
     """Base class of passive parts of a link."""
 
-    KEY: ClassVar[str]  # its table in a robot file
+    KEY: ClassVar[str]  # name of the table in a robot file
     frame: str
     name: str | None
 
     @property
     def title(self) -> str:
-        """Name by which the coordinates begin."""
+        """Prefix of the names of the modes."""
         return self.name or self.frame
 
     @property
     def modes(self) -> tuple[str, ...]:
-        """Names of the coordinates."""
+        """Names of the modes, which are coordinates of the robot."""
         raise NotImplementedError
 
     @property
     def participation(self) -> Array:
-        """Participation L (6, k): translation, then rotation about the frame's origin."""
+        """Modal participation L (6, k): translation, then rotation about the frame's origin."""
         raise NotImplementedError
 
     @property
     def springs(self) -> dict[str, dict[str, float]]:
-        """{"stiffness": {mode: value}, "damping": {mode: value}} of the coordinates."""
+        """Stiffness and damping of the modes, as {"stiffness": {mode: value}, "damping": ...}."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
 class FlexibleAppendage(Appendage):
-    r"""Flexible part of a link, such as a solar array, described by its clamped modes.
+    r"""Flexible part of a link, such as a solar array, described by its modes when clamped.
 
-    Each mode becomes a coordinate of q_m, its modal amplitude in kg^0.5 m for unit modal mass, with
-    the name NAME_mode_1, NAME_mode_2, ... A modal amplitude has the stiffness :math:`\omega^2`,
-    the damping :math:`2 \zeta \omega` and no motor. The link's inertia in the URDF must include
-    the appendage as if it were rigid.
+    Each mode adds a coordinate to q_m, with the name NAME_mode_1, NAME_mode_2 and so on. The
+    coordinate is the modal amplitude, in kg^0.5 m because the modal mass is 1. For a mode of
+    angular frequency :math:`\omega` and damping ratio :math:`\zeta`, the coordinate has the
+    stiffness :math:`\omega^2`, the damping :math:`2 \zeta \omega` and no motor. The link's inertia
+    in the URDF must include the appendage as if it were rigid.
 
     Parameters
     ----------
@@ -76,22 +77,22 @@ class FlexibleAppendage(Appendage):
     translation : array_like (3, k)
         Modal participation in translation [kg^0.5]: the linear momentum of each mode for a unit
         modal rate, in the frame's axes. The square of an entry is the effective mass of the mode
-        along the axis.
+        along this axis of the frame.
     rotation : array_like (3, k)
         Modal participation in rotation [kg^0.5 m]: the angular momentum of each mode about the
         frame's origin, for a unit modal rate.
     damping : float or sequence of float (k,)
         Damping ratios, from 0 to 1.
     name : str, optional
-        Name with which the coordinates begin; the frame's name by default.
+        Prefix of the names of the coordinates; the frame's name by default.
 
     Raises
     ------
     InputError
         If a shape is wrong, a value is not finite, a frequency is not positive, or a damping ratio
-        is not between 0 and 1. `load` raises the error if :math:`M_{rr} - L L^T` is not positive
-        semidefinite, which means that the participation is too large for the inertia of the
-        carrying body.
+        is not between 0 and 1. `load` also raises the error if the participation L is too large for
+        the rigid inertia :math:`M_{rr}` of the carrying body, because :math:`M_{rr} - L L^T` must
+        be positive semidefinite.
 
     Examples
     --------
@@ -110,8 +111,8 @@ class FlexibleAppendage(Appendage):
     rotation: Any
     damping: Any = 0.005
     name: str | None = None
-    # M_rr (6, 6) of a file about the frame's origin, translation over rotation, and whether it
-    # replaces the inertia of the URDF.
+    # M_rr (6, 6) from a file, about the frame's origin, with translation before rotation; `rigid`
+    # is true if it replaces the inertia of the URDF.
     inertia: Array | None = field(default=None, kw_only=True)
     rigid: bool = field(default=False, kw_only=True)
 
@@ -122,15 +123,16 @@ class FlexibleAppendage(Appendage):
         if frequency.ndim != 1 or not modes or damping.shape not in ((), (modes,)):
             raise InputError(
                 f"frequency and damping of {what} have shapes {frequency.shape} and "
-                f"{damping.shape}, expected k frequencies [Hz], and k damping ratios or one"
+                f"{damping.shape}, expected k frequencies [Hz], and k damping ratios or one "
+                "damping ratio for all"
             )
         damping = np.broadcast_to(damping, modes).copy()
         known = (frequency > 0.0) & (frequency < _FASTEST) & (damping >= 0.0) & (damping <= 1.0)
         for mode in np.flatnonzero(~known)[:1].tolist():
             raise InputError(
-                f"mode {mode + 1} of {what} has {frequency[mode]:g} Hz and the damping ratio "
-                f"{damping[mode]:g}, expected more than 0 and less than {_FASTEST:g} Hz, and a "
-                "ratio from 0 to 1"
+                f"mode {mode + 1} of {what} has the frequency {frequency[mode]:g} Hz and the "
+                f"damping ratio {damping[mode]:g}, expected a frequency of more than 0 and less "
+                f"than {_FASTEST:g} Hz, and a ratio from 0 to 1"
             )
         for name, unit in (("translation", "kg^0.5"), ("rotation", "kg^0.5 m")):
             hint = f": one column [{unit}] for each of the {modes} frequencies"
@@ -145,24 +147,29 @@ class FlexibleAppendage(Appendage):
     @classmethod
     def from_nastran(
         cls,
-        op4: Any,
-        asm: Any,
+        op4: object,
+        asm: object,
         *,
         frame: str,
-        origin: Any = None,
+        origin: object = None,
         modes: int | None = None,
         length: str = "m",
         mass: str = "kg",
-        damping: Any = 0.005,
+        damping: object = 0.005,
         name: str | None = None,
         rigid: bool = False,
     ) -> FlexibleAppendage:
-        r"""Read a Craig-Bampton superelement that Nastran wrote as an external superelement.
+        r"""Read a Craig-Bampton model that Nastran wrote as an external superelement.
 
-        The boundary is reduced to a rigid interface at the frame. With :math:`\Phi` the rigid
-        motions of the boundary, in the output coordinate systems of its grids, and V the modes of
-        unit modal mass of :math:`K_{qq}, M_{qq}`, the participation is
-        :math:`L = \Phi^T M_{bq} V` and the rigid inertia :math:`M_{rr} = \Phi^T M_{bb} \Phi`.
+        The boundary of the superelement is reduced to a rigid interface at `frame`. In the matrices
+        of the file, the index b denotes the boundary, and the index q denotes the modes. With these
+        matrices,
+
+        - the participation is :math:`L = \Phi^T M_{bq} V`;
+        - the rigid inertia is :math:`M_{rr} = \Phi^T M_{bb} \Phi`.
+
+        :math:`\Phi` contains the rigid motions of the boundary, in the output coordinate systems of
+        its grids. V contains the eigenvectors of :math:`K_{qq}, M_{qq}`, scaled to unit modal mass.
 
         Parameters
         ----------
@@ -170,23 +177,26 @@ class FlexibleAppendage(Appendage):
             Output4 file with the mass and stiffness matrix (mxx, maa or maax; kxx, kaa or kaax).
         asm : path
             Assembly file with the boundary grids and the points of the modes. A .pch file in the
-            same folder defines which degrees of freedom of the grids are kept.
+            same folder defines which degrees of freedom of the grids belong to the boundary;
+            without this file, all six do.
         frame : str
-            Frame of the model at the interface. The axes of this frame are the file's basic axes.
+            Frame of the robot's model at the interface. Its axes must be parallel to the basic
+            axes of the Nastran file.
         origin : sequence of float (3,), optional
-            Point [m] in the file's basic coordinates that coincides with the frame's origin; the
-            mean of the boundary grids by default.
+            Position [m] of the frame's origin in the file's basic coordinates; by default the mean
+            position of the boundary grids.
         modes : int, optional
-            Number of modes to use, the lowest frequency first; all by default.
+            Number of modes to use, in the order of increasing frequency; all by default.
         length : {"m", "mm", "cm", "in", "ft"}
             Unit of length in the file.
         mass : {"kg", "g", "tonne", "lb", "slug", "lbf s^2/in"}
             Unit of mass in the file.
         damping, name
-            As in `FlexibleAppendage`.
+            See `FlexibleAppendage`.
         rigid : bool
-            Whether the file's rigid inertia replaces the URDF's inertia of the link at the frame.
-            With False, a warning gives both inertias if they differ by more than 1 %.
+            Whether the rigid inertia from the file replaces the URDF's inertia of the link that
+            carries the frame. With False, a warning compares the two inertias if they differ by
+            more than 1 %.
 
         Returns
         -------
@@ -216,17 +226,17 @@ class FlexibleAppendage(Appendage):
 
     @property
     def modes(self) -> tuple[str, ...]:
-        """Names of the modes' coordinates."""
+        """Names of the modes, which are coordinates of the robot."""
         return tuple(f"{self.title}_mode_{k}" for k in range(1, 1 + len(self.frequency)))
 
     @property
     def participation(self) -> Array:
-        """Participation L (6, k): translation, then rotation about the frame's origin."""
+        """Modal participation L (6, k): translation, then rotation about the frame's origin."""
         return np.vstack((self.translation, self.rotation))
 
     @property
     def springs(self) -> dict[str, dict[str, float]]:
-        """{"stiffness": {mode: value}, "damping": {mode: value}} of the modal amplitudes."""
+        """Stiffness and damping of the modes, as {"stiffness": {mode: value}, "damping": ...}."""
         omega = 2.0 * math.pi * self.frequency
         values = {"stiffness": omega**2, "damping": 2.0 * self.damping * omega}
         return {key: dict(zip(self.modes, x.tolist(), strict=True)) for key, x in values.items()}
@@ -254,13 +264,14 @@ class FlexibleAppendage(Appendage):
 
 @dataclass(frozen=True, eq=False)
 class Slosh(Appendage):
-    r"""Liquid that sloshes in a tank: a mass that is free to move across an axis.
+    r"""Liquid that sloshes in a tank, modelled as a point mass that moves across the tank's axis.
 
-    The liquid is a point mass. With `frequency`, the mass moves on springs, with the coordinates
-    NAME_x and NAME_y [m]. With `length`, the mass is a pendulum, with angles [rad] as
-    coordinates. A pendulum has no spring. The frequency of the pendulum is :math:`\sqrt{a/l}`
-    under an acceleration a along the axis, such as the acceleration by a thruster, see
-    ``linearize(..., moving=True)``. The link's inertia in the URDF must include the mass.
+    With `frequency`, the mass moves on springs, and its coordinates are the displacements NAME_x
+    and NAME_y [m]. With `length`, the mass is a pendulum without springs, and its coordinates
+    NAME_x and NAME_y are angles [rad]. The angular frequency of a pendulum of length l is
+    :math:`\sqrt{a/l}` under an acceleration a along the axis, such as the acceleration by a
+    thruster. To linearise about an accelerated motion, use ``linearize(..., moving=True)``. The
+    link's inertia in the URDF must include the sloshing mass.
 
     Parameters
     ----------
@@ -269,26 +280,27 @@ class Slosh(Appendage):
     mass : float
         Mass m [kg] that sloshes.
     position : sequence of float (3,)
-        Position [m] of the mass at rest, in the frame.
+        Position [m] of the mass at rest, in the axes of `frame`.
     frequency : float, optional
-        Frequency [Hz] of the mass on its springs. For a pendulum, `frequency` is the frequency to
-        which the damping ratio refers.
+        Frequency [Hz] of the mass on its springs. If the mass is a pendulum, `frequency` does not
+        affect its stiffness, but converts the damping ratio to a damping coefficient.
     length : float, optional
         Length l [m] of the pendulum, whose hinge is at `position` + l `axis`.
     axis : sequence of float (3,)
-        Axis of the tank in the frame's axes, from its bottom up. The directions x and y are
-        perpendicular to `axis`. Direction x is the projection of the frame's x or y axis,
-        the one that is closer to perpendicular to `axis`.
+        Axis of the tank in the frame's axes, from the bottom of the tank upwards. The directions x
+        and y of the coordinates are perpendicular to `axis`. Direction x is the projection of the
+        frame's x axis; if the x axis is within 25.8 deg of the line along `axis`, direction x is
+        the projection of the frame's y axis.
     damping : float
         Damping ratio, from 0 to 1.
     name : str, optional
-        Name with which the coordinates begin; the frame's name and "_slosh" by default.
+        Prefix of the names of the coordinates; by default the frame's name, followed by "_slosh".
 
     Raises
     ------
     InputError
         If a number is not finite or out of range, or both frequency and length are missing.
-        `load` raises the error if the carrying body has less mass than the liquid.
+        `load` also raises the error if the carrying body has less mass than the liquid.
 
     Examples
     --------
@@ -325,8 +337,9 @@ class Slosh(Appendage):
             raise InputError(f"damping of {what} is {ratio:g}, expected a ratio from 0 to 1")
         if ratio and self.frequency is None:
             raise InputError(
-                f"{what} has the damping ratio {ratio:g}, but a pendulum has a frequency only "
-                "under an acceleration; give the frequency [Hz] to which the ratio refers"
+                f"{what} has the damping ratio {ratio:g}, but without a frequency, because a "
+                "pendulum oscillates only under an acceleration; give the frequency [Hz] to "
+                "which the ratio refers"
             )
         object.__setattr__(self, "damping", ratio)
         position = three_numbers(f"position of {what}", self.position)
@@ -349,18 +362,20 @@ class Slosh(Appendage):
         damping: float = 0.0,
         name: str | None = None,
     ) -> Slosh:
-        r"""Return the first lateral mode of the liquid in an upright circular cylinder.
+        r"""Return the first lateral slosh mode of the liquid in an upright circular cylinder.
 
-        For a liquid of mass m and height h under the acceleration a, with k = 1.8412 / R:
+        Let m be the mass of the liquid, h its height, R the radius of the tank, a the acceleration,
+        and k = 1.8412 / R. The angular frequency :math:`\omega`, the sloshing mass :math:`m_1` and
+        the length l of the equivalent pendulum are
 
         .. math::
             \omega^2 = a k \tanh k h, \qquad
             \frac{m_1}{m} = \frac{2 \tanh k h}{k h\,(k^2 R^2 - 1)}, \qquad
             l = \frac{a}{\omega^2}.
 
-        The sloshing mass m1 is at the depth :math:`\tfrac{2}{k} \tanh \tfrac{k h}{2}` below the
-        surface, as a pendulum or on springs (Dodge, The new dynamic behavior of liquids in moving
-        containers, Southwest Research Institute 2000, chapter 3; NASA SP-106, chapter 6).
+        Both as a pendulum and on springs, the sloshing mass is at the depth :math:`\tfrac{2}{k}
+        \tanh \tfrac{k h}{2}` below the surface (Dodge, The new dynamic behavior of liquids in
+        moving containers, Southwest Research Institute 2000, chapter 3; NASA SP-106, chapter 6).
 
         Parameters
         ----------
@@ -373,15 +388,15 @@ class Slosh(Appendage):
         acceleration : float
             Acceleration a along the axis [m/s^2], such as thrust divided by mass.
         bottom : sequence of float (3,)
-            Centre of the tank's bottom [m], in the frame.
+            Position [m] of the centre of the tank's bottom, in the axes of `frame`.
         axis : sequence of float (3,)
-            Axis of the tank, from its bottom up, in the frame's axes.
+            Axis of the tank in the frame's axes, from the bottom of the tank upwards.
         pendulum : bool
             Whether the mass is a pendulum, whose frequency depends on the acceleration at the
-            operating point. With False, the mass is on springs, with the constant frequency for
-            `acceleration`.
+            operating point. With False, the mass is on springs, and its frequency is always the
+            frequency under `acceleration`.
         damping, name
-            Parameters of `Slosh`; the damping ratio refers to the given acceleration.
+            Parameters of `Slosh`. The damping ratio refers to the frequency under `acceleration`.
 
         Returns
         -------
@@ -415,7 +430,7 @@ class Slosh(Appendage):
 
     @property
     def title(self) -> str:
-        """Name by which the coordinates begin."""
+        """Prefix of the names of the coordinates."""
         return self.name or f"{self.frame}_slosh"
 
     @property
@@ -425,18 +440,22 @@ class Slosh(Appendage):
 
     @property
     def modal_mass(self) -> float:
-        """Inertia of each coordinate with a clamped tank: mass [kg] or inertia [kg m^2]."""
+        """Inertia of each coordinate while the tank is fixed.
+
+        The value is the mass [kg] for a mass on springs, and the moment of inertia [kg m^2] for a
+        pendulum.
+        """
         return self.mass * (self.length or 1.0) ** 2
 
     @property
     def participation(self) -> Array:
-        """Participation L (6, 2): translation, then rotation about the frame's origin."""
+        """Modal participation L (6, 2): translation, then rotation about the frame's origin."""
         t = math.sqrt(self.mass) * self.axes[:, :2]
         return np.vstack((t, np.cross(np.array(self.position), t, axisb=0, axisc=0)))
 
     @property
     def springs(self) -> dict[str, dict[str, float]]:
-        """{"stiffness": {mode: value}, "damping": {mode: value}} of the coordinates."""
+        """Stiffness and damping by coordinate, as {"stiffness": {name: value}, "damping": ...}."""
         omega = 2.0 * math.pi * (self.frequency or 0.0)
         stiffness = self.modal_mass * omega**2
         damping = 2.0 * self.damping * self.modal_mass * omega
@@ -447,7 +466,10 @@ class Slosh(Appendage):
 
     @property
     def axes(self) -> Array:
-        """Unit vectors x, y and the axis as columns (3, 3), in the frame's axes."""
+        """Unit vectors along direction x, direction y and the tank's axis, as columns (3, 3).
+
+        The vectors are in the frame's axes.
+        """
         z = np.array(self.axis)
         near = np.eye(3)[0 if abs(z[0]) < 0.9 else 1]
         x = near - (near @ z) * z
@@ -455,7 +477,7 @@ class Slosh(Appendage):
         return np.column_stack((x, np.cross(z, x), z))
 
 
-def checked_appendages(value: Any) -> tuple[Appendage, ...]:
+def checked_appendages(value: object) -> tuple[Appendage, ...]:
     """Return flexible appendages and slosh, or raise `InputError`."""
     if isinstance(value, Appendage):
         value = [value]
@@ -467,7 +489,7 @@ def checked_appendages(value: Any) -> tuple[Appendage, ...]:
 
 
 def rigid_inertia(M: Array) -> pin.Inertia:
-    """Return the spatial inertia of a matrix (6, 6), translation over rotation."""
+    """Convert a rigid-body mass matrix (6, 6), translation before rotation, to an inertia."""
     mass = float(M[0, 0])
     lever = np.array([M[1, 5], M[2, 3], M[0, 4]]) / mass
     return inertia_of(

@@ -41,8 +41,8 @@ def with_appendages(robot: Any, appendages: Any) -> Any:
             joint = find_frame(bare.model, item.frame).joint
             if joint in taken:
                 raise InputError(
-                    f"'{item.title}' is the second appendage with rigid=True on its body; use it "
-                    "for one appendage of each body"
+                    f"'{item.title}' is the second appendage with rigid=True on its body; use "
+                    "rigid=True for only one appendage of each body"
                 )
             taken.add(joint)
             bare = _with_rigid(bare, item)
@@ -57,7 +57,7 @@ def with_appendages(robot: Any, appendages: Any) -> Any:
 
 
 def _with_rigid(bare: Any, item: FlexibleAppendage) -> Any:
-    """Return a robot whose link at an appendage's frame has the inertia of its file."""
+    """Return a robot whose link at an appendage's frame has the inertia of the appendage's file."""
     assert item.inertia is not None
     joint, placement = find_frame(bare.model, item.frame)
     of_file, body = rigid_inertia(item.inertia), bare.model.inertias[joint]
@@ -99,7 +99,7 @@ def _equipped(robot: Any, inputs: Any, appendages: Sequence[Appendage]) -> Any:
         for field in ("stiffness", "damping", "rest")
     }
     for field, values in springs.items():
-        if appendages is robot.appendages:  # whose springs may have been replaced since
+        if appendages is robot.appendages:  # their springs may have been replaced since
             break
         by_joint[field] = {k: x for k, x in by_joint[field].items() if k not in own} | values
     for field in ("point", "target", "start"):

@@ -1,4 +1,4 @@
-"""Wheels and other bodies on joints of their own, mounted on links whose inertia includes them."""
+"""Wheels and other bodies on new joints, subtracted from the links whose inertia includes them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from fflin.robot.urdf.links import is_impossible
 
 _Z = np.array([0.0, 0.0, 1.0])
 
-# What Pinocchio keeps of each degree of freedom, and of each entry of q, beside the joint itself.
+# Arrays of a Pinocchio model with an entry for each degree of freedom, and for each entry of q.
 _OF_VELOCITY = (
     *("armature", "damping", "rotorInertia", "rotorGearRatio"),
     *("lowerEffortLimit", "upperEffortLimit", "lowerVelocityLimit", "upperVelocityLimit"),
@@ -27,7 +27,7 @@ class Mounted(NamedTuple):
     """A mounted body, and the joint on which it moves relative to its carrier.
 
     `carrier` is the index of a joint of the bare model, or the name of a mounted body. `placement`
-    is the frame of the joint in the carrier's frame, and `inertia` the body in the joint's frame.
+    is the joint's placement in the carrier's frame. `inertia` is the body in the joint's frame.
     """
 
     joint: Joint
@@ -45,15 +45,15 @@ class Mounted(NamedTuple):
 
 def inertia_of(mass: float, lever: Array, inertia: Array) -> pin.Inertia:
     """Return a spatial inertia that need not be the inertia of a real body."""
-    # The constructor of Pinocchio refuses what a real body cannot have. What remains of a link
-    # without its mounted bodies is only a summand.
+    # Pinocchio's constructor refuses physically impossible inertias. But the rest of a link without
+    # its mounted bodies is only a term of a sum, and may be impossible.
     value = pin.Inertia.Zero()
     value.mass, value.lever, value.inertia = mass, lever, inertia
     return value
 
 
 def difference(body: pin.Inertia, part: pin.Inertia) -> pin.Inertia:
-    """Return a body without a part of it, both in the same frame."""
+    """Return a body minus one of its parts; both are in the same frame."""
     mass = body.mass - part.mass
     if part.mass == 0.0:
         return inertia_of(mass, body.lever, body.inertia - part.inertia)
@@ -76,9 +76,9 @@ def _shift(mass: float, lever: Array) -> Array:
 def with_mounted(
     model: pin.Model, bodies: Sequence[pin.Inertia], parts: Sequence[Mounted]
 ) -> pin.Model:
-    """Return a model with one more joint for each part, and other inertias of its own bodies.
+    """Return a model with a new joint for each part, and with new inertias of the old bodies.
 
-    The joints of the parts have no frames yet.
+    The new joints have no frames yet.
     """
     on: dict[int | str, list[Mounted]] = {}
     for part in parts:
@@ -95,7 +95,7 @@ def with_mounted(
             index = new.addJoint(parent, model.joints[item], placement, model.names[item])
             body, moved[item] = bodies[item], index
         added[item.name if isinstance(item, Mounted) else item] = index
-        # Not by its argument: Pinocchio adds up inertias by dividing by their mass.
+        # The body is not passed to appendBodyToJoint, which divides by its mass (perhaps zero).
         new.appendBodyToJoint(index, pin.Inertia.Zero(), pin.SE3.Identity())
         new.inertias[index] = body
     carry_over(model, new, moved)
@@ -103,7 +103,7 @@ def with_mounted(
     for part in parts:
         armature[new.idx_vs[added[part.name]]] = part.armature
     new.armature = armature
-    # The parent of a frame is an index among frames: they stay in order, and new ones come last.
+    # Frames refer to their parents by index, so old frames keep their order; new ones come last.
     for frame in model.frames.tolist()[1:]:
         copy = pin.Frame(frame)
         copy.parentJoint = moved[frame.parentJoint]
@@ -115,7 +115,7 @@ def _depth_first(
     model: pin.Model, on: Mapping[int | str, Sequence[Mounted]], root: int | str
 ) -> Iterator[int | Mounted]:
     """Yield the joints carried by a root, and the mounted bodies of each after all other joints."""
-    # Else the joints would not be in depth-first order, without which CRBA is wrong.
+    # CRBA needs the joints in depth-first order.
     if isinstance(root, int):
         yield root
         for child in model.children[root]:
@@ -126,7 +126,7 @@ def _depth_first(
 
 
 def carry_over(model: pin.Model, new: pin.Model, moved: Mapping[int, int]) -> None:
-    """Copy what a model keeps of its joints beside them; `moved` gives the new index of each."""
+    """Copy armatures, limits and similar arrays of joints; `moved` is {old index: new index}."""
     for names, begin, length in (_OF_VELOCITY, "idx_vs", "nvs"), (_OF_POSITION, "idx_qs", "nqs"):
         sizes, old_at, new_at = getattr(model, length), getattr(model, begin), getattr(new, begin)
         for name in names:
@@ -144,7 +144,7 @@ def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
 
 
 def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[int, Array], ...]:
-    """Return the momentum (3,) [N m s] of wheels without inertia on each joint, in its frame."""
+    """Return (joint, momentum (3,) [N m s] in its frame) of the wheels without inertia."""
     stored: dict[int, Array] = {}
     for _, wheel in named_wheels(inputs):
         if wheel.momentum:
@@ -166,14 +166,15 @@ def mounted_wheels(
         rest = difference(bodies[joint], spinning)
         moments = np.linalg.eigvalsh(rest.inertia).tolist()
         about = float(axis @ bodies[joint].inertia @ axis)
-        # Nothing but rounding is left where a wheel's own link carries it.
+        # If a wheel is mounted on its own link, only rounding errors of the inertia remain.
         if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
             of = "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
             lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
             raise InputError(
-                f"wheel '{name}' of {wheel.inertia:g} kg m^2 does not have less inertia than the "
-                f"link that carries it: {of} has {about:.3g} kg m^2 about its axis; the URDF's "
-                f"inertia must include the wheels, so correct the URDF or the wheel{lock}"
+                f"wheel '{name}' of {wheel.inertia:g} kg m^2 must have less inertia than the "
+                f"link that carries it, but {of} has {about:.3g} kg m^2 about the axis of the "
+                "wheel; the inertia in the URDF must include the wheels, so correct the URDF or "
+                f"the wheel{lock}"
             )
         bodies[joint] = rest
         placement = pin.SE3(turned_to(axis), np.zeros(3))

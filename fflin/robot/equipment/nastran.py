@@ -1,4 +1,4 @@
-"""Craig-Bampton superelements of Nastran: modes that are clamped at a rigid interface."""
+"""Craig-Bampton superelements of Nastran, with modes that are clamped at a rigid interface."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ MASSES = {
     "slug": 14.593902937206364,
     "lbf s^2/in": 175.12683524647636,
 }  # [kg]
-# Names of the mass and stiffness matrix in files of different origin.
+# Names of the mass and stiffness matrices in files of different origin.
 _MASS, _STIFFNESS = ("mxx", "maa", "maax"), ("kxx", "kaa", "kaax")
 
-# Of the largest entry: an asymmetry, a stiffness between boundary and modes, or a stiffness of the
-# rigid interface beyond this share is no rounding.
+# Largest rounding error relative to the largest entry. A larger asymmetry, coupling stiffness of
+# boundary and modes, or stiffness of the rigid interface is refused.
 _SHARE = 1e-6
 
 
@@ -36,12 +36,12 @@ class Superelement(NamedTuple):
     """Modes clamped at a rigid interface, about its origin, in SI units and basic axes."""
 
     frequency: Array  # (k,) [Hz]
-    L: Array  # (6, k): translation [kg^0.5] over rotation [kg^0.5 m]
-    inertia: Array  # M_rr (6, 6): translation over rotation
+    L: Array  # (6, k): translation [kg^0.5] before rotation [kg^0.5 m]
+    inertia: Array  # M_rr (6, 6): translation before rotation
 
 
 def read_superelement(
-    op4: Any, asm: Any, *, origin: Any, modes: int | None, length: str, mass: str
+    op4: object, asm: object, *, origin: Any, modes: int | None, length: str, mass: str
 ) -> Superelement:
     """Return the modes of a superelement, see `FlexibleAppendage.from_nastran`."""
     for what, unit, known in (("length", length, LENGTHS), ("mass", mass, MASSES)):
@@ -57,7 +57,7 @@ def read_superelement(
         if origin is None
         else vector("origin", origin, 3, "a point") / (LENGTHS[length])
     )
-    # Rigid motions about the file's basic origin, as motions about the interface's.
+    # Convert rigid motions about the file's basic origin to motions about the interface's origin.
     x, y, z = center
     shift = np.eye(6)
     shift[:3, 3:] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
@@ -84,9 +84,9 @@ def read_superelement(
 
 
 def _boundary(path: Path) -> tuple[Mask, Array, Array]:
-    """Return a mask of the boundary's degrees of freedom, rigid motions of all, and the grids."""
+    """Return the mask of boundary degrees of freedom, the rigid motions of all, and the grids."""
     try:
-        with np.printoptions():  # which pyYeti changes for the whole process
+        with np.printoptions():  # pyYeti changes them for the whole process
             from pyyeti import nastran
     except ImportError:
         raise InputError(
@@ -94,7 +94,7 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
         ) from None
     punched = path.suffix == ".asm" and path.with_suffix(".pch").is_file()
     try:
-        # The .pch file says which degrees of freedom of a grid are kept; else all six are.
+        # A .pch file lists the kept degrees of freedom of each grid; without it all six are kept.
         uset, _, boundary, *kept = nastran.asm2uset(
             str(path), try_rdextrn="pv_only" if punched else False
         )
@@ -109,19 +109,19 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
     boundary = np.asarray(boundary, dtype=bool)
     if not boundary.any() or boundary.all() or not np.isfinite(points).all() or not len(points):
         raise InputError(
-            f"{path} names no boundary grids (GRID) with coordinates, or no modes (SPOINT); "
-            "expected those of a Craig-Bampton superelement"
+            f"{path} lacks boundary grids (GRID) with coordinates or modes (SPOINT); expected "
+            "both, as in a Craig-Bampton superelement"
         )
     return boundary[keep], np.asarray(rigid)[keep], points
 
 
 def _matrices(path: Path, size: int) -> tuple[Array, Array]:
-    """Return mass and stiffness (size, size) of an output4 file."""
+    """Return the mass and stiffness matrices (size, size) of an output4 file."""
     from pyyeti.nastran import op4
 
     try:
         found: Mapping[str, Any] = op4.read(str(path), sparse=False)
-    except Exception as error:  # as above
+    except Exception as error:  # pyYeti raises whatever its parsing meets
         raise InputError(f"{path} cannot be read as an output4 file (.op4): {_line(error)}") from (
             None
         )
@@ -149,25 +149,25 @@ def _matrices(path: Path, size: int) -> tuple[Array, Array]:
 
 
 def _require_clamped(path: Path, K: Array, rigid: Array, boundary: Mask) -> None:
-    """Raise `InputError` unless the modes are clamped at the boundary and nothing else is."""
+    """Raise `InputError` unless the structure is clamped only at the boundary."""
     inner, largest = ~boundary, float(np.abs(K).max(initial=0.0))
     coupling = K[np.ix_(boundary, inner)]
     if np.abs(coupling).max(initial=0.0) > _SHARE * largest:
         raise InputError(
-            f"the stiffness of {path} couples boundary and modes; expected modes that are clamped "
-            "at the boundary (Craig-Bampton)"
+            f"the stiffness matrix in {path} couples boundary and modes; expected modes that are "
+            "clamped at the boundary (Craig-Bampton)"
         )
     K_b = K[np.ix_(boundary, boundary)]
     size = np.abs(rigid).T @ np.abs(K_b) @ np.abs(rigid)
     if np.abs(rigid.T @ K_b @ rigid).max() > _SHARE * max(float(size.max()), 1e-300):
         raise InputError(
-            f"the stiffness of {path} resists a rigid motion of its boundary: the structure is "
-            "clamped elsewhere too, or the .asm file has other grids"
+            f"the stiffness matrix in {path} resists a rigid motion of the boundary, because the "
+            "structure is also clamped elsewhere, or because the .asm file describes other grids"
         )
 
 
 def _eigenpairs(path: Path, K: Array, M: Array) -> tuple[Array, Array]:
-    """Return the squares of the frequencies [rad/s] and the modes of unit modal mass."""
+    """Return the squared frequencies [rad^2/s^2] and the mode shapes of unit modal mass."""
     from scipy.linalg import LinAlgError, eigh
 
     try:
@@ -176,8 +176,8 @@ def _eigenpairs(path: Path, K: Array, M: Array) -> tuple[Array, Array]:
         squares = np.zeros(1)
     if not squares[0] > 0.0:
         raise InputError(
-            f"the modal mass or stiffness of {path} is not positive definite; expected independent "
-            "modes that are clamped at the boundary"
+            f"the modal mass or stiffness matrix in {path} is not positive definite; expected "
+            "independent modes that are clamped at the boundary"
         )
     return np.asarray(squares), np.asarray(shapes)
 

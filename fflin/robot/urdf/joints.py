@@ -15,19 +15,19 @@ from fflin.robot.urdf.links import (
 )
 from fflin.robot.urdf.xml import Element, decimal, enumerated, named, quoted
 
-# Degrees of freedom of the types of joint.
+# Degrees of freedom of each joint type.
 FREEDOM = dict(fixed=0, revolute=1, continuous=1, prismatic=1, planar=3, floating=6)
 
-# What a joint without a limit is limited to.
+# Value of a missing limit in the model.
 UNLIMITED = sys.float_info.max
 
-# An axis this short or long is no direction that somebody meant to write.
+# An axis of a length outside these bounds is an error in the file.
 _SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
 
-# urdfdom and Pinocchio's parser recurse along the tree, about 2.5 kB of stack for each link.
+# urdfdom and Pinocchio's parser recurse along the tree, and take about 2.5 kB of stack per link.
 _DEPTH_LIMIT = 1_000
 
-# Robots have some 100 links; far more would take time and memory without bound.
+# Robots have some 100 links. The limit bounds time and memory.
 _LINK_LIMIT = 10_000
 
 
@@ -47,21 +47,21 @@ class JointElement(NamedTuple):
     parent: str
     child: str
     element: Element
-    origin: Pose  # of the child's frame in the parent's
+    origin: Pose  # placement of the child's frame in the parent's frame
     axis: tuple[float, ...]  # in the child's frame; Pinocchio scales it to unit length
-    limits: dict[str, float] | None  # lower, upper, effort, velocity as given; None without <limit>
+    limits: dict[str, float] | None  # given lower, upper, effort, velocity; None without <limit>
     damping: float  # [N m s/rad | N s/m]
     friction: float  # [N m | N]
-    mimic: Mimic | None  # as written: the leader may itself be a mimic
+    mimic: Mimic | None  # as in the file, where the leader may be a mimic joint too
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom."""
+        """Number of degrees of freedom."""
         return FREEDOM[self.type]
 
 
 def read_joint(element: Element) -> JointElement:
-    """Read a <joint>; raise `UrdfError` if something in it is wrong."""
+    """Read a <joint>, or raise `UrdfError` if it is invalid."""
     name = element.text("name", "a <joint>")
     of = f"joint {quoted(name)}"
     kind = element.text("type", of)
@@ -85,7 +85,7 @@ def read_joint(element: Element) -> JointElement:
 
 def _axis(element: Element, of: str, kind: str) -> tuple[float, ...]:
     found = element.find("axis", of)
-    # Exporters write a zero axis into fixed joints; it has no meaning there.
+    # Fixed joints have no axis, and exporters write zeros there.
     if found is None or FREEDOM[kind] != 1:
         return (1.0, 0.0, 0.0)
     found.allow_only("xyz", of=of)
@@ -107,20 +107,20 @@ def _limits(element: Element, of: str, kind: str) -> dict[str, float] | None:
     lower, upper = limits.get("lower", 0.0), limits.get("upper", 0.0)
     if lower > upper:
         found.note(
-            f"lower limit {lower:g} of {of} exceeds its upper limit {upper:g}; the model has no "
-            "position limits for it"
+            f"lower limit {lower:g} of {of} exceeds its upper limit {upper:g}; both position "
+            "limits are ignored"
         )
         limits |= {"lower": -UNLIMITED, "upper": UNLIMITED}
     return limits
 
 
 def _limit(found: Element, name: str, of: str) -> float:
-    """Return one limit. They do not enter the linear model, so a wrong one is no error."""
+    """Return one limit; an invalid one only causes a note, as models do not depend on limits."""
     value = decimal(found.attributes[name].strip())
     if math.isnan(value) or (value < 0.0 and name in ("effort", "velocity")):
         found.note(
-            f"limit {name} of {of} is {quoted(found.attributes[name])}, expected a number, of 0 or "
-            "more for effort and velocity; the limit is ignored"
+            f"limit {name} of {of} is {quoted(found.attributes[name])}, expected a number (0 or "
+            "more for effort and velocity); the limit is ignored"
         )
         value = -math.inf if name == "lower" else math.inf
     return max(-UNLIMITED, min(value, UNLIMITED))
@@ -137,7 +137,7 @@ def _dynamics(element: Element, of: str, kind: str) -> tuple[float, float]:
     if min(damping, friction) < 0.0:
         raise found.error(
             f"damping {damping:g} and friction {friction:g} of {of}: expected 0 or more; correct "
-            "the negative one"
+            "the negative value"
         )
     return damping, friction
 
@@ -155,7 +155,7 @@ def _mimic(element: Element, of: str) -> Mimic | None:
 
 
 def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
-    """Return {follower: Mimic of an independent joint}, none of fixed joints."""
+    """Return {mimic joint: Mimic of an independent joint}, without fixed joints."""
     written = {name: joint.mimic for name, joint in joints.items() if joint.mimic and joint.freedom}
     resolved: dict[str, Mimic] = {}
     for name in written:
@@ -182,7 +182,7 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
 
 
 def counted_leaders(joints: dict[str, JointElement], mimics: dict[str, Mimic]) -> set[str]:
-    """Return the continuous leaders a whole turn of which moves a follower elsewhere."""
+    """Return the continuous leaders whose full turn does not return all their mimic joints."""
     return {
         mimic.leader
         for name, mimic in mimics.items()
@@ -211,14 +211,14 @@ Part = TypeVar("Part", Link, JointElement)
 class Urdf(NamedTuple):
     """Checked content of a URDF: the joints connect the links into one tree."""
 
-    name: str  # empty where the file gives none
-    links: dict[str, Link]  # by name, in the order of the file
+    name: str  # empty without a name in the file
+    links: dict[str, Link]  # {name: link} in the order of the file
     joints: dict[str, JointElement]
     depth: int  # number of links on the longest path from the root
 
 
 def read_description(root: Element) -> Urdf:
-    """Check the elements of a URDF."""
+    """Check the elements of a URDF, and return its content."""
     _check_root(root)
     links = _by_name(read_link, root.find_all("link"))
     if not links:
@@ -237,14 +237,15 @@ def _check_root(root: Element) -> None:
     if root.tag != "robot":
         raise root.error(f"the root element is <{root.tag[:60]}>; expected <robot>")
     refuse_near_miss(root, "<robot>", ("link", "joint"))
-    # Elements of that name in extensions of URDF are others, and contain other elements.
+    # Extensions of URDF have elements with these names too, but with other children. So nested
+    # elements are recognised by their children.
     marks = {"robot": {"link"}, "link": {"inertial"}, "joint": {"parent", "child"}}
     for child in root.children:
         for inner in (child, *child.iterate()):
             nested = inner.tag == "robot" or inner is not child
             if nested and marks.get(inner.tag, {""}) <= {part.tag for part in inner.children}:
                 raise inner.error(
-                    f"<{inner.tag}> inside a <{child.tag}>, where URDF ignores it; put "
+                    f"a <{inner.tag}> is inside a <{child.tag}>, where URDF ignores it; put "
                     f"{quoted(inner.attributes.get('name', ''))} directly into <robot>"
                 )
 
@@ -276,7 +277,7 @@ def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointEl
             raise joint.element.error(
                 f"link {quoted(joint.child)} is the child of {of} and of joint "
                 f"{quoted(other.name)} in line {other.element.line}; a link can have only one "
-                "parent, so remove one joint: URDF has no closed loops"
+                "parent, because URDF has no closed loops; remove one of these joints"
             )
         above[joint.child] = joint
 

@@ -8,29 +8,30 @@ import pinocchio as pin
 
 from fflin.robot.urdf.xml import Element, enumerated, named, nearest, quoted
 
-# From 1e8 m on, in double precision the square of the length swallows that of a metre, and with
-# it what the links weigh about their own joints: ABA then divides zero by zero.
+# At lengths of 1e8 m, adding 1 m^2 to the squared length changes nothing in double precision. Then
+# the links' moments about their own joints are lost, and ABA divides zero by zero.
 _FARTHEST = 1e7  # [m]
 
-# Quaternions are written with four digits often, seldom with fewer.
+# Tolerance of a quaternion's length: files often have four digits, seldom fewer.
 _QUATERNION_SLACK = 1e-3
 
-# Rounding of the six numbers leaves a singular inertia with eigenvalues of about -1e-16 of the
-# largest when they are written in full; CAD programs write fewer digits.
+# Rounding of its six numbers gives a singular inertia eigenvalues of about -1e-16 of the largest.
+# The tolerance is larger because CAD programs write fewer digits.
 _NEGATIVE_SLACK = 1e-9
 
-# A point mass that a CAD program integrates has the inertia of rounding, of either sign: that
-# of a body within a micrometre of its centre.
+# The inertia of a point mass from a CAD program is a rounding error of either sign. It is as small
+# as the inertia of a body within this distance of its centre.
 _POINT = 1e-6  # [m]
 
-# A negative moment this small against that of the rigid body it is fixed to changes M no more
-# than the last digits of published figures do.
+# A negative moment below this fraction of the whole rigid body's moment is accepted. It changes M
+# less than the rounding of published numbers.
 _LOST_IN_BODY = 1e-6
 
-# Published figures have three digits or more, and a flat plate's lie on the bound.
+# Tolerance of the triangle inequality of principal moments. A flat plate fulfils it with equality,
+# and published numbers have three digits or more.
 TRIANGLE_SLACK = 1e-3
 
-# The entries of an inertia as URDF orders them.
+# Entries of an inertia in the order of URDF.
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -47,13 +48,13 @@ class Link(NamedTuple):
 
     name: str
     element: Element
-    mass: float | None = None  # [kg]; None where the link has no <inertial>
+    mass: float | None = None  # [kg]; None without <inertial>
     com: Pose = Pose()  # centre of mass, and axes of the inertia
-    inertia: tuple[float, ...] = (0.0,) * 6  # INERTIA [kg m^2] about the centre of mass
+    inertia: tuple[float, ...] = (0.0,) * 6  # [kg m^2] about the centre of mass, as in INERTIA
 
 
 def read_link(element: Element) -> Link:
-    """Read a <link>; raise `UrdfError` if something in it is wrong."""
+    """Read a <link>, or raise `UrdfError` if it is invalid."""
     name = element.text("name", "a <link>")
     of = f"link {quoted(name)}"
     refuse_near_miss(element, of, ("inertial",))
@@ -75,7 +76,7 @@ def read_link(element: Element) -> Link:
 
 
 def read_pose(element: Element, of: str) -> Pose:
-    """Read the <origin> of an element; the identity if it has none."""
+    """Read the <origin> of an element, or return the identity without one."""
     origin = element.find("origin", of)
     if origin is None:
         return Pose()
@@ -102,7 +103,7 @@ def read_pose(element: Element, of: str) -> Pose:
 
 
 def refuse_near_miss(element: Element, of: str, known: tuple[str, ...]) -> None:
-    """Refuse children that are a known element misspelt; others are ignored as URDF has it."""
+    """Raise `UrdfError` for misspelt names of known child elements; URDF ignores all others."""
     for child in element.children:
         if child.tag in known or ":" in child.tag:
             continue
@@ -113,13 +114,16 @@ def refuse_near_miss(element: Element, of: str, known: tuple[str, ...]) -> None:
 
 
 def is_impossible(mass: float, moments: Sequence[float]) -> bool:
-    """Tell whether the principal moments, ascending [kg m^2], are negative beyond rounding."""
+    """Return whether ascending principal moments [kg m^2] are negative beyond rounding."""
     # A body within the radius r of its centre has moments of at most mass r^2.
     return moments[0] < -max(_NEGATIVE_SLACK * moments[-1], mass * _POINT**2)
 
 
 def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[str]:
-    """Warn of odd inertias; refuse negative ones that the link's rigid body does not outweigh."""
+    """Return notes about unusual inertias.
+
+    Raise an error for negative moments that are not negligible in the link's rigid body.
+    """
     unequal, weightless, negligible = [], [], []
     for link in links:
         if link.mass is None:
@@ -143,7 +147,7 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
     lost = f"the inertia of {named('link', negligible)} has a negative principal moment, "
     notes = (
         (negligible, f"{lost}negligible compared with the links it is fixed to"),
-        # One principal moment is more than the sum of the others.
+        # One principal moment is larger than the sum of the other two.
         (unequal, f"unphysical inertia: {enumerated(unequal)}"),
         (weightless, f"inertia without mass: {named('link', weightless)}"),
     )

@@ -27,20 +27,21 @@ from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
 _SIZE_LIMIT = 64 * 2**20
 
-# Up to this depth the recursion of the parsers fits the smallest stack of a thread in use, 512 kB.
+# Up to this depth, the recursion of the parsers fits into the smallest stack of a thread, 512 kB.
 _SHALLOW = 100
 _STACK = 16 * 2**20
 
-# What the values of attributes cannot hold as it is.
+# Characters that must be escaped in values of attributes.
 _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
 
-# How long an expansion may take [s]; xacro's expressions and macros may be without end.
+# Time limit of an expansion [s], since xacro's expressions and macros may not terminate.
 XACRO_LIMIT = 60.0
 
-# Run as a file: by a module's name or as a text it could import from the working folder.
+# Path of the program that expands xacro. It is run as a file, because with -m or -c it could import
+# modules from the working folder.
 _CHILD = str(Path(__file__).with_name("xacro_child.py"))
 
-# What lies below these does not reach the model, so a "${" there is no reason to expand.
+# Elements that do not affect the model, so a "${" below them does not require xacro.
 _IGNORED = {
     *("visual", "collision", "material", "gazebo", "transmission", "ros2_control"),
     *("sensor", "plugin", "safety_controller", "calibration"),
@@ -56,21 +57,21 @@ class Advice(NamedTuple):
 
 
 class Description(NamedTuple):
-    """Robot as its file describes it."""
+    """Content of a robot's file."""
 
     model: pin.Model  # free-flyer root joint, zero gravity; mimic joints move freely in it
-    sha256: str  # of the file as it was read, without files that a xacro includes
-    mimics: dict[str, Mimic]  # of the joints that follow another, with independent leaders
-    damping: dict[str, float]  # {joint: value} where not zero [N m s/rad | N s/m]
-    meshes: tuple[str, ...]  # mesh files as it names them; they are not read
-    links: dict[str, Link]  # those that weigh something
-    joints: tuple[str, ...]  # all, as they stand in it
+    sha256: str  # digest of the file that was read, without files that a xacro includes
+    mimics: dict[str, Mimic]  # {mimic joint: Mimic} with independent leaders
+    damping: dict[str, float]  # {joint: value} of nonzero damping [N m s/rad | N s/m]
+    meshes: tuple[str, ...]  # mesh files as written in the file; they are not read
+    links: dict[str, Link]  # links with mass
+    joints: tuple[str, ...]  # all joints in the order of the file
     notes: tuple[str, ...]  # warnings, one line each
-    advice: tuple[Advice, ...] = ()  # those that hold where the robot's fields say no more
+    advice: tuple[Advice, ...] = ()  # warnings that fields of the robot may make unnecessary
 
 
 def read_urdf(path: Path) -> Description:
-    """Read a URDF, or a xacro, as a free-flying robot."""
+    """Read a URDF or xacro file as a free-flying robot."""
     return describe(read_document(path), path)
 
 
@@ -78,8 +79,8 @@ def describe(document: bytes, path: Path) -> Description:
     """Read a URDF from the bytes of a file; `path` is its name in errors."""
     root = parse(document, str(path))
     notes: list[str] = []
-    # The marks of xacro, and of what may stand for them.
-    plain = document.replace(b"\0", b"")  # UTF-16 too
+    # Search for the marks of xacro, or for characters that may encode them.
+    plain = document.replace(b"\0", b"")  # so that UTF-16 is searched too
     first = first_xacro(root) if any(x in plain for x in (b"xacro:", b"$", b"&#")) else None
     if path.suffix == ".xacro" or first:
         expanded, notes = expand(path, document, first)
@@ -105,7 +106,7 @@ def describe(document: bytes, path: Path) -> Description:
 
 
 def _advice(moving: list[JointElement], origin: str) -> Iterator[Advice]:
-    """Yield warnings of dampers, friction and limits of the file that the model ignores."""
+    """Yield warnings of dampers, friction and zero limits in the file that the model ignores."""
     damped = tuple(joint.name for joint in moving if joint.damping)
     rubbing = tuple(joint.name for joint in moving if joint.friction)
     zero = {
@@ -150,13 +151,13 @@ def _build(urdf: Urdf, path: Path, counted: Collection[str]) -> pin.Model:
             "joints with unusual names"
         )
     model.gravity.setZero()
-    # The name of a file need not be text.
+    # File names may contain bytes that are not valid text.
     model.name = urdf.name or path.stem.encode(errors="backslashreplace").decode()
     return model
 
 
 def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
-    """Call a function that recurses along the tree, with a large enough stack."""
+    """Call a function that recurses along the tree, in a thread with a large enough stack."""
     if depth <= _SHALLOW:
         return call()
     from concurrent.futures import ThreadPoolExecutor
@@ -171,8 +172,11 @@ def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
 
 
 def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
-    """Write a URDF of the moving parts, bit for bit; `counted` joints become revolute."""
-    # urdfdom reads quat_xyzw from version 1.1 on; 1.2 would require limits.
+    """Return a URDF of links, inertias and joints with exact numbers.
+
+    `counted` continuous joints become revolute, so that they count full turns.
+    """
+    # Version 1.1 is the first for which urdfdom reads quat_xyzw; 1.2 would require limits.
     lines = [f'<robot name={_quoted(urdf.name)} version="1.1">']
     for link in urdf.links.values():
         lines.extend(_link(link))
@@ -223,12 +227,12 @@ def _numbers(values: tuple[float, ...]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Write an attribute's value. The standard library's ways load far more than they do."""
+    """Return an attribute's value in quotes; the standard library's functions load many modules."""
     return f'"{text.translate(_ENTITIES)}"'
 
 
 def first_xacro(root: Element) -> Element | None:
-    """Return the first element that makes use of xacro; declaring its prefix does not count."""
+    """Return the first element that uses xacro, or None; a declared prefix alone is no use."""
     for element in chain([root], root.iterate(_IGNORED)):
         marked = any("${" in value or "$(" in value for value in element.attributes.values())
         if marked or element.tag.startswith("xacro:"):
@@ -237,7 +241,10 @@ def first_xacro(root: Element) -> Element | None:
 
 
 def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
-    """Return a xacro document as plain URDF, and xacro's messages; `first` is for errors."""
+    """Expand a xacro document to plain URDF, and return it with xacro's messages.
+
+    `first` is the first element that uses xacro, for error messages.
+    """
     import json
     import subprocess
     from importlib.util import find_spec

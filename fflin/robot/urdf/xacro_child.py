@@ -1,14 +1,14 @@
 """Program that expands one xacro document. It runs as a file, isolated, without the package fflin.
 
-Its arguments are the path of the document, the most seconds that it may take, and the folders to
-import from. Until it has these it imports built-in modules alone.
+Its arguments are the path of the document, the time limit [s], and the folders from which to
+import. Before it has set these folders, it imports only built-in modules.
 """
 
 import sys
 
 
 def main(path: str, limit: float) -> None:
-    """Expand stdin; write to stdout a line of JSON, the files that were read, and the document."""
+    """Expand stdin; write to stdout the list of files read, as a line of JSON, and the URDF."""
     import contextlib
     import faulthandler
     import json
@@ -22,14 +22,14 @@ def main(path: str, limit: float) -> None:
     try:
         with contextlib.redirect_stdout(sys.stderr):
             packages.walk_up_from(path)
-            # Files to include are looked up from the one on top of xacro's stack.
+            # xacro searches included files relative to the file on top of its stack.
             xacro.init_stacks(path)
             urdf = XacroDoc.from_string(
                 document, resolve_packages=False, rootdir=Path(path).parent
             ).to_urdf_string()
     except Exception as error:  # xacro evaluates Python expressions, which may raise anything
         sys.exit(" ".join(str(error).split()) or type(error).__name__)
-    # Included documents and YAML files; one that is read twice is in the list twice.
+    # Included documents and YAML files, without duplicates.
     files = json.dumps(sorted(set(xacro.all_includes)))
     sys.stdout.buffer.write(f"{files}\n{urdf}".encode())
 

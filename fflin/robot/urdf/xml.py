@@ -12,17 +12,18 @@ from xml.parsers import expat
 
 from fflin.base.errors import UrdfError, listed
 
-# URDFs nest some 10 elements; deeper ones would exceed the recursion limit.
+# URDFs nest some 10 elements. Much deeper documents would exceed the recursion limit.
 _DEPTH_LIMIT = 100
 
-# URDFs hold some 10,000 elements; millions would fill the memory.
+# URDFs contain some 10,000 elements. Millions would fill the memory.
 _ELEMENT_LIMIT = 500_000
 _TAG_LIMIT = 2**20  # bytes
 
 # No physical value is larger, and products of two such numbers do not overflow.
 _LARGEST = 1e30
 
-# Between xzy and xyz, quat and quat_xyzw; unit and value are farther apart.
+# Least similarity of a misspelt name: xzy is near to xyz, and quat to quat_xyzw; unit and value
+# are not near.
 _NEAR = 0.6
 
 _SPACE = " \t\r\n"
@@ -31,7 +32,7 @@ _DECIMAL = re.compile(
 )
 
 
-@lru_cache(128)  # a file has a few of them many times
+@lru_cache(128)  # a file repeats a few names many times
 def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
     """Return the known name nearest to a name, or None if no name is near."""
     import difflib
@@ -43,10 +44,10 @@ def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
 class Element:
     """XML element; text between elements is ignored, because URDF has no such text."""
 
-    tag: str  # with its prefix, if any: prefixes need not be bound
+    tag: str  # includes a prefix, which need not be bound to a namespace
     attributes: dict[str, str]
-    line: int  # of its start tag
-    origin: str  # what errors call the document: the path of the file
+    line: int  # line of its start tag
+    origin: str  # name of the document in errors: the path of the file
     children: list[Element] = field(default_factory=list)
     # {warning: lines}, shared by all elements of the document.
     notes: dict[str, list[int]] = field(default_factory=dict)
@@ -56,11 +57,11 @@ class Element:
         return UrdfError(f"{self.origin}:{self.line}: {message}")
 
     def note(self, message: str) -> None:
-        """Leave a warning about this element; the same warning appears once, with all its lines."""
+        """Add a warning about this element; equal warnings appear once, with all their lines."""
         self.notes.setdefault(message, []).append(self.line)
 
     def find_all(self, tag: str) -> list[Element]:
-        """Return the children of that tag."""
+        """Return the children with a tag."""
         return [child for child in self.children if child.tag == tag]
 
     def find(self, tag: str, of: str) -> Element | None:
@@ -74,7 +75,7 @@ class Element:
         return found[0] if found else None
 
     def require(self, tag: str, of: str) -> Element:
-        """Return the one child of that tag."""
+        """Return the only child with a tag, or raise `UrdfError` without one."""
         found = self.find(tag, of)
         if found is None:
             raise self.error(f"{of} has no <{tag}>; add it")
@@ -88,7 +89,7 @@ class Element:
                 yield from child.iterate(skip)
 
     def allow_only(self, *names: str, of: str) -> None:
-        """Refuse misspelt attributes, and note other unknown attributes."""
+        """Raise an error for misspelt attributes, and add a note about other unknown ones."""
         for name in self.attributes:
             if name in names or ":" in name:
                 continue
@@ -98,11 +99,12 @@ class Element:
                     f"{', '.join(names)}; correct it or remove it"
                 )
             self.note(
-                f"attribute {quoted(name)} of <{self.tag}> is ignored: it is not part of URDF"
+                f"attribute {quoted(name)} of <{self.tag}> is ignored, because it is not part of "
+                "URDF"
             )
 
     def text(self, name: str, of: str) -> str:
-        """Return an attribute that must exist and not be empty."""
+        """Return an attribute, or raise `UrdfError` if it is missing or empty."""
         value = self.attributes.get(name)
         if value is None or not value.strip():
             what = "has no" if value is None else "has an empty"
@@ -110,13 +112,13 @@ class Element:
         return value
 
     def number(self, name: str, of: str, default: float | None = None) -> float:
-        """Return an attribute that is one decimal number of at most 1e30."""
+        """Return an attribute as a decimal number of at most 1e30."""
         if default is not None and name not in self.attributes:
             return default
         return self._decimal(self.text(name, of).strip(_SPACE), f"{name} of {of}")
 
     def vector(self, name: str, of: str, size: int) -> tuple[float, ...]:
-        """Return an attribute that is `size` finite decimal numbers."""
+        """Return an attribute as `size` finite decimal numbers."""
         text = self.text(name, of)
         entries = re.split(rf"[{_SPACE}]+", text.strip(_SPACE))
         if len(entries) != size:
@@ -142,23 +144,23 @@ def decimal(text: str) -> float:
 
 
 def quoted(text: str) -> str:
-    """Show text of a file in an error: quoted, short, on one line, nothing unprintable."""
+    """Return a text of a file for an error: quoted, short, printable and on one line."""
     return repr(text if len(text) <= 60 else f"{text[:57]}...")
 
 
 def enumerated(names: Iterable[str]) -> str:
-    """Show names of a file in a sentence: the first six, and how many more there are."""
+    """Return a list of names for a sentence: the first six, and the number of the others."""
     return listed(map(quoted, names))
 
 
 def named(kind: str, names: Sequence[str]) -> str:
-    """Show names after their kind: joint 'a', joints 'a', 'b'."""
+    """Return names after their kind, such as "joint 'a'" or "joints 'a', 'b'"."""
     return f"{kind}{'s' if len(names) > 1 else ''} {enumerated(names)}"
 
 
 def notes_of(root: Element) -> list[str]:
-    """Return the notes left on a document, one line each."""
-    # Notes are kept with the robot, where the folder does not matter.
+    """Return the notes about a document, one line each."""
+    # Notes contain the file's name without its folder, because they are kept with the robot.
     origin = root.origin.rpartition(os.sep)[2]
     return [
         f"{origin}:{lines[0]}: {message}"
@@ -168,7 +170,7 @@ def notes_of(root: Element) -> list[str]:
 
 
 def parse(document: bytes, origin: str) -> Element:
-    """Return the root of a document in the encoding that it declares, without entities."""
+    """Parse a document in its declared encoding, and return its root; refuse entities."""
     top = Element("", {}, 0, origin)
     opened, count, parser = [top], 0, expat.ParserCreate()
 
@@ -187,7 +189,7 @@ def parse(document: bytes, origin: str) -> Element:
         opened.append(element)
 
     def refuse_document_type(*_: object) -> None:
-        # It may declare entities, which can be read from elsewhere or be of any length.
+        # A document type may declare entities, which may be external or have any length.
         raise UrdfError(
             f"{origin}:{parser.CurrentLineNumber}: document types (<!DOCTYPE>) and entities are "
             "not supported; remove the declaration and replace each entity by its text"

@@ -6,7 +6,7 @@ const sign = (phase) => (!aside(phase) && Math.abs(phase) > 90 ? "−" : "");
 
 // A mode by the one or two bodies that have most of its kinetic energy.
 function nameOf({ energy }) {
-  const [first, second] = energy.map(([name, part]) => `${name} ${(100 * part).toFixed(0)} %`);
+  const [first, second] = energy.map(([name, part]) => `${name} ${(100 * part).toFixed(0)}\u00a0%`);
   return second && energy[1][1] > 0.5 * energy[0][1] ? `${first}, ${second}` : first;
 }
 

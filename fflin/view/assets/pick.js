@@ -2,6 +2,9 @@
 
 const STILL = 4; // CSS pixels that a click may move
 
+// A number with these decimals, never -0.
+const fixed = (x, decimals) => (Number(x.toFixed(decimals)) + 0).toFixed(decimals);
+
 function makePicking(viewer, info) {
   const pane = viewer.dom_element, overlay = document.getElementById("overlay");
   const name = element("div", { id: "hover", hidden: true }), card = element("div", { id: "link", hidden: true });
@@ -33,8 +36,8 @@ function makePicking(viewer, info) {
     const place = new THREE.Vector3(...pose.slice(0, 3)).applyQuaternion(body.quaternion).add(body.position);
     const { x, y, z } = new THREE.Euler().setFromQuaternion(turn, "ZYX");
     values.mass.textContent = `${figure(mass, 4)} kg`;
-    values["x, y, z"].textContent = `${place.toArray().map((each) => each.toFixed(3)).join(", ")} m`;
-    values["roll, pitch, yaw"].textContent = `${[x, y, z].map((each) => ((each * 180) / Math.PI).toFixed(1)).join(", ")}°`;
+    values["x, y, z"].textContent = `${place.toArray().map((each) => fixed(each, 3)).join(", ")} m`;
+    values["roll, pitch, yaw"].textContent = `${[x, y, z].map((each) => fixed((each * 180) / Math.PI, 1)).join(", ")}°`;
   };
   const pick = (mesh) => {
     card.hidden = !mesh;

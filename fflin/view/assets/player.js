@@ -26,6 +26,8 @@ function makePlayer(viewer, info, onTime) {
 
   const state = { time: first, playing: false, speed: info.speed };
   const digits = last - first > 200 ? 0 : last - first > 20 ? 1 : 2;
+  // The width does not change while the motion plays.
+  clock.style.minWidth = `${2 * last.toFixed(digits).length + 5}ch`;
   let then = 0, i = 0;
 
   const seek = (time) => {

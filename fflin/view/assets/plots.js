@@ -119,10 +119,11 @@ function fitPlots(panel) {
     panel.classList.toggle("wide", wide);
     for (let tall = TALL; ; tall = Math.max(LOW, tall - Math.max(2, Math.floor(over() / count)))) {
       panel.style.setProperty("--tall", `${tall}px`);
-      if (over() <= 0 || tall === LOW || !count) return over() <= 0;
+      if (over() <= 0 || tall === LOW || !count) return over() <= 0 ? tall : 0;
     }
   };
-  if (!fit(false) && window.innerWidth >= 1100) fit(true);
+  // A large window has room for a second column before the plots become much lower.
+  if (fit(false) < (window.innerWidth >= 1400 ? 0.75 * TALL : LOW) && window.innerWidth >= 1100) fit(true);
   return panel.clientWidth !== width;
 }
 
