@@ -9,12 +9,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, input_keys
 from fflin.base.process import Progress
-from fflin.base.validation import Array, number, whole
+from fflin.base.validation import Array, Mask, number, whole
 from fflin.control.channel import input_limits
 from fflin.control.optimal.plan_search import Search, cost_of_inputs, excess
 from fflin.control.optimal.shooting import Point, Shooting
@@ -224,7 +224,7 @@ def _least(search: Search, guess: tuple[Array, Array, Array], size: Array) -> _M
 
 
 def _require_within(
-    shooting: Shooting, bounds: Array, what: str, point: Point, which: slice | NDArray[np.bool_]
+    shooting: Shooting, bounds: Array, what: str, point: Point, which: slice | Mask
 ) -> None:
     """Raise `InputError` if a point is outside the limits of some states."""
     values, state = shooting.limited_values(*point), shooting.state
@@ -240,9 +240,7 @@ def _require_within(
         raise InputError(f"the {what} is outside the limits: {listed(outside)}")
 
 
-def _failure(
-    shooting: Shooting, made: _Made, asked: NDArray[np.bool_], duration: float
-) -> InputError:
+def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> InputError:
     """Return the error of a search that failed, with what its last trial misses and exceeds."""
     robot, state = shooting.state.robot, shooting.state
     units = ["rad"] * 3 + [*state.units[3:]]

@@ -1,7 +1,10 @@
 """State X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, frames and chart."""
 
+from __future__ import annotations
+
 from copy import copy
 from itertools import compress
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +17,9 @@ from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALL
 from fflin.dynamics.orbital import OrbitField
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 
 class StateMap:
@@ -129,7 +135,7 @@ class StateMap:
         self.falls = self._pulled or robot.orbit is not None
         self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
 
-    def about(self, reference: pin.SE3) -> "StateMap":
+    def about(self, reference: pin.SE3) -> StateMap:
         """Return a copy of the map with another reference placement and the same `frame`."""
         other = copy(self)
         other._refer(reference)
@@ -246,7 +252,7 @@ class StateMap:
             in_frame = self.to_frame(chart, nu[..., None])[..., 0]
         return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
-    def to_pinocchio(self, x: Array) -> tuple[Array, Array]:
+    def to_pinocchio(self, x: ArrayLike) -> tuple[Array, Array]:
         """Convert a state to a Pinocchio configuration and velocity.
 
         Parameters
