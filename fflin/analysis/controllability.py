@@ -123,8 +123,8 @@ def controllability(lin: LinearModel) -> Controllability:
       rank(B).
     - At rest with symmetric springs and dampers, the other states are tested in second-order form,
       :math:`M a + D v + K s = S u` with positions s, damping D and stiffness K, by the rank of
-      :math:`[p^2 M + p D + K, S]` at each pole p. Entries within rounding error are set to zero,
-      and each row is scaled to at most unit length.
+      :math:`[p^2 M + p D + K, S]` at each pole p. In this matrix, entries that are zero to within
+      rounding error are set to zero, and rows longer than 1 are scaled to length 1.
     - At nonzero velocity, or if springs or dampers are not symmetric, the Popov-Belevitch-Hautus
       test is applied: the rank of :math:`[A - p I, B]` at each pole p is found from its singular
       values, with the states scaled to units of energy.
@@ -187,7 +187,7 @@ def controllability(lin: LinearModel) -> Controllability:
         names = tuple(combination(row, states, 1.0 / size[z]) for row in rows)
     others: Array = np.zeros((len(rows), len(lin.A)))
     others[:, z] = rows
-    # States are named after the coordinates that an input pushes on directly, where possible.
+    # Prefer coordinates on which an input acts directly when the controllable states are named.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
     basis, pivots = echelon(conserved.T @ part.controllable, size, np.tile(driven, 2))
     zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
@@ -220,11 +220,11 @@ def controllability(lin: LinearModel) -> Controllability:
 
 
 class _Part(NamedTuple):
-    """Split of the model without its conserved momenta, in reduced coordinates."""
+    """Controllable and uncontrollable parts of a model after its conserved momenta are removed."""
 
     controllable: Array  # (2 r, d), a basis
-    rows: Array  # (2 r - d, 2 r) with rows @ z what no input acts on
-    names: tuple[str, ...] | None  # of the rows; None if they are named after their states
+    rows: Array  # (2 r - d, 2 r); no input acts on rows @ z
+    names: tuple[str, ...] | None  # of the rows; None: named after their states
     method: str
     fixed: FixedPoles
 
@@ -243,16 +243,18 @@ def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | N
     system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
     idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
     if not system.acting or (not idle.shape[1] and not lin.dt):
-        # Inputs reach every momentum that is not conserved, and so the coordinates.
+        # The inputs act on every momentum that is not conserved, so all remaining states are
+        # controllable.
         everything, fixed = np.eye(2 * r), FixedPoles(margin=margin.transformed(R / system.size))
         return _Part(everything, everything[:0], (), "closed form", fixed)
     found = unobservable(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
     if found is None:
         return None
-    # By symmetry a motion (s, v) that S^T s does not show is a row that no input moves.
+    # The system is symmetric. Each motion (s, v) that is unobservable from the output S^T s
+    # therefore gives a row on which no input acts.
     s, v = np.split(found.motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
-    # The controllable subspace is orthogonal to those rows.
+    # The controllable subspace is orthogonal to these rows.
     size = np.tile(system.size, 2)
     normal = rows / size
     normal = np.linalg.qr((normal / np.linalg.norm(normal, axis=1, keepdims=True)).T, "complete")[0]
@@ -265,11 +267,12 @@ def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | N
     if system.D.values.any():
         rows = np.hstack((rows[:, :r] @ to_s, rows[:, r:]))
         return _Part(controllable, rows, None, "eigenvalues", fixed)
-    # Without damping, the rows read the positions and rates of vibrations that no input drives.
+    # Without damping, each row measures the position or the rate of a vibration that no input
+    # drives.
     members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
     read, names = [np.zeros((0, 2 * r))], list[str]()
     for pole, shapes in found.shapes:
-        if pole.real < 0.0:  # the positive one of the pair has the same shapes
+        if pole.real < 0.0:  # the pole with positive real part has the same shapes
             continue
         momenta = shapes.real.T @ system.M
         zero = np.zeros_like(momenta)

@@ -1,4 +1,4 @@
-"""Effective masses of the vibrations of a robot whose base is clamped."""
+"""Effective masses of the vibration modes of a robot with its base clamped."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 
-# Modes whose frequencies differ by less, relative to them, share one frequency.
+# Modes have the same frequency if their frequencies differ by less than this fraction.
 _EQUAL = 1e-9
 
-# Effective masses below this part of the total are rounding, as are singular values below its root.
+# Effective masses below this fraction of the total are rounding error. For singular values, the
+# limit is the square root of this fraction.
 _ROUNDING = 1e-14
 
 
@@ -74,7 +75,7 @@ class EffectiveMasses(FrozenArrays):
         return self.participation[3:].T ** 2
 
     def __str__(self) -> str:
-        """Show a table of masses and one of inertias, with their percentages of the total."""
+        """Show a table of effective masses and a table of moments of inertia, with percentages."""
         head = (
             f"{self.robot}, base clamped: {counted(len(self.frequencies), 'mode')}; effective "
             "masses and moments of inertia about the origin of the base frame, in base axes"
@@ -168,7 +169,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     kept = np.r_[:6, springs]
     floating = floating_inertia(M, kept, others)
     base, joints = np.arange(6), np.arange(6, len(kept))
-    # In coordinates scaled by the springs K is the identity, and soft modes keep their digits.
+    # Coordinates are scaled by the springs so that K is the identity. The low frequencies are then
+    # as accurate as the high ones.
     soft = 1.0 / np.sqrt(stiffness[springs - 6])
     M_mm = floating[6:, 6:] * np.outer(soft, soft)
     squares, vectors = np.linalg.eigh((M_mm + M_mm.T) / 2.0)
@@ -185,13 +187,13 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
 
 
 def _separated(frequencies: Array, L: Array) -> Array:
-    """Return L (6, k) with modes of one frequency combined, the first with the most mass."""
+    """Combine modes of equal frequency so that the first has the most mass; return L (6, k)."""
     L, first = L.copy(), 0
     while first < len(frequencies):
         near = frequencies <= (1.0 + _EQUAL) * frequencies[first]
         last = int(np.count_nonzero(near))
         group = L[:, first:last]
-        # Those without mass are combined by their inertia.
+        # Modes are combined by their mass, and then modes without mass by their moment of inertia.
         for rows in (slice(0, 3), slice(3, 6)):
             _, sizes, turned = np.linalg.svd(group[rows])
             group[:] = group @ turned.T
@@ -202,7 +204,7 @@ def _separated(frequencies: Array, L: Array) -> Array:
 
 
 def _cells(values: Array, total: Array) -> list[str]:
-    """Return each of three values with its percentage of the total; rounding shows as a dot."""
+    """Return each value with its percentage of the total; a dot stands for rounding error."""
     cells = []
     for value, whole in zip(values.tolist(), total.tolist(), strict=True):
         seen = abs(value) > 1e2 * _ROUNDING * whole

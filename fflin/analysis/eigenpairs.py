@@ -1,4 +1,4 @@
-"""Eigenpairs of a linear model: those of A without its zeros."""
+"""Eigenvalues of A that are not zero, with their eigenvectors."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from fflin.analysis.ranks import EPS
 from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
-# A stiffness less than this part of the largest, both scaled to unit inertias, counts as zero:
-# modes below 3e-7 of the highest frequency are rigid.
+# A stiffness below this fraction of the largest counts as zero, with coordinates scaled to unit
+# inertias. Modes below 3e-7 of the highest frequency are therefore rigid-body modes.
 _NO_STIFFNESS = 1e-13
 
 
 class Eigenpair(NamedTuple):
-    """A pole of A that is not zero, with a positive imaginary part if it is one of a pair."""
+    """Nonzero pole of A with its mode shape; a conjugate pair has one entry, with Im > 0."""
 
     pole: complex
     shape: Values  # (nx,)
@@ -26,7 +26,7 @@ class Eigenpair(NamedTuple):
 
 
 class NaturalModes(NamedTuple):
-    """Eigenpairs of A, with the numbers of `Modes`."""
+    """Eigenpairs of A, and the counts and residual that `Modes` reports."""
 
     pairs: list[Eigenpair]
     rigid_body: int
@@ -35,14 +35,15 @@ class NaturalModes(NamedTuple):
 
 
 def natural_modes(lin: LinearModel) -> NaturalModes:
-    """Find the natural modes of a continuous model of positions and their rates."""
+    """Return the natural modes of a continuous model whose states are positions and their rates."""
     warn_of_stiffness(lin)
     nv, inertia = len(lin.M), np.sqrt(lin.M.diagonal())
-    # Derivatives that are rounding errors of inputs that cancel each other are zero.
+    # Input forces that cancel each other leave rounding errors in the derivatives. Derivatives of
+    # that size are set to zero.
     A = lin.A.copy()
     by_position, rounding = A[nv:, :nv], np.abs(lin.B[nv:]) @ np.abs(lin.u0)
     by_position[np.abs(by_position) <= 1e2 * EPS * rounding[:, None]] = 0.0
-    # With these weights of the states, A has entries of the size of the fastest rate.
+    # Scale the states so that the largest entries of A are about the fastest rate.
     rates = np.abs(np.tile(inertia, 2)[:, None] * A / np.tile(inertia, 2))
     turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
     fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
@@ -64,13 +65,15 @@ def natural_modes(lin: LinearModel) -> NaturalModes:
 def nonzero_eigenpairs(
     A: Array, tolerance: float
 ) -> tuple[list[tuple[complex, Values, float]], int]:
-    """Return the eigenpairs of A that are not zero, each with its rounding, and the nullity.
+    """Return (pole, eigenvector, rounding error) of each nonzero pole of A, and the nullity of A.
 
-    With :math:`V_0, V_1` a basis of the null space and of its complement, A is replaced by
-    :math:`V_1^T A V_1`, which has the other eigenvalues, until no zeros are left.
+    A is repeatedly replaced by :math:`V_1^T A V_1`, where the columns of :math:`V_1` are
+    orthonormal and orthogonal to the null space of A. Each step removes zero eigenvalues only. The
+    steps end when A is regular.
     """
-    # A Jordan block of k zeros turns round-off into eigenvalues of its k-th root. A is scaled so
-    # that its entries are comparable; singular values below n times the tolerance are zero.
+    # Round-off moves the k zero eigenvalues of a Jordan block by its k-th root, so zeros are
+    # removed before eigenvalues are computed. The caller scales A to comparable entries. Singular
+    # values below n times the tolerance count as zero.
     n, whole = len(A), A
     size = float(np.linalg.norm(A))
     nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
@@ -84,14 +87,16 @@ def nonzero_eigenpairs(
                 break
             complement = np.asarray(transposed[:rank].T)
         else:
-            # Columns that are exactly zero are dropped as they stand: a rotation would round.
+            # Columns that are exactly zero are removed without a rotation, which would add
+            # round-off.
             complement = np.eye(len(A))[:, used]
         steps.append(A @ complement)
         A = complement.T @ steps[-1]
     if not len(A):
         return [], nullity
     values, right = np.linalg.eig(A)
-    # y x = 1 for the left eigenvectors y; the inverse is not asked of a defective A.
+    # The left eigenvectors y are scaled to y x = 1. If A is defective, `right` has no inverse, so
+    # the pseudoinverse is used.
     left = np.linalg.pinv(right, rcond=EPS)
     pairs: list[tuple[complex, Values, float]] = []
     for value, y, x in zip(values.tolist(), left, right.T, strict=True):
@@ -100,10 +105,10 @@ def nonzero_eigenpairs(
             pairs.append((complex(value), pairs[-1][1].conj(), error))
             continue
         for step in reversed(steps):
-            # As A V_0 = 0, an eigenvector V_0 a + V_1 x is A V_1 x, up to a factor.
+            # Because A V_0 = 0, the eigenvector in the larger space is A V_1 x, up to a factor.
             x = step @ x  # noqa: PLW2901 - the same vector in a larger space
         x /= np.linalg.norm(x)  # noqa: PLW2901
-        # Slow modes lost digits on the way; one inverse iteration restores them.
+        # Slow modes lose accuracy in these steps; one inverse iteration restores it.
         if np.linalg.norm(whole @ x - value * x) > 1e2 * EPS * abs(value):
             near = whole - (value + EPS * size) * np.eye(n)
             with suppress(np.linalg.LinAlgError):  # the shift is an eigenvalue exactly

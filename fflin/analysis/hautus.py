@@ -1,7 +1,8 @@
 """Controllable and observable subspaces by the Popov-Belevitch-Hautus test, pole by pole.
 
-`split_by_poles` tests any pair (A, B), or the dual pair (A^T, C^T), by [A - s E, B].
-`unobservable` tests second-order systems by [p^2 M + p D + K; C_s + p C_v], with less rounding.
+`split_by_poles` tests any pair (A, B), or the dual pair (A^T, C^T), by the rank of [A - s I, B].
+`unobservable` tests second-order systems by the null space of [p^2 M + p D + K; C_s + p C_v], which
+is less sensitive to rounding.
 """
 
 from __future__ import annotations
@@ -27,31 +28,33 @@ from fflin.analysis.ranks import (
 )
 from fflin.base.validation import Array, Values
 
-# A singular value above _SUSPICIOUS is not zero. Only eigenvectors whose product with inputs of
-# unit length is smaller, or whose eigenvalue has a neighbour this near, need a singular value.
+# A singular value above _SUSPICIOUS is not zero. Singular values are computed only for suspicious
+# eigenvectors: their product with unit input columns is below _SUSPICIOUS, or another eigenvalue
+# is closer than _SUSPICIOUS.
 _SUSPICIOUS = 1e-3
 
-# Eigenvalues nearer than this are the same: rounding moves a defective one by its square root.
-# Second-order poles nearer than _DEFECTIVE are taken for defective, of which eigenvectors say too
-# little.
+# Eigenvalues closer than _SAME_POLE are the same, because rounding moves a defective eigenvalue by
+# the square root of the rounding error. Second-order poles closer than _DEFECTIVE count as
+# defective. Their eigenvectors are not sufficient for the test.
 _SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
 
 # The Rayleigh quotient of a singular vector converges quadratically to the pole, in few steps.
-# Second-order poles take twice as many, each of less than _NEAR times the pole.
+# Second-order poles may take twice as many steps, each smaller than _NEAR times the pole.
 _REFINEMENTS, _NEAR = 4, 0.1
 
-# Poles that sampling brings this near to each other may hide what the continuous model shows.
+# Two poles are aliased if sampling brings them closer than this. A state that the continuous model
+# shows may then be unobservable.
 _ALIASED = 1e-6
 
-# A slower decay may be a defective pair of poles at zero, which rounding moves by its square root.
+# A slower decay may be a defective pair of zero poles, moved by the square root of rounding error.
 _DECAY = 1e-7
 
-# A motion of which a sample leaves less has died out: the rest is rounding.
+# A motion has died out if one sample reduces it below this fraction; the rest is rounding error.
 _DEAD = 1e4 * EPS
 
 
 class _Scaled(NamedTuple):
-    """A pair in coordinates of energy: ``x = to_x @ xi``, time in units of `unit` seconds."""
+    """Matrix A in energy coordinates xi, ``x = to_x @ xi``, and time units of `unit` seconds."""
 
     A: Array
     to_x: Array
@@ -61,10 +64,11 @@ class _Scaled(NamedTuple):
 
 
 def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
-    """Scale Jacobians to units of energy, and of time so that A has a size of about 1."""
-    # Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
-    # likewise over the time unit. The tolerance is twenty times the rounding of M^-1, or that of
-    # the exponential which the derivatives of a sampled model are a difference of.
+    """Scale the states to units of energy, and scale time so that A has a norm of about 1."""
+    # Velocities are scaled to L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy.
+    # Positions are scaled likewise and divided by the unit of time. The tolerance is twenty times
+    # the rounding error of M^-1. For a sampled model it is at least twenty times the rounding
+    # error of (A - I)/dt.
     nv = len(M)
     p, v = slice(0, nv), slice(nv, None)
     L = np.linalg.cholesky(M)
@@ -75,12 +79,14 @@ def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
     A = back @ X @ to_x
     turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
     rate = max(turning, drag, np.sqrt(fall))
-    # Without forces no unit of time is better than another.
+    # Without forces, the unit of time is arbitrary.
     unit = 1.0 / rate if rate > 0.0 else 1.0
     if dt:
-        # Sampled at the period of its only vibration, the model shows only rounding as forces.
+        # If the sample time is the period of the only vibration, the forces in X are rounding
+        # errors, and a unit of time derived from them would be too long.
         unit = min(unit, 100.0 * dt)
-    # With time in this unit, positions are measured in it too.
+    # Positions are divided by the unit of time, which gives positions and velocities the same
+    # units.
     stretch = np.repeat((unit, 1.0), nv)
     to_x, back = to_x * stretch, back / stretch[:, None]
     root = np.sqrt(M.diagonal())
@@ -94,17 +100,17 @@ class Split(NamedTuple):
     """State space of a model, split into a controllable and an uncontrollable part."""
 
     inside: Array  # (nx, d), basis of the controllable subspace
-    outside: Array  # (nx, nx - d), basis of a complement; the unobservable subspace of a dual pair
-    rows: Array  # (nx - d, nx) with rows @ x what no input acts on
+    outside: Array  # (nx, nx - d), complement; for a dual pair, the unobservable subspace
+    rows: Array  # (nx - d, nx); no input acts on rows @ x
     fixed: FixedPoles  # of the complement
 
 
 def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False) -> Split:
-    """Split the state space of (X, B) by left vectors w [A - s E, B] = 0 at every eigenvalue s."""
-    # They are split off by an orthogonal transformation, until there are none: so that the whole of
-    # a defective eigenvalue goes. A staircase would carry the rounding of a weak step into the
-    # next.
-    # X is A, or (A - E)/dt of a sampled model; `drive` is B, or C^T of the dual pair.
+    """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s."""
+    # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair. Left null
+    # vectors are split off by orthogonal transformations until none remain, which also removes the
+    # whole chain of a defective eigenvalue. A staircase algorithm would carry the rounding error
+    # of an ill-conditioned step into the next step.
     pair = _scaled(X, M, dt)
     A, to = (pair.A.T, pair.to_x.T) if dual else (pair.A, pair.from_x)
     B = unit_columns(to @ drive)
@@ -131,20 +137,21 @@ def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = 
     least, most = int(decay.argmin()), int(decay.argmax())
     settling = decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least]).halved()
     if dt and abs(poles[most]) < _DEAD:
-        # Motions that die out between samples cannot be distinguished.
+        # Motions that decay to rounding error within one sample cannot be distinguished.
         margin &= decided(1.0, shapes[:, most]).halved()
     return split._replace(fixed=FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling))
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
-    """Return an orthonormal real basis (m, k) of the left eigenvectors that are orthogonal to B."""
+    """Return a real orthonormal basis (m, k) of the left eigenvectors of A orthogonal to B."""
     from scipy.linalg import eig
 
     poles, left = eig(A, left=True, right=False)
     unseen = np.linalg.norm(left.conj().T @ B, axis=1) < _SUSPICIOUS
     distances = np.abs(poles[:, None] - poles) + np.eye(len(A))
     near = unseen | (distances.min(axis=1) < _SUSPICIOUS)
-    # Rounding splits a defective zero into several poles, so that zero itself is tested first.
+    # Rounding splits a defective zero eigenvalue into several poles, so zero itself is tested
+    # first.
     candidates = [0j, *poles[(poles.imag >= 0.0) & near]]
     found: Array = np.zeros((len(A), 0))
     margin, known = Margin(), np.zeros(0, dtype=complex)
@@ -158,7 +165,8 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
         known = np.append(known, at)
         parts = np.hstack((vectors.real, vectors.imag)) if abs(at.imag) > _SAME_POLE else vectors
         parts = np.real(parts)
-        # Poles that differ only by rounding have the same vectors.
+        # Poles that differ only by rounding error have the same vectors, so only new directions
+        # are added.
         new = parts - found @ (found.T @ parts)
         found = np.hstack((found, image(new, _SUSPICIOUS)[0]))
     return found, margin
@@ -167,7 +175,7 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
 def _left_vectors_at(
     A: Array, B: Array, pole: complex, tolerance: float
 ) -> tuple[Array, complex, Margin]:
-    """Return the left vectors (m, k) at a pole, the pole itself, and the margin."""
+    """Return the left null vectors (m, k) at a pole, the refined pole, and the margin."""
     size = len(A)
     for _ in range(_REFINEMENTS):
         shift = pole.real if abs(pole.imag) < _SAME_POLE else pole
@@ -186,20 +194,22 @@ class Unobservable(NamedTuple):
     """Free motions that a measurement of positions and velocities does not observe."""
 
     motions: Array  # (2 nv, k), basis of the unobservable subspace, (s, ds/dt)
-    shapes: tuple[tuple[complex, Values], ...]  # (nv, m), of each continuous pole or pair but zero
+    shapes: tuple[tuple[complex, Values], ...]  # (nv, m), for each nonzero continuous pole or pair
     fixed: FixedPoles
 
 
 def unobservable(
     system: SecondOrder, position: Noisy, velocity: Noisy, dt: float
 ) -> Unobservable | None:
-    """Find the motions that ``position @ s + velocity @ ds/dt`` does not show.
+    """Return the motions for which ``position @ s + velocity @ ds/dt`` stays zero.
 
-    They are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p; None where
-    eigenvectors do not tell: of other K or D, of aliased or defective poles.
+    The motions are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. The
+    result is None if this test is inconclusive: K or D is not symmetric, D is indefinite, sampling
+    aliases two poles, or a pole is defective.
     """
-    # Those of the pole zero come in chains of two at the most: K s = K v = D v = C_s v = 0 and
-    # C_s s + C_v v = 0. What hides from the inputs are, by symmetry, those of C_s = S^T, C_v = 0.
+    # At the pole zero, Jordan chains have at most two vectors: K s = K v = D v = C_s v = 0 and C_s
+    # s + C_v v = 0. By symmetry, the inputs cannot excite the motions that C_s = S^T, C_v = 0 does
+    # not show.
     if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
         return None
     at_zero, margin = _missed_at_zero(system, position, velocity)
@@ -251,10 +261,11 @@ def _missed_at_zero(system: SecondOrder, position: Noisy, velocity: Noisy) -> tu
 def _missed_shapes_at(
     system: SecondOrder, position: Noisy, velocity: Noisy, pole: complex
 ) -> tuple[Values, complex, Margin]:
-    """Return the shapes (nv, k) that are missed at a pole, the pole refined, and the margin."""
+    """Return the unobservable shapes (nv, k) at a pole, the refined pole, and the margin."""
     M, K, D = system.M, system.K.values, system.D.values
     for step in range(2 * _REFINEMENTS):
-        # Rows are scaled by what stands in them: a slow mode beside a fast one keeps its figures.
+        # Scale each row by the size of its terms, so that a slow mode keeps its accuracy beside a
+        # fast one.
         s = pole if pole.imag else pole.real
         size = abs(s)
         weight = np.sqrt(
@@ -278,10 +289,10 @@ def _missed_shapes_at(
 
 
 def _root(system: SecondOrder, shape: Values, near: complex) -> complex:
-    """Return the root of the scalar equation of a shape that is nearest to a pole."""
+    """Return the root nearest to a pole of the scalar quadratic equation of a mode shape."""
     left = shape
     if abs(shape @ system.M @ shape) < 0.1 * abs(shape.conj() @ system.M @ shape):
-        left = shape.conj()  # where poles are equal, shape^T M shape may vanish
+        left = shape.conj()  # shape^T M shape may vanish if poles are equal
     a, b, c = (left @ X @ shape for X in (system.M, system.D.values, system.K.values))
     root = np.sqrt(complex(b * b - 4.0 * a * c))
     q = -(b + (root if (np.conj(b) * root).real >= 0.0 else -root)) / 2.0
@@ -295,7 +306,7 @@ def _root(system: SecondOrder, shape: Values, near: complex) -> complex:
 
 
 def _simple(system: SecondOrder, shapes: Values, pole: complex) -> bool:
-    """Return whether a pole has as many eigenvectors as its multiplicity."""
+    """Return whether a pole has as many independent eigenvectors as its multiplicity."""
     change = shapes.T @ (2.0 * pole * system.M + system.D.values) @ shapes
     size = np.abs(shapes).T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(system.D.values))
     least = np.linalg.svd(change, compute_uv=False)[-1]
@@ -303,7 +314,7 @@ def _simple(system: SecondOrder, shapes: Values, pole: complex) -> bool:
 
 
 def _aliased(poles: Values, dt: float) -> bool:
-    """Whether sampling maps two poles to one, or a vibration to a pole at rest."""
+    """Return whether sampling maps two poles to one, or a vibration to z = 1."""
     s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
     apart = s[:, None] - s
     turns = np.round(apart.imag / (2.0 * np.pi))

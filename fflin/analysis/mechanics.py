@@ -19,27 +19,29 @@ from fflin.analysis.ranks import (
     without_rounding,
 )
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.validation import Array, Values, instance
+from fflin.base.validation import Array, Indices, Values, instance
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    pass
 
-# Springs or dampers with a larger relative asymmetry are not symmetric.
+# Springs or dampers with a larger relative asymmetry count as not symmetric.
 _SYMMETRIC = 1e-8
 
-# A momentum with a larger relative residual is not the rate of a coordinate: the model moves.
+# If the relative residual is larger, no coordinate has the momentum as its rate, because the
+# operating point is in motion.
 _CONSISTENT = 1e-8
 
-# Rounding of springs and dampers, in units of energy, beside the square and the speed of a spin.
+# Rounding error in units of energy: of springs per squared spin rate, of dampers per spin rate.
 _OF_SPIN = 1e-15
 
-# An orbit that is slower beside the fastest vibration has squares near its rounding.
+# If the ratio of the orbital rate to the fastest vibration is below this, its square is close to
+# rounding error.
 _SLOWEST = 3e-6
 
 
 def checked(lin: LinearModel) -> LinearModel:
-    """Return a model whose state is positions and their rates, or raise `InputError`."""
+    """Return the model if its states are positions and their rates, or raise `InputError`."""
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     lin.require_unchanged()
     nx = len(lin.A)
@@ -70,24 +72,24 @@ def warn_of_stiffness(lin: LinearModel) -> None:
 
 
 def state_sizes(lin: LinearModel) -> Array:
-    """Return weights (nx,) that make states comparable, by their inertia."""
+    """Return weights (nx,) that scale the states to comparable sizes by their inertia."""
     return np.tile(np.sqrt(lin.M.diagonal()), 2)
 
 
 def rate_matrix(lin: LinearModel) -> Array:
-    """Return A, or (A - E)/dt of a sampled model, which has the same invariant subspaces."""
+    """Return A, or (A - I)/dt of a sampled model, which has the same invariant subspaces."""
     return (lin.A - np.eye(len(lin.A))) / lin.dt if lin.dt else lin.A
 
 
-def floating_inertia(M: Array, kept: NDArray[np.intp], others: NDArray[np.intp]) -> Array:
-    """Return the Schur complement of M: the inertia of coordinates with the others free."""
+def floating_inertia(M: Array, kept: Indices, others: Indices) -> Array:
+    """Return the inertia of the kept coordinates with the others free: a Schur complement of M."""
     across = M[np.ix_(others, kept)]
     return M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(others, others)], across)
 
 
 @dataclass(frozen=True)
 class SecondOrder:
-    """The forces of a model, in coordinates s whose rates are the velocities."""
+    """Matrices of M a + D v + K s = S u, in coordinates s whose rates are the velocities v."""
 
     M: Array
     K: Noisy
@@ -96,11 +98,11 @@ class SecondOrder:
 
     @cached_property
     def size(self) -> Array:
-        """Roots of the diagonal of M (nv,), which make forces and speeds comparable."""
+        """Square roots (nv,) of the diagonal of M, which make forces and speeds comparable."""
         return np.sqrt(self.M.diagonal())
 
     def restricted(self, R: Array) -> SecondOrder:
-        """Return the system of the motions R z, whose constraint forces do no work."""
+        """Return the system restricted to motions R z by constraint forces that do no work."""
         M = R.T @ self.M @ R
         K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
         return SecondOrder(M, K, D, self.S.after(R.T))
@@ -122,7 +124,7 @@ class SecondOrder:
 
     @cached_property
     def poles(self) -> tuple[Values, Margin]:
-        """Approximate nonzero poles, one of each conjugate pair."""
+        """Approximate nonzero poles, one of each conjugate pair, and the margin of their rank."""
         rigid, margin = self._null(self.K, self.D)
         unloaded, other = self._null(self.K)
         R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
@@ -151,24 +153,26 @@ class SecondOrder:
 
 def second_order(lin: LinearModel) -> SecondOrder:
     """Return the second-order form of a model, continuous or sampled."""
-    # The product with M leaves rounding where there is no spring, damper or input. It is put to
-    # zero by one floor for springs and one for dampers, per unit of energy, and one for each input.
+    # The product with M leaves rounding errors where there is no spring, damper or input. Entries
+    # below a threshold are set to zero. All springs share one threshold and all dampers another,
+    # per unit of energy; each input has its own.
     nv, M, X = len(lin.M), lin.M, rate_matrix(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
     spread = 4.0 * nv * EPS * np.abs(rates)
     if lin.dt:
-        # Every entry of an exponential carries the rounding of the largest.
+        # Every entry of a matrix exponential has the rounding error of the largest entry.
         spread[:, : 2 * nv] += 4.0 * nv * EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
     noise = np.abs(M) @ spread
-    # What balances in a spin leaves rounding, and may leave nothing else to compare it with.
+    # Forces that balance during a spin leave rounding errors. There may be no other force to
+    # compare them with, so the errors are estimated from the spin rate.
     turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
     spin = float(np.abs(turns).max(initial=0.0))
     noise[:, :nv] += _OF_SPIN * np.outer(size, size) * spin**2
     noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(size, size) * spin
     forces = Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
-    # The forces of an input are compared with the largest of the same input.
+    # The forces of an input are compared with the norm of its column.
     each = np.linalg.norm(S.values / size[:, None], axis=0)
     return SecondOrder(
         M=M,
@@ -179,9 +183,10 @@ def second_order(lin: LinearModel) -> SecondOrder:
 
 
 def at_rest(lin: LinearModel) -> LinearModel | None:
-    """Return a model with the second-order structure of the given one, None where it has none."""
-    # That is the continuous one where positions change at the rates of velocities alone, which also
-    # tells the structure of what was sampled from it; or a sampled one without forces.
+    """Return the model whose second-order structure applies to `lin`, or None if there is none."""
+    # The continuous model has this structure if the rates of the positions depend on the
+    # velocities alone. The structure then also applies to a model sampled from it. A sampled model
+    # without its continuous model has this structure only if there are no forces.
     source, nv = lin.generator or lin, len(lin.M)
     X = rate_matrix(source)
     if X[:nv, :nv].any() or (source.dt and X[nv:].any()):
@@ -190,7 +195,7 @@ def at_rest(lin: LinearModel) -> LinearModel | None:
 
 
 def rates_of_positions(X: Array) -> Array:
-    """Return N (nv, nv) with dp/dt = N nu; the identity where sampling at a period hides it."""
+    """Return N (nv, nv) with dp/dt = N nu, or the identity if sampling makes N ill-conditioned."""
     nv = len(X) // 2
     N = X[:nv, nv:]
     return N if np.linalg.cond(N) < 1e6 else np.eye(nv)
@@ -200,35 +205,37 @@ def rates_of_positions(X: Array) -> Array:
 class ConservedMomenta:
     """Conserved momenta, which no input, spring or damper changes, and the kept coordinates."""
 
-    # W (k, nv) with W M nu conserved, in echelon form: a unit vector is one coordinate's momentum.
+    # W (k, nv): W M nu is conserved. W is in echelon form, so a unit vector stands for the
+    # momentum of a single coordinate.
     weights: Array
-    # L1, L2 (k, nx) with L1 A = 0, L2 A = L1, L B = 0 (sampled: of (A - E)/dt).
+    # L1, L2 (k, nx) with L1 A = 0, L2 A = L1 and L1 B = L2 B = 0. For a sampled model, A is
+    # replaced by (A - I)/dt.
     momenta: Array
     coordinates: Array
-    # (r,), coordinates that, with their rates, determine the others where L1 x = L2 x = 0
-    kept: NDArray[np.intp]
-    T: Array  # (nx, 2 r), the states with L1 x = L2 x = 0 of those coordinates and rates
+    # (r,): kept coordinates. They and their rates determine all other states if L1 x = L2 x = 0.
+    kept: Indices
+    T: Array  # (nx, 2 r): state with L1 x = L2 x = 0 from the kept coordinates and rates
     margin: Margin  # of the decision on r
 
     @property
-    def selected(self) -> NDArray[np.intp]:
-        """The states (2 r,) of the kept coordinates and their rates."""
+    def selected(self) -> Indices:
+        """Indices (2 r,) of the kept coordinates and their rates in the state."""
         return np.concatenate((self.kept, self.kept + len(self.T) // 2))
 
     @property
     def rates(self) -> Array:
-        """All velocities (nv, r) of the rates of the kept coordinates."""
+        """Map (nv, r) from the rates of the kept coordinates to all velocities."""
         return self.T[len(self.T) // 2 :, len(self.kept) :]
 
 
 def conserved(lin: LinearModel) -> ConservedMomenta:
     """Find the conserved momenta (9.2): :math:`W M [A_{21}, A_{22}, B_2] = 0`."""
-    lin = lin.generator or lin  # it conserves the same momenta
+    lin = lin.generator or lin  # conserves the same momenta
     nv, X, system = len(lin.M), rate_matrix(lin), second_order(lin)
     size = system.size
     pushes = stacked([[system.K.T], [system.D.T], [system.S.T]])
     free, margin = null_space(pushes @ np.diag(1.0 / size), states=2)
-    # A column of W^T is a unit vector where the momentum is that of one coordinate alone.
+    # A column of W^T is a unit vector if the momentum belongs to a single coordinate.
     basis, pivots = echelon(free / size[:, None], size)
     W = basis.T
     momenta = W @ lin.M
@@ -249,7 +256,7 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
 
 
 def _driven(X: Array, momenta: Array) -> Array | None:
-    """Return the coordinates (k, nv) over the positions whose rates are the momenta, if any."""
+    """Return the coordinates (k, nv) whose rates are the momenta, or None if there are none."""
     nv = len(X) // 2
     X11, X12 = X[:nv, :nv], X[:nv, nv:]
     if not X11.any():

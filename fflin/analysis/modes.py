@@ -190,7 +190,7 @@ class Modes:
         return np.array(listed)
 
     def __str__(self) -> str:
-        """Show how many are rigid, and a table of the others with the bodies that move most."""
+        """Show the number of rigid-body modes, and a table of the other modes."""
         vibrations, others = len(self.vibrations), len(self.modes) - len(self.vibrations)
         head = (
             f"{self.robot}: {counted(self.rigid_body, 'rigid-body mode')} "
@@ -225,7 +225,7 @@ class Modes:
         return "\n\n".join((*parts, *self._of_appendages()))
 
     def _of_appendages(self) -> list[str]:
-        """Return the modes of appendages, free and clamped, and their effective masses."""
+        """Return tables of the appendage modes, free and clamped, and of their effective masses."""
         robot = self.lin._robot
         if robot is None or not robot.modes:
             return []
@@ -312,7 +312,7 @@ def modes(lin: LinearModel) -> Modes:
     shapes = []
     for pair in pairs:
         positions = np.abs(pair.shape[:nv])
-        # Of several that move equally, such as symmetric panels, the first.
+        # If several coordinates move equally, such as symmetric panels, the first is scaled to 1.
         largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
         shapes.append(np.asarray(pair.shape / pair.shape[largest], dtype=complex))
     energies = energy_by_body(lin._robot, lin, shapes)
@@ -335,7 +335,7 @@ def modes(lin: LinearModel) -> Modes:
 
 
 def _percents(energy: Mapping[str, float], room: int) -> str:
-    """Name the bodies with 1 % of the energy or more, and sum up all other bodies."""
+    """Name the bodies with at least 1 % of the energy, and sum up all other bodies."""
     words = [f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01]
     text = ""
     for count in range(len(words), 0, -1):
@@ -362,7 +362,7 @@ def energy_by_body(
     inertias = robot.model.inertias.tolist()[ROOT:]
     found: list[Mapping[str, float]] = []
     for shape in shapes:
-        # All velocities of a mode are its pole times the displacements.
+        # In a mode, all velocities are the displacements times the pole.
         moved = displacement(lin, chart, shape)
         energies = np.zeros(len(names))
         for part in (moved.real, moved.imag):

@@ -1,4 +1,4 @@
-"""Names of combinations of states: momenta, the coordinates they drive, and largest terms."""
+"""Names of combinations of states, such as conserved momenta and their coordinates."""
 
 import re
 
@@ -9,7 +9,7 @@ from fflin.analysis.ranks import Margin
 from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
-# Of each group of velocities: its momenta, and the coordinates that these drive.
+# For each group of velocities: its momenta, and the coordinates whose rates are these momenta.
 _CONSERVED = {
     "omega_b": ("angular momentum", "base attitude"),
     "v_b": ("linear momentum", "base position"),
@@ -20,7 +20,7 @@ _AXIS = re.compile(r"(?<!\S)[xyz](?!\S)")
 
 
 def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, ...]:
-    """Name the conserved momenta, and then the coordinates that they drive."""
+    """Name the conserved momenta, and then the coordinates whose rates are these momenta."""
     nv = len(lin.M)
     size = np.sqrt(lin.M.diagonal())
     rates = [name.split(".", 1) for name in lin.state_names[nv:]]
@@ -28,7 +28,8 @@ def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, 
         tuple(f"{_CONSERVED.get(group, _OTHER)[i]} {member}" for group, member in rates)
         for i in (0, 1)
     )
-    # A coordinate cannot be moved while the others are held; with them it can.
+    # The inputs cannot move such a coordinate alone, but they may move it together with the
+    # others.
     only_joints = all(rates[i][0] == "qdot_m" for i in conserved.kept)
     of_base = all(
         not row[i] for row in conserved.weights for i in range(nv) if rates[i][0] == "qdot_m"
@@ -41,7 +42,7 @@ def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, 
 
 
 def grouped(names: tuple[str, ...]) -> list[str]:
-    """Join names that differ in their axis alone: "angular momentum x, y, z" is one."""
+    """Join names that differ only in their axis, for example to "angular momentum x/y/z"."""
     groups: dict[str, list[str]] = {}
     for name in names:
         axes = _AXIS.findall(name)
@@ -54,13 +55,13 @@ _RATES = {"q_b": "omega_b", "r_b": "v_b", "q_m": "qdot_m"}
 
 
 def rate_of(name: str) -> str:
-    """Return the name of the rate of a coordinate; of a rate none."""
+    """Return the name of the rate of a coordinate, or "" if the name is not a coordinate."""
     group, _, member = name.partition(".")
     return f"{_RATES[group]}.{member}" if group in _RATES else ""
 
 
 def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:
-    """Show a linear combination by its largest terms; `sizes` makes the weights comparable."""
+    """Format a linear combination by its largest terms; `sizes` makes the weights comparable."""
     order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]
     largest = abs(weights[order[0]]) * sizes[order[0]]
     shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
@@ -75,7 +76,7 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
 
 
 def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[str, ...]:
-    """Say what is decided within rounding, and the two answers: `count` states, or others."""
+    """Return a note for each undecided rank, with both possible numbers of states."""
     return tuple(
         f"undecided: {shape(lin, at)} counts as {'' if change < 0 else 'not '}{what}, but the "
         f"test value is only {ratio:.1g} times its rounding error; {count} or {count + change} "
@@ -85,7 +86,7 @@ def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[
 
 
 def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
-    """Say where rounding decides whether the slowest motion decays."""
+    """Return a note if rounding error leaves undecided whether the slowest motion decays."""
     return tuple(
         f"undecided: {shape(lin, at)} may or may not decay by itself, because its decay rate is "
         f"only {ratio:.1g} times its rounding error; the model may or may not be {what}"
@@ -94,7 +95,7 @@ def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
 
 
 def shape(lin: LinearModel, at: Values) -> str:
-    """Name the coordinates that rates (nv,) move, real or complex, by the largest."""
+    """Describe rates `at` (nv,), real or complex, by the coordinates that move most."""
     size = np.sqrt(lin.M.diagonal())
     largest = at[int(np.abs(at * size).argmax())]
     of_base = {"omega_b": "rotation about ", "v_b": "translation along "}

@@ -14,7 +14,7 @@ from fflin.base.validation import Array, FrozenArrays, Values, instance, positiv
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.model import LinearModel
 
-# A pole that decays less, relative to the fastest, may be one at zero that rounding moved.
+# A slower decay, relative to the fastest pole, may be a pole at zero that rounding has moved.
 _DECAY = 1e-7
 
 
@@ -132,7 +132,7 @@ def observability(lin: LinearModel) -> Observability:
 
 
 def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
-    """Return the motions (nx, k) that the outputs miss, their poles, and the method."""
+    """Return the unobservable motions (nx, k), their poles, and the method."""
     source, nv = mechanics.at_rest(lin), len(lin.M)
     if source is not None:
         system = mechanics.second_order(source)
@@ -147,7 +147,7 @@ def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
         if found is not None:
             motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
             return motions, found.fixed, "eigenvalues" if system.acting else "closed form"
-    # The uncontrollable subspace of the dual pair (A^T, C^T).
+    # The unobservable subspace belongs to the uncontrollable part of the dual pair (A^T, C^T).
     part = split_by_poles(mechanics.rate_matrix(lin), lin.C.T, lin.M, lin.dt, dual=True)
     return part.outside, part.fixed, "eigenvalues"
 
@@ -262,7 +262,7 @@ def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
     steps = round(duration / dt)
     if not steps or abs(steps * dt - duration) > 1e-9 * duration:
         raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
-    # The sum of A^k Q A^kT over k < steps, by the binary digits of their number.
+    # Sum A^k Q A^kT over k < steps by repeated doubling.
     total, power = np.zeros_like(Q), np.eye(len(A))
     while steps:
         if steps & 1:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Of the two routes to a block, one is drawn above its line and one below.
+# Vertical offsets of the tests, so that the points of two independent computations do not overlap.
 _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -131,7 +131,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
 
 
 def _draw_shape(axes: Axes, line: int, shape: Values, colors: Sequence[str]) -> None:
-    """Draw a shape as bars about its line: filled the part in phase, outlined the modulus."""
+    """Draw a shape as bars on its line: the real part filled, the modulus outlined."""
     x, height = np.arange(len(shape)), -0.45  # the axis points down
     axes.axhline(line, color="#888888", lw=0.5)
     axes.bar(x, height * shape.real, 0.7, line, color=colors)

@@ -1,4 +1,4 @@
-"""Rank decisions with their distance from doubt, and echelon forms."""
+"""Rank decisions with their margins, and echelon forms."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.validation import Array, Values
+from fflin.base.validation import Array, Indices, Values
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    pass
 
 EPS = float(np.finfo(float).eps)
 
-# A coefficient of an echelon form that is smaller, relative to a pivot of 1, is rounding.
+# Smaller coefficients of an echelon form, relative to the pivot 1, are rounding errors.
 _CLEAN = 1e-10
 
-# A tolerance is SAFETY times the rounding; singular values between LOST and CLEAR times the
-# tolerance are in doubt.
+# A tolerance is SAFETY times the rounding error. A singular value between LOST and CLEAR times its
+# tolerance is undecided.
 SAFETY, CLEAR, LOST = 10.0, 30.0, 0.01
 
-# A force below _FLOOR times the largest of its kind, per unit of energy, may be rounding; below
-# the part _ROUNDING of that it is taken for it.
+# A force below _FLOOR times the largest force of its kind, per unit of energy, may be rounding
+# error. A force below _ROUNDING times this limit is set to zero.
 _FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 
 class Decision(NamedTuple):
-    """Return whether a singular value is nonzero: its ratio to the tolerance is above 1."""
+    """Singular value divided by its tolerance; it counts as nonzero if this ratio is above 1."""
 
     ratio: float
     at: Values = np.zeros(0)  # its direction; empty if there was nothing to decide
-    states: int = 1  # that hang on it: two on a pair of poles, or a momentum and what it drives
+    states: int = 1  # states decided: 2 for a pair of poles, or for a momentum and its coordinate
 
 
 class Margin(NamedTuple):
-    """Distance of rank decisions from doubt: smallest counted and largest dropped value."""
+    """Margin of rank decisions: smallest value counted as nonzero, largest counted as zero."""
 
     counted: Decision = Decision(np.inf)
     left_out: Decision = Decision(0.0)
@@ -51,7 +51,7 @@ class Margin(NamedTuple):
         return self.left_out.ratio
 
     def __and__(self, other: Margin) -> Margin:
-        """Return the nearer to doubt of two."""
+        """Combine two margins: keep the smaller counted value and the larger dropped value."""
         counted, left_out = zip(self, other, strict=True)
         return Margin(
             min(counted, key=lambda decision: decision.ratio),
@@ -59,20 +59,20 @@ class Margin(NamedTuple):
         )
 
     def moved(self, change: Callable[[Values], Values]) -> Margin:
-        """Return it with its directions changed."""
+        """Return the margin with a function applied to its directions."""
         return Margin(*(d._replace(at=change(d.at)) if d.at.size else d for d in self))
 
     def transformed(self, change: Array) -> Margin:
-        """Return it with the directions in other coordinates, ``change * v`` or ``change @ v``."""
+        """Return the margin with transformed directions, ``change * v`` or ``change @ v``."""
         return self.moved(lambda v: change * v if change.ndim == 1 else change @ v)
 
     def halved(self) -> Margin:
-        """Return it with the positions or the rates of the directions, whichever are larger."""
+        """Return the margin with the larger half of each direction: its positions or its rates."""
         return self.moved(lambda v: max(np.split(v, 2), key=np.linalg.norm))
 
     @property
     def doubts(self) -> tuple[tuple[float, Values, int], ...]:
-        """The decisions within rounding: ratios, directions, and how many states more they are."""
+        """Decisions within rounding error: ratio, direction, change of the number of states."""
         counted, left_out = self
         near = [(counted.ratio, counted.at, -counted.states)] * (self.kept < CLEAR)
         near += [left_out] * (self.dropped > LOST)
@@ -80,7 +80,7 @@ class Margin(NamedTuple):
 
 
 def decided(ratio: float, direction: Values, states: int = 1) -> Margin:
-    """Return the margin of one decision."""
+    """Return the margin of a single decision."""
     one = Decision(ratio, direction, states)
     return Margin(counted=one) if ratio > 1.0 else Margin(left_out=one)
 
@@ -89,29 +89,29 @@ class FixedPoles(NamedTuple):
     """Poles of the uncontrollable or unobservable part."""
 
     poles: Values = np.zeros(0)  # (k,) [1/s], or of the sampled model
-    decays: bool = True  # whether all of them do, beyond rounding
-    margin: Margin = Margin()  # of what is reached or shown
+    decays: bool = True  # whether all these poles decay, beyond rounding error
+    margin: Margin = Margin()  # of the rank decisions
     settling: Margin = Margin()  # of whether the slowest of these poles decays
 
     def transformed(self, change: Array) -> FixedPoles:
-        """Return it with the directions of its margins in other coordinates."""
+        """Return the poles with the directions of their margins in other coordinates."""
         margin, settling = self.margin.transformed(change), self.settling.transformed(change)
         return self._replace(margin=margin, settling=settling)
 
 
 class Noisy(NamedTuple):
-    """A matrix and what rounding may have done to each of its entries."""
+    """Matrix with a bound on the rounding error of each entry."""
 
     values: Any  # real or complex
     noise: Array
 
     @classmethod
     def exact(cls, values: Values) -> Noisy:
-        """Return a matrix without rounding."""
+        """Wrap a matrix that has no rounding error."""
         return cls(values, np.zeros(values.shape))
 
     def columns(self, part: slice) -> Noisy:
-        """Return some of its columns."""
+        """Return a range of columns."""
         return Noisy(self.values[:, part], self.noise[:, part])
 
     def __matmul__(self, right: Array) -> Noisy:
@@ -136,7 +136,7 @@ def stacked(rows: list[list[Noisy]]) -> Noisy:
 
 
 def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
-    """Put to zero the entries that are rounding, also beside the largest, in units of energy."""
+    """Set entries that are rounding errors to zero; sizes are compared in units of energy."""
     units = rows[:, None] * columns
     size = np.abs(forces.values)
     least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
@@ -146,9 +146,9 @@ def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
 
 
 def right_vectors(matrix: Noisy, states: int = 1) -> tuple[Array, Any, int, Margin]:
-    """Return n singular values, right vectors (n, n), the rank, and its margin."""
-    # Rows are brought to unit length, or shorter so that none has more rounding: none hides behind
-    # another, and none that is rounding itself hides the others.
+    """Return n singular values, right singular vectors (n, n), the rank, and its margin."""
+    # Rows are scaled to unit length, so that no row hides behind a larger one. A row with much
+    # rounding error is made shorter, so that it does not hide other rows.
     n = matrix.values.shape[1]
     sizes, spread = (np.linalg.norm(entries, axis=1) for entries in matrix)
     real = sizes > 0.0
@@ -166,7 +166,7 @@ def right_vectors(matrix: Noisy, states: int = 1) -> tuple[Array, Any, int, Marg
 
 
 def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin:
-    """Return the margin of a rank, of singular values as ratios to the tolerance."""
+    """Return the margin of a rank from singular values divided by the tolerance."""
     margin = Margin()
     for index in range(max(rank - 1, 0), min(rank + 1, len(ratios))):
         margin &= decided(float(ratios[index]), vectors[:, index], states)
@@ -174,13 +174,13 @@ def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin
 
 
 def null_space(matrix: Noisy, states: int = 1) -> tuple[Array, Margin]:
-    """Return the null space (n, k) of a matrix, orthonormal; see `right_vectors`."""
+    """Return an orthonormal basis (n, k) of the null space, and its margin; see `right_vectors`."""
     _, vectors, rank, margin = right_vectors(matrix, states)
     return vectors[:, rank:], margin
 
 
 def image(matrix: Array, tolerance: float) -> tuple[Array, Array]:
-    """Return orthonormal bases of what columns (m, k) span (m, r), and of its complement."""
+    """Return orthonormal bases of the column space (m, r) and of its orthogonal complement."""
     if not matrix.size:
         return np.zeros((len(matrix), 0)), np.eye(len(matrix))
     U, values, _ = np.linalg.svd(matrix)
@@ -197,15 +197,16 @@ def unit_columns(matrix: Array) -> Array:
 
 def echelon(
     columns: Array, weights: Array, preferred: Array | None = None
-) -> tuple[Array, NDArray[np.intp]]:
-    """Return a basis of independent columns (m, r), the identity at r pivots, and these."""
+) -> tuple[Array, Indices]:
+    """Return a basis (m, r) of independent columns, with identity pivot rows, and the pivots."""
     from scipy.linalg import qr
 
     size = columns.shape[1]
     if not size:
         return columns.copy(), np.zeros(0, dtype=np.intp)
     weighted = np.linalg.qr(columns * weights[:, None])[0]
-    # A preferred row counts a thousand times; more would cost digits by bad pivots.
+    # Preferred rows are weighted by 1,000; a larger weight would cost accuracy through poor
+    # pivots.
     graded = weighted if preferred is None else weighted * np.where(preferred, 1e3, 1.0)[:, None]
     pivots = np.sort(qr(graded.T, mode="r", pivoting=True)[1][:size])
     basis = np.linalg.solve(columns[pivots].T, columns.T).T

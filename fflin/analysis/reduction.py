@@ -9,14 +9,13 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from fflin.analysis.mechanics import checked, conserved, floating_inertia, second_order
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin, Noisy, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.names import input_keys
-from fflin.base.validation import Array, frozen
+from fflin.base.validation import Array, Indices, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.files import given
@@ -24,14 +23,13 @@ from fflin.linear.model import LinearModel, same_certificate
 from fflin.robot.joints import frame_index
 from fflin.robot.robot import Robot
 
-Indices: TypeAlias = NDArray[np.intp]
 Make: TypeAlias = Callable[[LinearModel], LinearModel]
 Part = TypeVar("Part", bound=LinearModel)
 
-# What is smaller, relative to the rest, is rounding.
+# Smaller values, relative to the largest, are rounding errors.
 _ROUNDING = 1e-9
 
-# Largest part of f0, relative to it, that the reduced state may leave out.
+# Largest part of f0, relative to its largest entry, that the reduced state may leave out.
 _DRIFT = 1e-9
 
 
@@ -256,8 +254,9 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 
 
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
-    """Return the wheels (k,) on whose angle nothing depends, and those whose speed is so too."""
-    # A speed matters where the carrier turns at the point, and where the wheel has friction.
+    """Return the wheels whose angle has no effect, and those whose speed has no effect either."""
+    # A wheel speed has an effect if the carrier rotates at the operating point or the wheel has
+    # friction.
     nv, wanted = len(lin.M), {f"q_m.{name}" for name in wheel_inputs(lin)}
     at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
     if not len(at):
@@ -268,9 +267,10 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
-    """Return the wheels (k,) that a design does not regulate (9.5)."""
-    # Inputs that turn nothing at rest may still spin wheels: as many as they do so independently
-    # can be momenta. By default these stay where something else turns the base.
+    """Return the indices (k,) of the wheels that a design does not regulate (9.5)."""
+    # Combinations of inputs that exert no net force at rest may still change wheel speeds. As many
+    # wheels are kept as there are independent combinations. By default, wheels are kept only if
+    # inputs other than the wheels can rotate the base.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
         raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
     _, free = ignorable_wheels(lin)
@@ -288,9 +288,10 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
 
 
 def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
-    """Return the model of the states that are regulated; `lin` itself where it has no wheels."""
-    # It lacks the `removed_wheels`, and the angles of other wheels on which nothing depends: there
-    # may be fewer positions than rates. It lacks the base's position if no input pushes it.
+    """Return the model of the regulated states, or `lin` itself if it has no wheels."""
+    # The model lacks the `removed_wheels`, and the angles of all wheels whose angle has no effect.
+    # It may therefore have fewer positions than rates. It lacks the base position if no input acts
+    # on it.
     if not wheel_inputs(lin):
         return lin
     source, nv = lin.generator or lin, len(lin.M)
@@ -298,7 +299,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     base = [i for i in range(nv) if idle[i] and lin.state_names[i].startswith("r_b.")]
     columns = [*base, *(i + nv for i in base)]
     if np.abs(np.delete(source.A[:, columns], columns, axis=0)).max(initial=0.0) > _ROUNDING:
-        base = []  # in axes that turn one direction is part of the others
+        base = []  # in rotating axes, each direction affects the others
     removed = np.union1d(base, removed_wheels(lin, wheel_speeds)).astype(np.intp)
     part = without(lin, removed)
     angles = {lin.state_names[i] for i in ignorable_wheels(lin)[0]}
@@ -319,7 +320,7 @@ def rigid_forces(body: LinearModel) -> Noisy:
 
 
 def without(lin: LinearModel, removed: Indices) -> LinearModel:
-    """Return a model without coordinates (k,) and their rates, exact whatever these do (9.4)."""
+    """Remove coordinates (k,) and their rates from a model; exact for any motion of them (9.4)."""
     kept = np.setdiff1d(np.arange(len(lin.M)), removed)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
     rest = floating_inertia(lin.M, kept, removed)
@@ -327,7 +328,7 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
 
 
 def _balanced(lin: LinearModel) -> LinearModel:
-    """Return a model without the forces that are rounding of a spin, which its parts lack."""
+    """Return the model without stiffness and damping that are only rounding errors of a spin."""
     nv, A, system = len(lin.M), lin.A.copy(), second_order(lin)
     if not lin.dt and not system.K.values.any():
         A[nv:, :nv] = 0.0
@@ -337,7 +338,7 @@ def _balanced(lin: LinearModel) -> LinearModel:
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
-    """Return the model of some states, with the inertia M and the outputs of these states."""
+    """Return the model of the named states, with the inertia M and the outputs of these states."""
     S = selection(names, lin.state_names)
     seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
     values |= {"C": seen @ values["C"], "D": seen @ lin.D, "y0": seen @ lin.y0}
@@ -352,13 +353,13 @@ def selection(names: Sequence[str], of: Sequence[str]) -> Array:
 
 
 def outputs_of(lin: LinearModel, S: Array) -> Array:
-    """Return the matrix (k, ny) that selects the outputs of the states S x alone."""
+    """Return the matrix (k, ny) that selects the outputs that depend only on the states S x."""
     others = np.abs(lin.C - lin.C @ S.T @ S).max(axis=1, initial=0.0)
     return np.eye(len(lin.C))[others <= 1e-12 * np.abs(lin.C).max(axis=1, initial=0.0)]
 
 
 def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
-    """Return the fields of a model of the states z = S x of the inertia M, the others T z."""
+    """Return the fields of the model with the states z = S x, where x = T z, and the inertia M."""
     names = tuple(lin.state_names[i] for i in S.argmax(axis=1))
     whole = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
     return whole | {
@@ -376,7 +377,7 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
 
 
 def certified(part: Part, lin: LinearModel, make: Make) -> Part:
-    """Return a part with the certificate of the whole, and with what made it of its source."""
+    """Add the certificate of a whole model to its part, and a source to a sampled part."""
     fingerprint, source = part.fingerprint, lin.generator
     certify = partial(same_certificate, lin, fingerprint)
     of = (fingerprint, make(source)) if lin.dt and source is not None else None

@@ -20,7 +20,8 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
 
-# Of the principal moments, relative to the largest: what eigenvalues and sums over bodies lose.
+# Rounding error of the principal moments relative to the largest, from eigenvalues and sums over
+# bodies.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
@@ -76,7 +77,7 @@ class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
     __slots__ = ()
 
     def __str__(self) -> str:
-        """Show one of the four attitudes of each kind."""
+        """Show one row for each four equivalent attitudes."""
         rows = [["radial", "along", "normal [kg m^2]", "", "growth [1/s]"]]
         for one in self[::4]:
             said = {True: "stable", False: "unstable", None: "undecided"}[one.stable]
@@ -177,12 +178,12 @@ def relative_equilibria(
 
 
 def _libration(moments: Array, n: float) -> tuple[Complex, float]:
-    """Return the poles (6,) of a body's attitude, and the smallest stability condition."""
+    """Return the poles (6,) of the attitude motion, and the smallest margin of stability."""
     radial, along, normal = moments.tolist()
     pitch = 3.0 * (along - radial) / normal
     k_a, k_r = (normal - radial) / along, (normal - along) / radial
     b, c = 1.0 + 3.0 * k_a + k_a * k_r, 4.0 * k_a * k_r
-    # Of mu^2 + b mu + c = 0, mu = lambda^2 / n^2, without cancellation.
+    # Solve mu^2 + b mu + c = 0 for mu = lambda^2 / n^2 without cancellation.
     root = np.sqrt(complex(b * b - 4.0 * c))
     larger = -0.5 * (b + (root if b >= 0.0 else -root))
     squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)

@@ -22,13 +22,13 @@ from fflin.base.errors import (
 from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
-# A relative singular value of the equilibrated Popov-Belevitch-Hautus matrix below this counts as
-# zero: repeated eigenvalues are computed with such errors.
+# Relative singular values of the equilibrated Popov-Belevitch-Hautus matrix below this count as
+# zero, because repeated eigenvalues have errors of this size.
 _RANK = 1e-7
 
 
 def require_stabilizable(lin: LinearModel) -> None:
-    """Raise `StabilizabilityError` that names the states that inputs cannot stabilise."""
+    """Raise `StabilizabilityError` if there are states that the inputs cannot stabilise."""
     missed = "the inputs cannot stabilise {}; add inputs"
     if len(lin.A) < 2 * len(lin.M):  # with speeds of wheels without their angles
         robot = lin._robot
@@ -38,7 +38,8 @@ def require_stabilizable(lin: LinearModel) -> None:
         return
     found, words = controllability(lin), ""
     if not found.stabilizable:
-        # The momenta come first, and then the coordinates that they drive.
+        # Name the momenta and the other states, but not the coordinates whose rates are the
+        # momenta.
         count = len(conserved(lin).weights)
         lost = (*found.uncontrollable[:count], *found.uncontrollable[2 * count :])
         words = missed.format(listed(grouped(lost)))
@@ -51,7 +52,7 @@ def require_stabilizable(lin: LinearModel) -> None:
 
 
 def require_detectable(lin: LinearModel) -> None:
-    """Raise `DetectabilityError` that names what no output shows and what does not settle."""
+    """Raise `DetectabilityError` if there are unobservable motions that do not decay."""
     missed = "the outputs do not observe {}, whose motion does not decay by itself; add outputs"
     if len(lin.A) < 2 * len(lin.M):
         _check_reach(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, DetectabilityError)
@@ -64,7 +65,7 @@ def require_detectable(lin: LinearModel) -> None:
 def _conclude(
     kind: type[FflinError], words: str, notes: Sequence[str], margin: Margin, depth: int = 4
 ) -> None:
-    """Raise the error of given words with undecided ranks, or warn of undecided ranks."""
+    """Raise an error with `words` and the undecided ranks, or warn if ranks are only undecided."""
     doubts = [note for note in notes if note.startswith("undecided")]
     if words:
         error: Any = kind("; ".join((words, *doubts)))
@@ -75,13 +76,13 @@ def _conclude(
 
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
-    """Raise `InputError` that names the marginally stable modes without a weight in Q."""
+    """Raise `InputError` if a marginally stable mode has no weight in Q."""
     missed = "Q has no weight on {}, whose motion does not decay by itself; add a weight there"
     _check_reach(lin, A.T, _root(Q), "weighted by Q", missed)
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
-    """Raise `InputError` that names the modes on the boundary that no disturbance reaches."""
+    """Raise `InputError` if a marginally stable mode is excited by no disturbance."""
     missed = (
         "W does not excite {}, whose motion does not decay by itself, so a steady-state filter "
         "would not correct its estimate; give the noise there a positive intensity"
@@ -90,8 +91,8 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
 
 
 def _root(W: Array) -> Array:
-    """Return a factor L (m, m) with W = L L^T, of a semidefinite matrix of unlike units."""
-    # It has the root of W's condition, and so reaches what W reaches with less doubt.
+    """Return L (m, m) with W = L L^T, for a semidefinite W whose entries have different units."""
+    # The condition number of L is the square root of W's, so its rank is easier to decide.
     size = np.sqrt(W.diagonal())
     size = np.where(size > 0.0, size, 1.0)
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
@@ -107,12 +108,13 @@ def _check_reach(
     complaint: str,
     error: type[FflinError] = InputError,
 ) -> None:
-    """Raise an error where B misses a mode on the boundary, or warn of what is undecided."""
+    """Raise an error if B does not reach a mode on the stability boundary; warn if undecided."""
     discrete = bool(lin.dt)
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
     beyond = np.abs(poles) - 1.0 if discrete else poles.real
-    # Rounding moves a Jordan block of four by its fourth root.
+    # Rounding moves the eigenvalues of a Jordan block of size four by its fourth root, so poles
+    # closer than 1e-3 of the largest count as one.
     candidates = [complex(discrete)]
     growing = (beyond > 0.0) & (error is not InputError)
     for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:
@@ -122,7 +124,7 @@ def _check_reach(
     for pole in candidates:
         shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
         matrix = np.column_stack((shifted, B))
-        # Rows and columns have unlike units; they are brought to comparable sizes.
+        # Rows and columns have different units, so they are scaled to comparable sizes.
         rows, columns, scaled = np.ones(len(matrix)), np.ones(matrix.shape[1]), matrix
         for _ in range(4):
             sizes = np.sqrt(np.abs(scaled).max(axis=1))

@@ -1,7 +1,7 @@
-"""Foundations that depend on no robot.
+"""Basic modules that do not depend on a robot.
 
-Errors, files and records, rotations, tables and figures, checks of arguments. Imports no other
-room.
+The modules contain errors, files and records, rotations, tables and figures, and checks of
+arguments. They import no other package of fflin.
 """
 
 __version__ = "0.2.0"

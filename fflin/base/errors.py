@@ -1,19 +1,24 @@
-"""Errors that fflin raises; each message says what was given, what was expected, what to do."""
+"""Errors that fflin raises; each message gives the value, what is expected, and what to do."""
+
+from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable
-from typing import Any
+from typing import TYPE_CHECKING
 
-# Characters that end a line or command the terminal, names that are too long to be read, and how
-# long a message may be. A part of a path is such a name, the path is not.
+if TYPE_CHECKING:
+    from fflin.analysis.ranks import Margin
+
+# Patterns of control characters, which could break a line or control the terminal, and of names
+# too long to read. Each part of a path counts as a name. _LONGEST is the longest message.
 _CONTROL, _LONG_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]"), re.compile(r"[^\s/\\]{100,}")
 _LONGEST = 1000
-# The line break of a message of another package that goes on with an indented line.
+# Line break before an indented line, found in messages of other packages.
 _INDENTED = re.compile(r"[ \t]*\r?\n[ \t]+")
 
 
 def one_line(text: str) -> str:
-    """Return a message in one line: control characters are escaped, long text is cut."""
+    """Return a message as one line: escape control characters and cut long text."""
     text = _INDENTED.sub(" ", text)
     text = _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
     text = _LONG_NAME.sub(lambda found: _cut(found[0], 60), text)
@@ -21,7 +26,7 @@ def one_line(text: str) -> str:
 
 
 def _cut(text: str, size: int) -> str:
-    """Return both ends of a text, about `size` characters."""
+    """Return both ends of a text, about `size` characters in all."""
     return f"{text[: 2 * size // 3]}...{text[-size // 3 :]}"
 
 
@@ -165,7 +170,7 @@ class StabilizabilityError(FflinError, ValueError):
     fflin.base.errors.StabilizabilityError: the inputs cannot stabilise linear momentum ...
     """
 
-    margin: Any = None
+    margin: Margin | None = None
 
 
 class DetectabilityError(FflinError, ValueError):
@@ -186,7 +191,7 @@ class DetectabilityError(FflinError, ValueError):
     fflin.base.errors.DetectabilityError: the outputs do not observe q_b.x, q_b.y, q_b.z, ...
     """
 
-    margin: Any = None
+    margin: Margin | None = None
 
 
 class MissingPackageError(FflinError, ImportError):
@@ -245,13 +250,13 @@ class FflinWarning(UserWarning):
 
 
 def listed(names: Iterable[str]) -> str:
-    """Show names in a sentence: the first six, each once, and how many more there are."""
+    """Join names for a sentence: the first six different names and the number of the others."""
     names = list(dict.fromkeys(names))
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """Build the error for a name that does not exist, with the names that are near."""
+    """Build the error for an unknown name, with similar names as a hint."""
     import difflib
 
     names = list(known)
@@ -267,7 +272,7 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
 
 
 def require_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:
-    """Raise `UnknownNameError` for the first of the names that is not known."""
+    """Raise `UnknownNameError` for the first unknown name, if any."""
     for name in names:
         if name not in known:
             raise unknown(kind, name, known)

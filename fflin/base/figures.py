@@ -1,4 +1,4 @@
-"""Figures: their style, their colours, and the file that each is saved to."""
+"""Style, colours and output files of figures."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from fflin.base.writing import as_path, check_ending, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.typing import RcKeyType
 
     from fflin.base.validation import Array
 
 FORMATS = (".png", ".pdf", ".svg")
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a6d3b")
-_STYLE: dict[Any, Any] = {
+_STYLE: dict[RcKeyType, object] = {
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
@@ -40,7 +42,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def cycle(count: int) -> list[str]:
-    """Return that many colours, all different."""
+    """Return `count` different colours."""
     if count <= len(COLORS):
         return list(COLORS[:count])
     from matplotlib import colormaps
@@ -49,13 +51,13 @@ def cycle(count: int) -> list[str]:
     return [to_hex(colormaps["turbo"](i / (count - 1))) for i in range(count)]
 
 
-def letters_of(count: float, room: float) -> float:
-    """Font size [pt] at which a number of lines fit into a height [pt]."""
-    return min(8.0, 0.75 * room / max(1, count))
+def letters_of(count: float, height: float) -> float:
+    """Return the font size [pt] at which `count` lines fit into a height [pt]."""
+    return min(8.0, 0.75 * height / max(1, count))
 
 
 def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float) -> None:
-    """Scale an axis so that values of very different sizes are distinguishable."""
+    """Make an axis symmetric logarithmic if the sizes of its values span a decade."""
     sizes = [abs(value) for value in values.tolist() if abs(value) > 1e-9 * unit]
     if not sizes or max(sizes) < 10.0 * min(sizes):
         return
@@ -67,8 +69,10 @@ def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float)
 
 
 @contextmanager
-def drawing(path: str | Path | None, width: float, height: float, **options: Any) -> Iterator[Any]:
-    """Yield a figure of a size [in] in the style, without a window; save it if a path is given."""
+def drawing(
+    path: str | Path | None, width: float, height: float, **options: Any
+) -> Iterator[Figure]:
+    """Yield a figure of a size [in] in fflin's style; save the figure if a path is given."""
     target = None if path is None else as_path(path)
     if target is not None:
         check_ending(target, FORMATS)

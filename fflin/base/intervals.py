@@ -21,7 +21,7 @@ class Estimate(NamedTuple):
 
 
 def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
-    """Return the fraction of successes, exact for any count."""
+    """Return the fraction of successes and its Clopper-Pearson interval, exact for any count."""
     from scipy.special import betaincinv
 
     tail, failures = (1.0 - confidence) / 2.0, count - successes
@@ -31,10 +31,10 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
 
 
 def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
-    """Return figures of runs (N,) that start ever farther away.
+    """Return success statistics of runs (N,), sorted by the distance of their start.
 
-    They are the number of runs before the first failure, a lower bound on the success rate of these
-    starts, and the interval of the success rate of all runs.
+    The statistics are the number of runs before the first failure, a lower bound on the success
+    rate of these starts, and a confidence interval for the success rate of all runs.
     """
     count = len(failed)
     inside = int(failed.argmax()) if failed.any() else count
@@ -44,12 +44,12 @@ def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[f
 
 
 def quantile(values: Array, p: float, confidence: float) -> Estimate:
-    """Return the p-quantile between two order statistics; infinite if there are too few draws."""
+    """Return the p-quantile and its interval, infinite ends if there are too few draws."""
     from scipy.special import bdtr
 
     count = len(values)
     ordered = np.concatenate(([-np.inf], np.sort(values), [np.inf]))
-    # How many of them are below the quantile is binomial.
+    # The number of values below the quantile has a binomial distribution.
     below, tail = bdtr(np.arange(count + 1.0), count, p), (1.0 - confidence) / 2.0
     low, high = np.searchsorted(below, (tail, 1.0 - tail)).tolist()
     middle = min(max(math.ceil(p * count), 1), count)
@@ -57,7 +57,7 @@ def quantile(values: Array, p: float, confidence: float) -> Estimate:
 
 
 def mean(values: Array, confidence: float) -> Estimate:
-    """Return the mean with Student's interval, which assumes a normal distribution."""
+    """Return the mean and Student's t interval, which assumes a normal distribution."""
     from scipy.special import stdtrit
 
     count, middle = len(values), float(values.mean())
@@ -69,7 +69,7 @@ def mean(values: Array, confidence: float) -> Estimate:
 
 
 def rank_correlations(columns: Array, values: Array) -> Array:
-    """Return Spearman's correlation of columns (N, k) with values (N,), also infinite ones."""
+    """Return Spearman's correlation of columns (N, k) with values (N,), which may be infinite."""
     ranks = np.column_stack([_ranks(column) for column in (*columns.T, values)])
     ranks -= ranks.mean(axis=0)
     size = np.linalg.norm(ranks, axis=0)
@@ -79,7 +79,7 @@ def rank_correlations(columns: Array, values: Array) -> Array:
 
 
 def _ranks(values: Array) -> Array:
-    """Return ranks, ties sharing the mean of theirs."""
+    """Return the ranks of values; equal values share the mean of their ranks."""
     _, which, counts = np.unique(values, return_inverse=True, return_counts=True)
     ranks: Array = (np.cumsum(counts) - 0.5 * (counts - 1))[which]
     return ranks

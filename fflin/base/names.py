@@ -1,4 +1,4 @@
-"""Names GROUP.ENTRY of states and inputs; groups, entries and patterns that match them."""
+"""Names GROUP.ENTRY of states and inputs, and patterns that match them."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -13,12 +13,12 @@ _OF_UNIT = {"N": "thrust", "N m": "wheel"}
 
 
 def group_of(name: str) -> str:
-    """Return GROUP of GROUP.ENTRY; empty if the name has no group."""
+    """Return the GROUP of a name GROUP.ENTRY, or "" if the name has no group."""
     return name.partition(".")[0] if "." in name else ""
 
 
 def input_keys(of: Any) -> tuple[str, ...]:
-    """Return GROUP.ENTRY of each input of a model, or of what else has their names and units."""
+    """Return GROUP.ENTRY for each input of an object with `input_names` and `input_units`."""
     return tuple(
         name if group_of(name) in _GROUPS else f"{_OF_UNIT.get(unit, 'input')}.{name}"
         for name, unit in zip(of.input_names, of.input_units, strict=True)
@@ -26,7 +26,7 @@ def input_keys(of: Any) -> tuple[str, ...]:
 
 
 def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the 12 + 2n states: of the configuration, then of their rates."""
+    """Return the names of the 12 + 2n states: the configuration, followed by its rates."""
     return (
         *(f"{group}.{axis}" for group in ("q_b", "r_b") for axis in "xyz"),
         *(f"q_m.{name}" for name in joints),
@@ -36,7 +36,7 @@ def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str, str]]:
-    """Return (first, last, group, units) of names of one group, or of one unit."""
+    """Return (first, last, group, units) of consecutive names with the same group or unit."""
     found: list[tuple[int, int, str, list[str]]] = []
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         group = name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
@@ -52,7 +52,8 @@ def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
     """Return the indices of the names that match a key: ``tau_m.x``, ``tau_m``, ``x`` or ``*x``."""
     if key in names:
         return [names.index(key)]
-    # Of a name or of its entry; brackets stand in names of joints: * and ? alone are wild.
+    # The pattern must match a name or its entry. Only * and ? are wildcards, because brackets may
+    # occur in joint names.
     pattern = re.compile(re.escape(str(key)).replace(r"\*", ".*").replace(r"\?", "."), re.DOTALL)
     of_group = [i for i, name in enumerate(names) if group_of(name) == key]
     found = of_group or [i for i, name in enumerate(names) if pattern.fullmatch(name)]
@@ -70,7 +71,7 @@ def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
 
 
 def stands_for_any(key: str, names: Sequence[str]) -> bool:
-    """Return whether a key matches any of the names, or entries of several groups."""
+    """Return whether a key matches any name; an ambiguous key also counts as a match."""
     try:
         return bool(matching("name", key, names))
     except UnknownNameError:
@@ -80,7 +81,7 @@ def stands_for_any(key: str, names: Sequence[str]) -> bool:
 
 
 def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[int, T]:
-    """Return {index: value} of {key: value}; patterns go before groups, and names before both."""
+    """Return {index: value} of {key: value}; names override groups, groups override patterns."""
     found: dict[int, T] = {}
     groups = {*map(group_of, names)}
     for key in sorted(values, key=lambda key: 1 if _is_pattern(key) else 2 * (key not in groups)):
@@ -89,21 +90,21 @@ def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[in
 
 
 def rates_by_name(joints: Sequence[str], values: Mapping[str, float]) -> dict[str, float]:
-    """Return {state: rate} of {joint, state, group or pattern: rate}."""
+    """Return {state: rate} from the rates of joints, states, groups or patterns."""
     names = state_keys(joints)[6 + len(joints) :]
     full = {f"qdot_m.{key}" if key in joints else key: value for key, value in values.items()}
     return {names[index]: value for index, value in by_name("velocity", full, names).items()}
 
 
 def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return the indices of the names that match any of the keys, in the order of the names."""
+    """Return the sorted indices of all names that match any of the keys."""
     return sorted({index for key in keys for index in matching(kind, key, names)})
 
 
 def joints_by_name(
     kind: str, values: Mapping[str, T], joints: Sequence[str], find: Callable[[str], str]
 ) -> dict[str, T]:
-    """Return {joint: value} of {joint, pattern or group: value}; `find` checks a single name."""
+    """Return {joint: value} from values of joints, patterns or groups; `find` checks one name."""
     many = {key: value for key, value in values.items() if key == "q_m" or _is_pattern(key)}
     states = [f"q_m.{name}" for name in joints]
     found = {joints[i]: value for i, value in by_name(kind, many, states).items()}

@@ -1,4 +1,4 @@
-"""State of the process: progress bar on stderr, folders of imports, threads of BLAS."""
+"""Progress bar on stderr, folders of the import path, and threads of BLAS."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _PATIENCE = 1.0  # seconds before a bar is shown
-_WORTH = 10.0  # seconds of work, whose estimate is shown
+_WORTH = 10.0  # seconds of work from which an estimate is shown
 _INTERVAL = 0.1
 
 
 class Progress:
-    """A bar; `shown` None shows it on a terminal, once the run takes long."""
+    """Progress bar; by default, it appears on a terminal if the run takes long."""
 
     def __init__(self, shown: bool | None = None) -> None:
         terminal = sys.stderr is not None and sys.stderr.isatty()
@@ -29,7 +29,7 @@ class Progress:
         self.done, self.total = 0, 0
 
     def expect(self, seconds: float, cores: int) -> None:
-        """Print the estimated time of long work that is about to begin."""
+        """Print the estimated duration of a long computation before it starts."""
         if seconds < _WORTH:
             return
         size, unit = (seconds / 3600.0, "h") if seconds > 7200.0 else (seconds / 60.0, "min")
@@ -57,13 +57,13 @@ class Progress:
             print(f"\r\x1b[2K{text}", end="", file=sys.stderr, flush=True)
 
     def close(self) -> None:
-        """Take the bar away."""
+        """Remove the bar from the terminal."""
         if self._drawn:
             print("\r\x1b[2K", end="", file=sys.stderr, flush=True)
 
 
 def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
-    """Return `sys.path` without some folders, whatever their entries are called."""
+    """Return `sys.path` without some folders, in whatever form its entries name them."""
     return [entry for entry in sys.path if not any(same_folder(entry, each) for each in folders)]
 
 
@@ -76,7 +76,7 @@ def same_folder(first: str | os.PathLike[str], second: str | os.PathLike[str]) -
 
 
 def in_one_thread(function: Callable[P, T]) -> Callable[P, T]:
-    """Limit BLAS to one thread within a function.
+    """Limit BLAS to one thread while a function runs.
 
     With many small matrices, several threads only wait for each other.
     """

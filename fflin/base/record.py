@@ -1,16 +1,16 @@
-"""Records on disk: names with arrays, texts, lists of texts, numbers, and groups of numbers.
+"""Records on disk: named arrays, strings, lists of strings, numbers and groups of numbers.
 
-Models, gains, schedules, filters and motions are such records; any program that reads .npz, .mat
-or .json can read them. Each file carries a SHA-256 digest, so that a damaged or edited file is
-refused:
+Models, gains, schedules, filters and motions are saved as records. Any program that reads .npz,
+.mat or .json can read them. Each file contains a SHA-256 digest, so that a damaged or edited file
+is refused:
 
-- .npz: the entry ``sha256``, the digest of the other entries;
-- .json: the entry ``sha256``, the digest of the text before it;
-- .mat: the text of the header, the digest of all that follows it. It is compared before SciPy
-  reads the file, since SciPy can crash on a damaged one.
+- .npz: the entry ``sha256`` is the digest of the other entries;
+- .json: the entry ``sha256`` is the digest of the text before it;
+- .mat: the text of the header contains the digest of everything after the header. The digest is
+  compared before SciPy reads the file, because SciPy can crash on a damaged file.
 
-A file without a digest is read as it is. The result is then not ``verified``, and it is saved
-without a digest.
+A file without a digest is read without this check. The result is then not ``verified``, and it is
+saved without a digest.
 """
 
 from __future__ import annotations
@@ -64,36 +64,36 @@ class NoRoomError(FileError):
 
 
 def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool) -> None:
-    """Write a record in the format of the ending, with its digest if `checksummed`."""
+    """Write a record in the format of the file's ending, with its digest if `checksummed`."""
     check_ending(path, FORMATS)
     require_finite(record)
     write_atomically({path: _CODECS[path.suffix][0](record, checksummed)})
 
 
 def read_record(path: Path) -> tuple[Record, bool]:
-    """Return the record in a file, and whether it is verified; to be called within `reading`."""
-    # Arrays may have other shapes of that order: .mat knows no vectors, .json no empty matrices.
+    """Return the record in a file, and whether its digest was verified; call within `reading`."""
+    # Arrays may return with another shape: .mat has no vectors and .json has no empty matrices.
     check_ending(path, FORMATS)
     return decoded(path.suffix, read_file(path, path.suffix))
 
 
 def decoded(suffix: str, content: bytes) -> tuple[Record, bool]:
-    """Return the record in the content of a file, and whether the record is verified."""
+    """Return the record in the content of a file, and whether its digest was verified."""
     return _CODECS[suffix][1](content)
 
 
 @contextmanager
 def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
-    """Turn errors in reading a file that was saved by a program into one `FileError`."""
+    """Turn all errors in reading a file that program `by` saved into one `FileError`."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of headers that damage makes look old
+            warnings.simplefilter("ignore")  # SciPy takes damaged headers for old ones
             yield
     except FileError:
         raise
     except FileNotFoundError:
         raise FileError(f"{path}: No such file{missing(path)}") from None
-    except Exception as error:  # each decoder has its own dozen
+    except Exception as error:  # each decoder raises its own types
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
             raise NoRoomError(f"{shown(path)}: does not fit into memory") from None
         raise FileError(f"{shown(path)}: not a {what} saved by {by} ({reason(error)})") from None
@@ -109,24 +109,24 @@ def require_finite(record: Mapping[str, object]) -> None:
 
 
 def text(value: object) -> str:
-    """Return a text of a record."""
+    """Return a string from a record."""
     return value if isinstance(value, str) else str(np.asarray(value).item())
 
 
 def texts(value: Any) -> tuple[str, ...]:
-    """Return a list of texts of a record; a text alone is a list of one."""
+    """Return a list of strings from a record; a single string becomes a list of one."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     return (value,) if isinstance(value, str) else tuple(map(text, value))
 
 
 def figure(value: object) -> float:
-    """Return a figure of a record."""
+    """Return a number from a record."""
     return float(np.asarray(value).item())
 
 
 def figures(value: object) -> dict[str, float]:
-    """Return a group of figures of a record."""
+    """Return a group of numbers from a record."""
     group = value if isinstance(value, dict) else json.loads(text(value))
     return {key: figure(x) for key, x in group.items()}
 
@@ -134,8 +134,8 @@ def figures(value: object) -> dict[str, float]:
 def content_digest(entries: Mapping[str, Any]) -> str:
     """Return the SHA-256 of arrays or bytes with their names, types and shapes.
 
-    Every file whose content has several parts is checked by it. The bytes of a part are hashed in
-    blocks of 4 MiB.
+    All file formats with several parts use this digest. The bytes of a part are hashed in blocks of
+    4 MiB.
     """
     digest = hashlib.sha256()
     with ThreadPoolExecutor() as pool:
@@ -145,7 +145,7 @@ def content_digest(entries: Mapping[str, Any]) -> str:
             digest.update(f"{key} {array.dtype.str} {array.shape}\n".encode())
             data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             blocks = [data[at : at + _BLOCK] for at in range(0, len(data), _BLOCK)]
-            # Hashing lets other threads run.
+            # hashlib releases the interpreter lock, so threads hash the blocks in parallel.
             run = pool.map if len(blocks) > 1 else map
             digest.update(b"".join(run(lambda block: hashlib.sha256(block).digest(), blocks)))
     return digest.hexdigest()
@@ -164,7 +164,7 @@ def _to_npz(record: Mapping[str, object], checksummed: bool) -> bytes:
 def _from_npz(content: bytes) -> tuple[Record, bool]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         record = {key: file[key] for key in file.files}
-    # The archive ends with how many entries it has; a length that is damaged hides some of them.
+    # The archive ends with its number of entries. A damaged length field can hide some entries.
     end = content[-22:]
     if end[:4] == b"PK\5\6" and int.from_bytes(end[10:12], "little") != len(record):
         raise ValueError(DAMAGED)
@@ -172,7 +172,7 @@ def _from_npz(content: bytes) -> tuple[Record, bool]:
 
 
 def verify_checksum(record: Record) -> bool:
-    """Remove the digest from the entries of .npz; return whether it exists and is valid."""
+    """Remove the digest from the entries of a .npz file; return whether there was a valid one."""
     checksum = record.pop(CHECKSUM, None)
     if checksum is not None and text(checksum) != content_digest(record):
         raise ValueError(DAMAGED)
@@ -212,7 +212,7 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
 
 
 def _of_mat(value: object) -> Any:
-    """Return a variable of MATLAB: an array, text, a list of cells or rows, a dict of a struct."""
+    """Convert a MATLAB variable to an array, string, list of cells or rows, or dict (struct)."""
     if not isinstance(value, np.ndarray):
         return value
     if value.dtype.names:
@@ -270,9 +270,10 @@ class Design(FrozenArrays):
         False for a result read from a file without a digest, and for every result derived from it.
     """
 
-    # Names of the arrays of one dimension, which Matlab does not know.
+    # Names of one-dimensional arrays, which MATLAB stores as matrices.
     VECTORS: ClassVar[tuple[str, ...]] = ()
-    # Those that may be infinite, which JSON does not know: written as the largest double.
+    # Names of arrays that may be infinite. JSON has no infinity, so the largest double replaces
+    # it.
     OPEN: ClassVar[tuple[str, ...]] = ()
 
     verified: bool = field(default=True, kw_only=True)
@@ -305,7 +306,7 @@ class Design(FrozenArrays):
 
     @classmethod
     def _read(cls: type[Kind], path: str | Path, **given: object) -> Kind:
-        """Do what `load` does; what no file has is `given`."""
+        """Read a file as `load` does; `given` holds the fields that no file contains."""
         source, name = as_path(path), cls.__name__
         with reading(source, name):
             record, verified = read_record(source)
@@ -314,14 +315,14 @@ class Design(FrozenArrays):
             values = {
                 item.name: _value(cls, item, record[item.name])
                 for item in _saved(cls)
-                # What has a default came later than some files.
+                # Files saved by older versions may lack fields that have a default.
                 if item.name in record or item.default_factory is MISSING
             }
             return cls(**given, **values, verified=verified)
 
 
 def record_of(design: Design) -> Record:
-    """Return what a file holds of a result."""
+    """Return the record that represents a result in a file."""
     record: Record = {"kind": type(design).__name__}
     for item in _saved(type(design)):
         value = getattr(design, item.name)
@@ -332,13 +333,13 @@ def record_of(design: Design) -> Record:
 
 
 def _saved(cls: type[Design]) -> list[Field[Any]]:
-    """Return the fields that files have."""
+    """Return the fields that files contain."""
     own = (item for item in fields(cls) if item.name != "verified" and item.name[0] != "_")
     return [item for item in own if item.type != "Robot"]
 
 
 def _value(cls: type[Design], item: Field[object], raw: object) -> Any:
-    """Return a field's value, with the type of its annotation."""
+    """Convert a value from a file to the type of its field's annotation."""
     for kind, of_kind in (("float", figure), ("str", text), ("tuple", texts)):
         if str(item.type).startswith(kind):
             return of_kind(raw)

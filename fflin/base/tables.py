@@ -1,4 +1,4 @@
-"""Text tables: aligned, folded to the terminal's width, plain if the output is not a terminal."""
+"""Text tables with aligned columns, folded to the width of the terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from fflin.base.validation import Array
 
-MOST_ROWS, _SPARE = 20, 2  # rows of a table that is read at a glance; a few more are not cut
+MOST_ROWS, _SPARE = 20, 2  # rows of a cut table; _SPARE more rows are not cut
 
 _GAP = "  "
 _PARAGRAPH = re.compile(r"\n(?!  \S)")
@@ -21,18 +21,18 @@ _EPS = sys.float_info.epsilon
 
 
 def width() -> int:
-    """Return the number of columns: the terminal's, or 80 if the output is not a terminal."""
+    """Return the number of columns of the terminal, or 80 if the output is not a terminal."""
     return shutil.get_terminal_size((80, 24)).columns if _on_terminal() else 80
 
 
 def folded(lines: Iterable[str]) -> str:
-    """Fold each line to the width, not at a no-break space; the rest goes below, indented."""
+    """Fold each line to the width, but not at no-break spaces; continuation lines are indented."""
     wrap = textwrap.TextWrapper(width(), subsequent_indent="  ", break_on_hyphens=False)
     return "\n".join(map(wrap.fill, lines)).replace("\u00a0", " ")
 
 
 def headed(command: str, report: str) -> str:
-    """Put the name of a command before its report, and fold the first line again."""
+    """Put the name of a command before its report, and fold the first paragraph again."""
     _, *rest = _PARAGRAPH.split(report, maxsplit=1)
     return "\n".join([folded([f"{command}: {first_paragraph(report)}"]), *rest])
 
@@ -43,7 +43,7 @@ def first_paragraph(report: str) -> str:
 
 
 def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[str]]:
-    """Return the head and the first rows of a long table; `rest` refers to the other rows."""
+    """Return the head and the first rows of a long table; `rest` says where the other rows are."""
     left = len(rows) - 1 - MOST_ROWS
     if left <= _SPARE:
         return list(rows)
@@ -51,7 +51,7 @@ def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[st
 
 
 def dim(text: str) -> str:
-    """Text that is dimmed on a terminal with colours."""
+    """Return dimmed text if the output is a terminal with colours."""
     if _on_terminal() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb":
         return f"\x1b[2m{text}\x1b[0m"
     return text
@@ -81,12 +81,12 @@ def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
 
 
 def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
-    """Show a matrix with its names, "~0" for rounding; lines of zeros alone are left out."""
+    """Format a matrix with its names; "~0" is rounding error, and lines of zeros are left out."""
     text = [
         [_number(x, below) for x, below in zip(row, limits, strict=True)]
         for row, limits in zip(values.tolist(), rounding(values).tolist(), strict=True)
     ]
-    # What is too wide is folded: the next columns follow below, under the rows that they need.
+    # Columns that exceed the width continue below, with only the rows in which they are not zero.
     label, used = max(map(len, rows)), 0
     folds: list[list[int]] = []
     for j, name in enumerate(columns):
@@ -107,7 +107,7 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
 
 
 def rounding(values: Array) -> Array:
-    """Return the rounding of both its row's and its column's largest entry, for each entry."""
+    """Return the rounding error of each entry, from the largest entries in its row and column."""
     sizes = abs(values)
     by_row: Array = _EPS * sizes.max(axis=1, initial=0.0)[:, None]
     return by_row.clip(max=_EPS * sizes.max(axis=0, initial=0.0))
@@ -118,13 +118,13 @@ def _number(x: float, below: float) -> str:
 
 
 def counted(number: int, thing: str) -> str:
-    """Say how many there are of a thing."""
+    """Return a number with its noun, in the plural if needed."""
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def signals(title: str, values: Array, names: Sequence[str], units: Sequence[str]) -> str:
-    """Show what is not zero of a state, an input or a force, with its unit."""
-    # A line is broken between entries alone, not at the spaces within them.
+    """Format the nonzero entries of a state, an input or a force, with their units."""
+    # Lines may break between entries, but not at the spaces within an entry.
     entries = [
         f"{name}\xa0=\xa0{value:.6g}" + (f"\xa0{unit}" if unit != "1" else "")
         for name, value, unit in zip(names, values.tolist(), units, strict=True)

@@ -16,14 +16,14 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-# Some 1,000 inputs.
+# Enough for about 1,000 inputs.
 _SIZE_LIMIT = 2**17
 
-# The time for a dotted key grows with the square of its parts.
+# The time to parse a dotted key grows with the square of the number of its parts.
 _DOTS_LIMIT = 1_000
 
-# What may hold a line that looks like a key: strings of several lines. Strings of one line and
-# comments are matched too, for they may hold quotes.
+# Multi-line strings may contain lines that look like keys. One-line strings and comments are
+# matched too, because they may contain quotes.
 _TEXTS = re.compile(
     r'"""(?:\\.|[^\\])*?"""+|\'\'\'.*?\'\'\'+|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
 )
@@ -33,13 +33,14 @@ _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value of TOML is a finite number."""
-    # The limit keeps lengths finite, and integers that no float can hold out.
+    """Return whether a TOML value is a finite number."""
+    # The limit keeps computed lengths finite. It also excludes integers that no float can
+    # represent.
     return type(value) in (int, float) and abs(value) < 1e100
 
 
 class TomlFile:
-    """Content of a TOML file, with the lines of places such as ``input``, 3, ``axis``."""
+    """Content of a TOML file, and the line of each key path such as ``input``, 3, ``axis``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -52,44 +53,44 @@ class TomlFile:
             self.record: dict[str, Any] = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
             found = re.search(r"at line (\d+)", str(error))
-            last = getattr(error, "start", len(content.rstrip()))  # of what is not UTF-8 text
+            last = getattr(error, "start", len(content.rstrip()))  # first byte that is not UTF-8
             line = found[1] if found else content.count(b"\n", 0, last) + 1
             message = f"{path}:{line}: invalid TOML: {error}; correct the file"
             raise InputError(message) from None
-        # Keys may be quoted, so that strings of one line stay.
+        # Multi-line strings are removed. One-line strings stay, because keys may be quoted.
         self._lines = _lines_of(_TEXTS.sub(lambda x: "\n" * x[0].count("\n") or x[0], text))
-        for place, value in _values(self.record):
-            # Python refuses to write longer integers, as a message would.
+        for key_path, value in _values(self.record):
+            # Python refuses to convert longer integers to text, so no message could show them.
             if type(value) is int and value.bit_length() > 10_000:
                 raise self.error(
-                    f"{place[-1]} has too many digits; write a number of this size in the form "
+                    f"{key_path[-1]} has too many digits; write a number of this size in the form "
                     "1e30",
-                    *place,
+                    *key_path,
                 )
 
-    def line(self, *place: str | int) -> int:
+    def line(self, *key_path: str | int) -> int:
         """Return the line number of a key, or of the table that contains it."""
-        way = ".".join(map(str, place))
-        while way and way not in self._lines:
-            way = way.rpartition(".")[0]
-        return self._lines.get(way, 1)
+        dotted = ".".join(map(str, key_path))
+        while dotted and dotted not in self._lines:
+            dotted = dotted.rpartition(".")[0]
+        return self._lines.get(dotted, 1)
 
-    def error(self, problem: FflinError | str, *place: str | int) -> FflinError:
-        """Build an error that names the file and the line of a key, of the problem's own type."""
+    def error(self, problem: FflinError | str, *key_path: str | int) -> FflinError:
+        """Build an error of the problem's type that names the file and the line of a key."""
         kind = type(problem) if isinstance(problem, FflinError) else InputError
-        return kind(f"{self.path}:{self.line(*place)}: {problem}")
+        return kind(f"{self.path}:{self.line(*key_path)}: {problem}")
 
     @contextmanager
     def located(self, *table: str | int, of: str = "") -> Iterator[None]:
-        """Put file, line and `of` in front of errors that name a key, or a text, of a table."""
+        """Add file, line and `of` to errors that name a key or a string value of a table."""
         try:
             yield
         except FflinError as error:
-            place = self._named_in(str(error), *table)
-            raise self.error(type(error)(f"{of}{error}"), *place) from None
+            key_path = self._named_in(str(error), *table)
+            raise self.error(type(error)(f"{of}{error}"), *key_path) from None
 
     def _named_in(self, message: str, *table: str | int) -> tuple[str | int, ...]:
-        """Return the place of the first key, text or pattern of a table that a message names."""
+        """Return the path of the first key, string or pattern of a table that a message names."""
         head = ".".join(map(str, table)) + "."
         keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]
         names = [
@@ -99,9 +100,9 @@ class TomlFile:
         ]
         names = [name for name in names if name]
         for name in names:
-            for place, value in _values(self.record):
-                if value == name and place[: len(table)] == table:
-                    return place
+            for key_path, value in _values(self.record):
+                if value == name and key_path[: len(table)] == table:
+                    return key_path
             for key in keys:
                 if f".{key}".endswith(f".{name}") or key.rpartition(".")[0] == name:
                     return *table, key
@@ -110,7 +111,7 @@ class TomlFile:
 
 
 def flat(table: Mapping[str, object]) -> dict[str, Any]:
-    """Return a table in which ``a.b = 1``, read as a table in a table, is the name "a.b"."""
+    """Flatten nested tables: ``a.b = 1``, read as a table in a table, becomes the name "a.b"."""
     while any(isinstance(value, dict) and value for value in table.values()):
         pairs = []
         for key, value in table.items():
@@ -121,19 +122,19 @@ def flat(table: Mapping[str, object]) -> dict[str, Any]:
 
 
 def _values(record: Mapping[str, object]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-    """Yield (place, value) of all values that are not tables or arrays, at any depth."""
+    """Yield (key path, value) of all values, at any depth, that are not tables or arrays."""
     left: list[tuple[tuple[str | int, ...], Any]] = [((), record)]
     while left:
-        place, value = left.pop()
+        key_path, value = left.pop()
         if isinstance(value, dict | list):
             pairs = value.items() if isinstance(value, dict) else enumerate(value)
-            left += [((*place, key), inner) for key, inner in pairs]
+            left += [((*key_path, key), inner) for key, inner in pairs]
         else:
-            yield place, value
+            yield key_path, value
 
 
 def _lines_of(text: str) -> dict[str, int]:
-    """Return the lines of tables and keys, by their parts joined by dots."""
+    """Return {dotted key: line number} of all tables and keys."""
     lines: dict[str, int] = {}
     counts: dict[str, int] = {}
     table = ""
@@ -149,12 +150,12 @@ def _lines_of(text: str) -> dict[str, int]:
                 counts[name] = counts.get(name, -1) + 1
                 lines.setdefault(name, number)
                 name = f"{name}.{counts[name]}"
-            elif first in counts and below:  # a table in the last of an array's
+            elif first in counts and below:  # a subtable of the last table of an array
                 name = f"{first}.{counts[first]}.{below}"
             table = name
         else:
             name = f"{table}.{name}" if table else name
-        # `a.b = 1` has a line of `a` too.
+        # `a.b = 1` also defines the key `a` in this line.
         while name and name not in lines:
             lines[name] = number
             name = name.rpartition(".")[0]

@@ -1,4 +1,4 @@
-"""Checks of arguments, made once at the beginning of a public call, and read-only arrays."""
+"""Checks of arguments, made once when a public function begins, and read-only arrays."""
 
 from __future__ import annotations
 
@@ -6,39 +6,46 @@ import math
 import sys
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 
 from fflin.base.errors import InputError
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     import pinocchio as pin
     from numpy.typing import ArrayLike, NDArray
 
     Array = NDArray[np.floating[Any]]
     Complex = NDArray[np.complexfloating[Any]]
     Values = NDArray[np.inexact[Any]]  # real or complex
+    Mask = NDArray[np.bool_]
+    Indices = NDArray[np.intp]
 else:
-    Array = Complex = Values = np.ndarray  # numpy.typing takes a tenth of the command line's start
+    # numpy.typing takes a tenth of the command line's start.
+    Array = Complex = Values = Mask = Indices = np.ndarray
 
-# A quaternion or a (cos, sin) pair whose squared length misses 1 by up to this has only been
-# rounded and is renormalised; one that misses it by more is taken for a mistake.
+T = TypeVar("T")
+
+# A quaternion or a (cos, sin) pair is renormalised if its squared length differs from 1 by at most
+# this, because the difference is rounding error. A larger difference is an error in the input.
 NORM_TOLERANCE = 1e-6
 
-# Native double precision. NumPy has one such object, so that `is` does instead of a comparison.
+# Native double precision. NumPy has only one such object, so `is` can replace a comparison.
 DOUBLE = np.dtype(np.float64)
 
 
 def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
-    """Return a vector (size,) of finite native floats; the same array if it is valid already."""
+    """Return a vector (size,) of finite native floats; a valid array is returned itself."""
     if type(value) is np.ndarray and value.dtype is DOUBLE:
         array: Array = value
     else:
         array = as_double(name, value)
     if array.shape != (size,):
         raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
-    # Python's sum is quicker than NumPy's here, and overflows without a warning.
+    # For short vectors, Python's sum is faster than NumPy's. It overflows without a warning.
     if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
         index = int(np.flatnonzero(~np.isfinite(array))[0])
         raise InputError(f"{name}[{index}] is {array[index]}; every entry must be finite")
@@ -79,7 +86,7 @@ def positive(name: str, value: object, unit: str = "", hint: str = "") -> float:
 
 
 def share(name: str, value: object) -> float:
-    """Return a number between 0 and 1, or raise `InputError`."""
+    """Return a fraction between 0 and 1, or raise `InputError`."""
     found = number(name, value)
     if not 0.0 < found < 1.0:
         raise InputError(f"{name} is {found:g}, expected a fraction between 0 and 1")
@@ -88,12 +95,18 @@ def share(name: str, value: object) -> float:
 
 def refuse_masked(name: str, value: object) -> None:
     """Raise `InputError` if an entry is masked, because NumPy may ignore the mask."""
-    ma: Any = sys.modules.get("numpy.ma")  # what is masked has loaded it
+    ma: ModuleType | None = sys.modules.get(
+        "numpy.ma"
+    )  # a masked array exists only if this is loaded
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
 
 
-def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
+@overload
+def instance(name: str, value: object, kind: type[T], expected: str) -> T: ...
+@overload
+def instance(name: str, value: object, kind: tuple[type, ...], expected: str) -> object: ...
+def instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> object:
     """Return a value of the expected type, or raise `InputError` with the given type."""
     if not isinstance(value, kind):
         raise InputError(f"{name} has type {type(value).__name__}, expected {expected}")
@@ -102,7 +115,7 @@ def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
 
 def truth(name: str, value: object) -> bool:
     """Return whether a switch is on, or raise `InputError` if it is not True or False."""
-    return bool(instance(name, value, bool | np.bool_ | int, "True or False"))
+    return bool(instance(name, value, (bool, np.bool_, int), "True or False"))
 
 
 def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int:
@@ -115,14 +128,13 @@ def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int
     return int(value)
 
 
-def by_name(name: str, value: object, of_what: str) -> Mapping[str, Any]:
+def by_name(name: str, value: object, of_what: str) -> Mapping[str, object]:
     """Return a mapping whose keys are names, or raise `InputError`."""
-    mapping: Mapping[str, Any] = instance(name, value, Mapping, f"{{{of_what}: value}}")
-    return mapping
+    return instance(name, value, Mapping, f"{{{of_what}: value}}")
 
 
-def untied(key: str, value: object) -> tuple[Any, bool]:
-    """Return a range, and whether one value in it is meant for all that its key names."""
+def untied(key: str, value: object) -> tuple[object, bool]:
+    """Return a range, and whether all names that its key matches get the same random value."""
     if not isinstance(value, Mapping):
         return value, False
     if value.keys() != {"range", "tied"}:
@@ -131,7 +143,7 @@ def untied(key: str, value: object) -> tuple[Any, bool]:
 
 
 def numbers(name: str, value: object, of_what: str, each: str) -> dict[str, float]:
-    """Return {name: finite float} of a mapping by names; an error calls one of them `each`."""
+    """Return {name: finite float} from a mapping; a message calls an entry `each`."""
     values = by_name(name, value, of_what)
     return {key: number(f"{each} '{key}'", entry) for key, entry in values.items()}
 
@@ -141,20 +153,20 @@ def dimension(name: str, value: object) -> int:
     return _as_array(name, value).ndim
 
 
-def placement(name: str, value: Any) -> pin.SE3:
-    """Return a copy of a placement, its rotation normalised if it is valid within 1e-6."""
+def placement(name: str, value: object) -> pin.SE3:
+    """Return a copy of a placement; its rotation is normalised if it is valid within 1e-6."""
     import pinocchio as pin
 
-    instance(name, value, pin.SE3, "a pin.SE3 (placement)")
-    if not np.isfinite(value.homogeneous).all():
+    given = instance(name, value, pin.SE3, "a pin.SE3 (placement)")
+    if not np.isfinite(given.homogeneous).all():
         raise InputError(f"{name} has entries that are not finite")
-    if not is_rotation(value.rotation):
+    if not is_rotation(given.rotation):
         raise InputError(f"{name} is not a rotation matrix; expected R^T R = I and det R = 1")
-    return pin.SE3(pin.Quaternion(value.rotation).normalized().matrix(), value.translation)
+    return pin.SE3(pin.Quaternion(given.rotation).normalized().matrix(), given.translation)
 
 
 def is_rotation(R: Array) -> bool:
-    """Whether R (3, 3) is a rotation within 1e-6."""
+    """Return whether R (3, 3) is a rotation matrix within 1e-6."""
     skewed = float(np.abs(R.T @ R - np.eye(3)).max())
     return skewed <= NORM_TOLERANCE and float(np.linalg.det(R)) > 0.0
 
@@ -168,7 +180,7 @@ def as_double(name: str, value: ArrayLike) -> Array:
     return array.astype(np.float64)
 
 
-def _as_array(name: str, value: object) -> Any:
+def _as_array(name: str, value: object) -> NDArray[np.generic]:
     try:
         return np.asarray(value)
     except ValueError:
@@ -176,7 +188,7 @@ def _as_array(name: str, value: object) -> Any:
 
 
 class FrozenArrays:
-    """Mixin of frozen dataclasses: makes their arrays read-only, and copies writable ones."""
+    """Mixin for frozen dataclasses: makes arrays read-only, and copies writeable arrays first."""
 
     def __post_init__(self) -> None:
         this: Any = self
@@ -186,7 +198,7 @@ class FrozenArrays:
                 object.__setattr__(self, item.name, frozen(value.copy()))
 
     def __setstate__(self, state: dict[str, object]) -> None:
-        # NumPy makes arrays anew, and writeable, for deepcopy and most of pickle's protocols.
+        # deepcopy and most pickle protocols create new writeable arrays, so they are frozen again.
         for value in state.values():
             if isinstance(value, np.ndarray):
                 frozen(value)
@@ -194,6 +206,6 @@ class FrozenArrays:
 
 
 def frozen(array: Array) -> Array:
-    """Return the array itself, read-only."""
+    """Make an array read-only and return it."""
     array.setflags(write=False)
     return array

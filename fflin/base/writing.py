@@ -1,9 +1,9 @@
 """Atomic writing of files.
 
-- A file is written completely or, if anything fails, not at all; the old file then stays.
-- The target is a new name or a regular file. An old file keeps its mode; the umask sets the mode
-  of a new one.
-- If the target is a link, the file that it leads to is written, and the link stays.
+- A file is written completely or, if anything fails, not at all. The old file then stays.
+- The target is a new name or a regular file. An old file keeps its mode. The mode of a new file
+  follows from the umask.
+- If the target is a symbolic link, the file at its end is written and the link stays.
 - A command never overwrites a file that it reads.
 """
 
@@ -19,18 +19,18 @@ from typing import NamedTuple
 
 from fflin.base.errors import FileError, InputError
 
-# Names in larger folders are not compared with the name of a missing file.
+# In folders with more names than this, no similar names are searched for.
 _MANY = 1000
 
 
 class CommandFiles(NamedTuple):
-    """Output files that a command has still to write, and input files that it has read."""
+    """Output files that a command has yet to write, and input files that it has read."""
 
     outputs: set[Path]
     inputs: set[str]
 
 
-# None in a Python session, which may write over what it has read.
+# None in a Python session, which may overwrite files that it has read.
 _of_command: ContextVar[CommandFiles | None] = ContextVar("files of a command", default=None)
 
 
@@ -53,7 +53,7 @@ def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
     """Return the content of a regular file of at most `limit` bytes, or raise `FileError`."""
     what = f"; give the path of a {kind} file"
     try:
-        # Opening a pipe would wait for somebody to write into it.
+        # Opening a pipe would block until another process writes into it.
         if path.exists() and not path.is_file():
             raise FileError(
                 f"{path}: is {'a folder' * path.is_dir() or 'not a regular file'}{what}"
@@ -75,9 +75,9 @@ def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
 
 @contextmanager
 def files_of_command(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterator[None]:
-    """Raise `FileError` within it once a file is to be read and written, or to be written twice.
+    """Raise `FileError` if a command reads a file that it writes, or writes a file twice.
 
-    `inputs` are those that are known at the start; `read_file` and `remember` add the others.
+    `inputs` are the files known at the start; `read_file` and `remember` add further files.
     """
     check_distinct(*(outputs := list(outputs)))
     token = _of_command.set(CommandFiles(set(outputs), set()))
@@ -89,7 +89,7 @@ def files_of_command(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterato
 
 
 def remember(*paths: str | Path) -> None:
-    """Let a command write over none of these files, which it reads."""
+    """Register files that a command reads, so that it cannot overwrite them."""
     if files := _of_command.get():
         files.inputs.update(map(os.path.abspath, paths))
         for target in files.outputs:
@@ -154,11 +154,11 @@ def install(temporary: Path, target: Path) -> None:
         os.chmod(temporary, real.stat().st_mode & 0o777)
     os.replace(temporary, real)
     if files := _of_command.get():
-        files.outputs.discard(target)  # what the command made, it may read
+        files.outputs.discard(target)  # a command may read its own output
 
 
 def followed_path(target: Path) -> Path:
-    """Return the target file with links followed; raise `FileError` if it may not be written."""
+    """Return the target with links followed, or raise `FileError` if it must not be written."""
     real = Path(os.path.realpath(target))
     try:
         found = os.stat(real)
@@ -178,7 +178,7 @@ def followed_path(target: Path) -> Path:
 
 
 def check_output_path(target: Path, endings: tuple[str, ...] = ()) -> None:
-    """Raise `FileError` if no file can be written there, before any work is done."""
+    """Raise `FileError` before any work is done if the target cannot be written."""
     from tempfile import TemporaryFile
 
     if endings:
@@ -193,7 +193,7 @@ def check_output_path(target: Path, endings: tuple[str, ...] = ()) -> None:
 
 
 def check_distinct(*targets: Path | None) -> None:
-    """Raise `FileError` if two outputs are the same file, links followed; None is skipped."""
+    """Raise `FileError` if two outputs are the same file after links are followed; skip None."""
     seen: list[Path] = []
     for target in filter(None, targets):
         for first in seen:
@@ -205,7 +205,7 @@ def check_distinct(*targets: Path | None) -> None:
 
 
 def missing(path: Path, otherwise: str = "") -> str:
-    """Say in which folder a file does not exist, and which names there are similar, if any."""
+    """Describe the folder in which a file is missing, and the similar names in it."""
     import difflib
 
     try:
@@ -220,7 +220,7 @@ def missing(path: Path, otherwise: str = "") -> str:
 
 
 def reason(error: Exception) -> str:
-    """Return why a file could not be opened, in a line."""
+    """Return in one line why a file could not be opened."""
     said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     if isinstance(error, KeyError) and said.strip("'").isidentifier():
         said = f"it has no entry {said}"
@@ -229,6 +229,6 @@ def reason(error: Exception) -> str:
 
 
 def shown(path: str | Path) -> str:
-    """Show a path in an error; one that is too long for a file by its ends."""
+    """Return a path for a message; a path too long for a file name is cut to its two ends."""
     text = str(path)
     return text if len(text) < 500 else f"{text[:60]} ... {text[-60:]}"

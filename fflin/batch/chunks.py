@@ -1,4 +1,4 @@
-"""Job of a sweep's workers: linear models about the points of one chunk."""
+"""Job of a sweep: linear models about the points of one chunk."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 RowNumbers: TypeAlias = NDArray[np.integer[Any]]
 
-# Python has one set of warning filters for the whole process, so that threads take turns.
+# Warning filters belong to the whole process, so only one thread at a time changes them.
 _TURN = Lock()
 
 
 class ChunkJob:
-    """Linearises chunks of points, `at_rest` all, as `Linearizer` does."""
+    """Job that linearises chunks of points with `Linearizer`; `at_rest` means zero velocity."""
 
     def __init__(
         self, robot: Robot, *, at_rest: bool, engine: str | None = None, **options: Any
@@ -49,17 +49,18 @@ class ChunkJob:
                     "engine='compiled' is not possible, because the outputs are not the state; "
                     "leave engine out"
                 )
-            prepared.kernel()  # which says where there is none
-        # There every field of a model but B is known without computing it.
+            prepared.kernel()  # raises an error if there is none
+        # At rest about its own reference, a free robot has constant A and f0, so only B is
+        # computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A worker makes a work space of its own.
+        # Each worker needs its own work space, so only the arguments are pickled.
         return self._again, ()
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of each array that differs from point to point, for one point."""
+        """Shape per point of each array that varies between points."""
         prepared = self.linearizer.prepared
         nx, nu = prepared.map.nx, len(prepared.actuation.names)
         ny = len(prepared.common["output_names"])
@@ -107,14 +108,14 @@ class ChunkJob:
         inertia.invert(q, inverse)
         if actuation.default:
             return
-        # The columns do not depend on the base's position, and would lose digits to it.
+        # The columns do not depend on the base position, which would only add rounding error.
         still = q.copy()
         still[:3] = 0.0
         np.matmul(inverse, actuation.columns(data, still), out=B_lower)
 
     @cached_property
     def compiled(self) -> BatchEquations | None:
-        """The kernel's equations, unless it does not know the robot; threads do them together."""
+        """Compiled equations for many points at once, or None if the robot cannot be compiled."""
         prepared = self.linearizer.prepared
         if self._engine == "python" or prepared.sensing is not None or prepared.not_compilable:
             return None
@@ -134,7 +135,7 @@ class BatchEquations:
         self._kernel = prepared.kernel()
 
     def write(self, points: Points, out: Mapping[str, Array]) -> RowNumbers:
-        """Write the arrays that vary between points, and return the rows not computed."""
+        """Write the arrays that vary between points, and return the rows that were not computed."""
         count = len(points.q)
         if count < LANES:
             more = {key: np.empty((LANES, *array.shape[1:])) for key, array in out.items()}
@@ -149,7 +150,7 @@ class BatchEquations:
             return np.flatnonzero(~self._anywhere(points, out))
 
     def _anywhere(self, points: Points, out: Mapping[str, Array]) -> Mask:
-        """Write A, B, f0 and x0 about any points, and return where they are sound."""
+        """Write A, B, f0 and x0 about any points, and return which rows are valid."""
         ready, (q, v, u), A, B = self._prepared, points, out["A"], out["B_lower"]
         state, actuation, count = ready.map, ready.actuation, len(q)
         own = ready.own_reference
@@ -168,7 +169,8 @@ class BatchEquations:
         out["f0"][:] = 0.0 if ready.moving else f0
         if ready.moving:
             out["_drift"][:] = drift(state, f0, rates.gravity)
-        # NaN compares false. The upper half of A is finite where q0 and f0 are sound.
+        # Comparisons with NaN are false, so rows with NaN are not valid. The upper half of A is
+        # finite if q0 and f0 are valid.
         good = self._kernel.sound(q, judged) & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
         for rows in (A.reshape(count, -1)[:, A[0].size // 2 :], B.reshape(count, -1), f0):
             good &= np.vecdot(rows, rows) < LARGEST
@@ -176,5 +178,5 @@ class BatchEquations:
 
 
 def _filled(rows: Array) -> Array:
-    """Return as many rows as lanes, the last of them repeated."""
+    """Fill rows up to the number of SIMD lanes by repeating the last row."""
     return np.pad(rows, ((0, LANES - len(rows)), (0, 0)), mode="edge")

@@ -1,4 +1,4 @@
-"""Sets of configurations: given, on a grid, or random, generated on demand."""
+"""Sets of configurations: a given array, a grid, or random rows generated on demand."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# Random rows are drawn in blocks of this size, each with a seed of its own, so that a row does not
-# depend on the chunk that it is read in.
+# Random rows are drawn in blocks of this size, each with its own seed. A row therefore does not
+# depend on the chunk in which it is read.
 _DRAWN = 4096
 
-# Range of a joint that turns without limits [rad].
+# Range of a revolute joint without limits [rad].
 _TURN = (-math.pi, math.pi)
 
 
@@ -120,7 +120,7 @@ class RandomConfigurations:
 
 @dataclass(frozen=True, eq=False)
 class GivenConfigurations:
-    """An array of valid configurations (N, nq)."""
+    """Array (N, nq) of valid configurations."""
 
     q: Array
 
@@ -132,7 +132,7 @@ class GivenConfigurations:
         return self.q[start:stop]
 
 
-# What `sweep` takes in place of an array: rows that are made when they are asked for.
+# Configurations that `sweep` accepts instead of an array; their rows are generated on demand.
 Configurations: TypeAlias = Grid | RandomConfigurations | GivenConfigurations
 
 
@@ -253,13 +253,13 @@ def random_configurations(
 
 
 def as_configurations(robot: Robot, q: ArrayLike | Configurations) -> Configurations:
-    """Return the points that `sweep` is given as rows of this robot."""
+    """Return the points of a sweep as configurations of this robot."""
     instance("robot", robot, Robot, "a fflin.Robot")
     if isinstance(q, GivenConfigurations):  # checked already
         return q
     if not isinstance(q, Grid | RandomConfigurations):
         return GivenConfigurations(checked_configurations(robot, q))
-    # The same robot with other inputs or outputs will do.
+    # The robot may have other inputs or outputs, but its joints must be the same.
     if q.robot.joints != robot.joints:
         raise InputError(
             f"q was made for '{q.robot.name}', whose joints differ from the joints of "
@@ -269,7 +269,7 @@ def as_configurations(robot: Robot, q: ArrayLike | Configurations) -> Configurat
 
 
 def content(configurations: Configurations) -> dict[str, Any]:
-    """Return what all rows are made of, by names in their order."""
+    """Return all values that determine the rows, by name and in order."""
     values = {item.name: getattr(configurations, item.name) for item in fields(configurations)}
     of_joints = values.pop("axes", None) or values.pop("ranges", {})
     values.pop("robot", None)
@@ -307,7 +307,7 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
 
 
 def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Any]) -> Array:
-    """Return rows (count, nq) that differ from `start` in the joints that are named."""
+    """Return copies (count, nq) of `start` with other values of the named joints."""
     q = np.tile(start, (count, 1))
     for name, column in values.items():
         robot.joint(name).place(q.T, column)

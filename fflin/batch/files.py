@@ -1,8 +1,8 @@
-"""Arrays of many rows, in memory and in files: npz, and HDF5 whose arrays are read on demand.
+"""Arrays of many rows in memory, in .npz files, and in HDF5 files that are read on demand.
 
-An HDF5 file has a dataset for each array and two datasets of checksums. ``chunk_sha256`` has the
-checksum of each chunk of rows, whose size is the attribute ``chunk``. ``sha256`` is the checksum of
-those and of all other content.
+An HDF5 file has a dataset for each array and two datasets of checksums. ``chunk_sha256`` contains
+the checksum of each chunk of rows; the attribute ``chunk`` is the number of rows in a chunk.
+``sha256`` is the checksum of these checksums and of all other content.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from fflin.base.writing import (
 
 FORMATS = (".npz", ".h5")
 
-# From this version on HDF5 has checksums of its own metadata, without which reading a damaged file
+# HDF5 has checksums of its own metadata from this version on. Without them, reading a damaged file
 # can crash the process.
 CHECKED = ("v108", "v108")
 
 CHUNK_CHECKSUMS = f"chunk_{CHECKSUM}"
 _CHUNK_BYTES = 2**22
 
-# Allowance for what an HDF5 file has besides its rows: names, constant arrays, checksums [bytes].
+# Space in an HDF5 file for names, constant arrays and checksums [bytes].
 _OVERHEAD = 2**16
 
 
 def check_format(path: Path) -> None:
-    """Raise if the file's ending is not a known format, or h5py is needed and not installed."""
+    """Raise an error if the file's ending is unknown, or if h5py is needed but not installed."""
     check_ending(path, FORMATS)
     if path.suffix == ".h5":
         hdf5()
@@ -64,14 +64,14 @@ def hdf5() -> Any:
 
 
 def is_constant(array: Array) -> bool:
-    """Return whether all rows of an array are one row that is stored once."""
+    """Return whether an array stores a single row that stands for all its rows."""
     return array.strides[0] == 0 and array.size > 0
 
 
 def write_rows(
     path: Path, arrays: Mapping[str, Array], texts: Mapping[str, str], *, checksummed: bool
 ) -> None:
-    """Write arrays of equally many rows, and texts; with their digests where `checksummed`."""
+    """Write arrays with the same number of rows, and strings, with digests if `checksummed`."""
     check_format(path)
     constants = {key: value[0] for key, value in arrays.items() if is_constant(value)}
     varying = {key: value for key, value in arrays.items() if key not in constants}
@@ -101,17 +101,17 @@ def write_rows(
 
 
 def chunk_checksum(arrays: Mapping[str, Array]) -> bytes:
-    """Return the SHA-256 of the rows of some points."""
+    """Return the SHA-256 digest of a range of rows."""
     return bytes.fromhex(content_digest(arrays))
 
 
 def _chunk_checksums(varying: Mapping[str, Array], count: int, chunk: int) -> NDArray[np.uint8]:
-    """Return the SHA-256 (chunks, 32) of the rows of each chunk."""
+    """Return the SHA-256 digest (chunks, 32) of each chunk of rows."""
 
     def checksum(start: int) -> bytes:
         return chunk_checksum({key: value[start : start + chunk] for key, value in varying.items()})
 
-    # hashlib releases the interpreter's lock, so that threads hash at the same time.
+    # hashlib releases the interpreter lock, so threads hash the chunks in parallel.
     with ThreadPoolExecutor() as pool:
         checksums = b"".join(pool.map(checksum, range(0, count, chunk)))
     return np.frombuffer(checksums, np.uint8).reshape(-1, 32)
@@ -120,7 +120,7 @@ def _chunk_checksums(varying: Mapping[str, Array], count: int, chunk: int) -> ND
 def file_checksum(
     texts: Mapping[str, str], chunk: int, checksums: object, constants: Mapping[str, Array]
 ) -> NDArray[np.uint8]:
-    """Return the SHA-256 (32,) of a file's content, with the checksums of its chunks of rows."""
+    """Return the SHA-256 digest (32,) of a file's content, including the digests of its chunks."""
     whole = content_digest({**texts, "chunk": chunk, CHUNK_CHECKSUMS: checksums, **constants})
     return np.frombuffer(bytes.fromhex(whole), np.uint8)
 
@@ -128,7 +128,7 @@ def file_checksum(
 def read_rows(
     path: Path, *, verify: bool
 ) -> tuple[dict[str, Array], list[str], dict[str, str], bool]:
-    """Return arrays, which of them are of one row for all, texts, and whether they are verified."""
+    """Return arrays, names of the arrays with one row for all points, strings, and `verified`."""
     with path.open("rb") as file:
         zipped = file.read(2) == b"PK"
     if not zipped and path.suffix == ".npz":
@@ -138,7 +138,7 @@ def read_rows(
 
 
 def _from_npz(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str], bool]:
-    # Opened here, since NumPy does not close a file that it finds damaged.
+    # The file is opened here, because NumPy does not close a file that it finds damaged.
     with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
         entries = {key: file[key] for key in file.files}
     verified = verify and verify_checksum(entries)
@@ -166,7 +166,7 @@ def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, st
 
 
 def _mapped(path: Path, dataset: Any) -> Array:
-    """Return a contiguous dataset as an array that is read as it is used."""
+    """Return a contiguous dataset as a memory-mapped array."""
     offset = dataset.id.get_offset()
     if offset is None or not dataset.size:
         return np.asarray(dataset[()])
@@ -194,15 +194,15 @@ class MemoryStore:
             ) from None
 
     def finished(self, start: int, stop: int) -> bool:
-        """Return whether a chunk is there already."""
+        """Return False: chunks in memory are never finished before a run."""
         return False
 
     def read(self, stop: int) -> dict[str, Array]:
-        """Return the rows before one."""
+        """Return the rows before row `stop`."""
         return self.view(0, stop)
 
     def view(self, start: int, stop: int) -> dict[str, Array]:
-        """Return the arrays that a chunk is written to."""
+        """Return views of the arrays for the rows of a chunk."""
         return {key: value[start:stop] for key, value in self.arrays.items()}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
@@ -212,13 +212,13 @@ class MemoryStore:
                 rows[:] = arrays[key]
 
     def close(self) -> None:
-        """Do nothing: memory needs no closing."""
+        """Do nothing, because memory needs no closing."""
 
     discard = close
 
 
 class FileStore:
-    """Arrays of `count` rows in an HDF5 file, NAME.part until it is complete."""
+    """Arrays of `count` rows in an HDF5 file; the file is named NAME.part until it is complete."""
 
     def __init__(
         self,
@@ -270,7 +270,7 @@ class FileStore:
 
     @contextmanager
     def _reported(self) -> Iterator[None]:
-        """Turn the errors of HDF5 into a `FileError`."""
+        """Turn errors of HDF5 into a `FileError`."""
         try:
             yield
         except FileError:
@@ -290,12 +290,12 @@ class FileStore:
             )
 
     def read(self, stop: int) -> dict[str, Array]:
-        """Return the rows before one."""
+        """Return the rows before row `stop`."""
         with self._reported():
             return {key: self._file[key][:stop] for key in self._names}
 
     def view(self, start: int, stop: int) -> None:
-        """Return no arrays: a chunk is made elsewhere and then written."""
+        """Return None: a chunk cannot be computed in place, so `write` copies it to the file."""
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
         """Keep a finished chunk."""
@@ -308,7 +308,7 @@ class FileStore:
             self._file.flush()
 
     def complete(self) -> None:
-        """Add the checksum of the whole file, and give the file its name."""
+        """Add the checksum of the whole file, and rename the file to its final name."""
         with self._reported():
             checksums = self._file[CHUNK_CHECKSUMS][:]
             self._file[CHECKSUM][:] = file_checksum(
@@ -323,12 +323,12 @@ class FileStore:
         self.part.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Leave the unfinished file for another run."""
+        """Close the unfinished file, so that another run can resume from it."""
         self._file.close()
 
 
 def _reserve(path: Path, size: int) -> None:
-    """Reserve disk space for a file, since HDF5 can crash the process where the disk is full."""
+    """Reserve disk space for a file, because HDF5 can crash the process if the disk is full."""
     try:
         with path.open("ab") as file:
             if hasattr(os, "posix_fallocate"):
@@ -339,7 +339,7 @@ def _reserve(path: Path, size: int) -> None:
 
 
 def _memory() -> float:
-    """Return the size of the machine's memory [bytes], infinite if it is not known."""
+    """Return the size of the machine's memory [bytes], or infinity if it is unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):  # not on this system
@@ -356,7 +356,7 @@ def require_room(path: Path, size: int) -> None:
 
 
 def output_path(out: str | Path) -> Path:
-    """Return the path of a file that can be written, or raise `FileError`."""
+    """Return a path that can be written as a rows file, or raise `FileError`."""
     path = as_path(out)
     check_format(path)
     check_output_path(path)
@@ -365,6 +365,6 @@ def output_path(out: str | Path) -> Path:
 
 
 def part_of(path: Path) -> Path:
-    """Return the path NAME.part of an unfinished result, next to the target of a link."""
+    """Return the path NAME.part of an unfinished result, with links followed."""
     real = Path(os.path.realpath(path)) if os.path.islink(path) else path
     return real.with_name(real.name + ".part")

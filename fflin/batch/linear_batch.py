@@ -13,7 +13,7 @@ import numpy as np
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.record import NOT_VERIFIED, reading
-from fflin.base.validation import Array, FrozenArrays, frozen, number, refuse_masked
+from fflin.base.validation import Array, FrozenArrays, Indices, Mask, frozen, number, refuse_masked
 from fflin.base.writing import as_path
 from fflin.batch.files import is_constant, read_rows, write_rows
 from fflin.batch.rows import Column, away, positions, values
@@ -22,13 +22,15 @@ from fflin.linear.files import given
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
 
-# Position and quaternion of a free-flyer joint that stands at the robot's root.
+# Position and quaternion of a free-flyer joint at the robot's root frame.
 AT_ROOT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
-# Two joint values are the same where they differ by no more than this [rad|m].
+# Joint values that differ by at most this count as equal [rad|m].
 _SAME = 1e-9
 
 
@@ -105,14 +107,14 @@ class LinearBatch(FrozenArrays):
     fflin_version: str
     pinocchio_version: str
     columns: tuple[Column, ...]
-    # None where x0 follows from q, at rest, and where y0 is x0, since the outputs are the state.
+    # None if x0 follows from q (at rest), or if y0 is x0 (the outputs are the state).
     _x0: Array | None
     _y0: Array | None
-    # None where it is the base's own placement, which q gives in the frame that _root places.
+    # None if the reference is the base's own placement, which follows from q and _root.
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Fields of the models that the robot computes, by name.
+    # Model fields that need the robot to be computed, by name.
     _asked: Mapping[str, Any]
     verified: bool = True
 
@@ -132,9 +134,9 @@ class LinearBatch(FrozenArrays):
     @overload
     def __getitem__(self, index: int) -> LinearModel: ...
     @overload
-    def __getitem__(self, index: slice | Sequence[int] | Array) -> LinearBatch: ...
+    def __getitem__(self, index: slice | Sequence[int] | Indices | Mask) -> LinearBatch: ...
 
-    def __getitem__(self, index: object) -> LinearModel | LinearBatch:
+    def __getitem__(self, index: int | slice | ArrayLike) -> LinearModel | LinearBatch:
         if isinstance(index, int | np.integer):
             if not -len(self) <= index < len(self):
                 raise IndexError(f"index is {index}, but the batch has {len(self)} points")
@@ -305,7 +307,7 @@ class LinearBatch(FrozenArrays):
         return LinearBatch(**found, _asked=fields_of_model(common), verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
-        """Return the arrays that vary or may vary between the points, by name."""
+        """Return all arrays with one row per point, by name."""
         held = {key: getattr(self, key) for key in (*_ARRAYS, *_OPTIONAL_ARRAYS)}
         return {key: value for key, value in held.items() if value is not None}
 
@@ -319,7 +321,7 @@ class LinearBatch(FrozenArrays):
     def _model(self, index: int) -> LinearModel:
         common: dict[str, Any] = dict.fromkeys(_MODEL)  # None unless it is set below
         common |= {key: getattr(self, key) for key in (*_TEXTS, "verified")}
-        # A row of a file is read here, so that no model keeps the file open.
+        # The row is read from the file here, so that no model keeps the file open.
         rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
         lower, root = rows.pop("B_lower"), rows.pop("_root")
         rows["B"] = frozen(np.concatenate((np.zeros_like(lower), lower)))
@@ -344,8 +346,8 @@ class LinearBatch(FrozenArrays):
         return {self.joint_names.index(name): value for name, value in joints.items()}
 
 
-# The fields of a batch by kind, in their order: texts are the same at all points and stand in the
-# header of a file, arrays have one row per point.
+# Names of a batch's fields by kind, in order. _TEXTS are the same at all points and are stored in
+# the header of a file. Arrays have one row per point.
 _KINDS = {item.name: str(item.type) for item in fields(LinearBatch)}
 _MODEL = {item.name for item in fields(LinearModel)} - {"verified"}
 _ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array"]
@@ -354,7 +356,7 @@ _TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not i
 
 
 def fields_of_model(common: Mapping[str, object]) -> dict[str, Any]:
-    """Return the fields that are the same for all models and that a batch does not have."""
+    """Return the fields that are the same for all models and are not fields of a batch."""
     return {key: value for key, value in common.items() if key not in _KINDS}
 
 
@@ -397,7 +399,7 @@ def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:
 
 
 def _in_world(root: Array, base: Array) -> Array:
-    """Return the placement (7,) in the world of a base that is placed (7,) in the root's frame."""
+    """Return the world placement (7,) of a base from its placement (7,) in the root's frame."""
     import pinocchio as pin
 
     if (root == AT_ROOT).all():

@@ -1,4 +1,4 @@
-"""Arrays of configurations, velocities and inputs, one per row: joint values and checks."""
+"""Arrays with one configuration, velocity or input per row: joint values and checks."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# Where a joint stands in q: (index, -1), or, where it is stored so, those of (cos, sin); and the
-# entry for a unit of its value.
+# Position of a joint in q: (index, -1), or the indices of (cos, sin) for a continuous joint. The
+# factor is the entry of q for a joint value of 1.
 Column: TypeAlias = tuple[int, int, float]
 
-# Rows that are checked at once, which bounds the memory of what is computed on the way.
+# Number of rows that are checked together, which limits the memory for intermediate results.
 _BLOCK = 2048
 
 
 class Points(NamedTuple):
-    """Valid configurations, velocities and inputs; v and u0 are None for rest and no input."""
+    """Valid configurations, velocities and inputs; v None means rest, u0 None means zero."""
 
     q: Array
     v: Array | None
     u0: Array | None
 
     def each(self, change: Callable[[Array], Array]) -> Points:
-        """Return them with the same done to each."""
+        """Return the points with a function applied to each array."""
         v, u0 = (None if rows is None else change(rows) for rows in self[1:])
         return Points(change(self.q), v, u0)
 
 
 def column(joint: Joint) -> Column:
-    """Return where a joint stands in q."""
+    """Return the indices and the scale of a joint in q."""
     return joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1, joint.scale
 
 
@@ -55,7 +55,7 @@ def positions(q: Array, columns: Sequence[Column]) -> Array:
 
 
 def away(q: Array, column: Column, value: float) -> Array:
-    """Return distances (N,) of a joint from a value; continuous joints use the short way."""
+    """Return distances (N,) of a joint from a value, by the shorter arc of a continuous joint."""
     distance = values(q, column) - value
     if column[1] >= 0:
         distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))
@@ -70,7 +70,7 @@ def follow_rows(robot: Robot, q: Array) -> None:
 
 
 def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
-    """Return a copy of configurations (N, nq), each as `Robot.checked_configuration` has it."""
+    """Return a copy of configurations (N, nq) after `Robot.checked_configuration` of each row."""
     rows = _rows("q", q, robot.nq, "one configuration in Pinocchio's order per row")
     for start in range(0, len(rows), _BLOCK):
         block = rows[start : start + _BLOCK]
@@ -78,9 +78,9 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
             excess = np.abs(np.einsum("ij,ij->i", block[:, 3:7], block[:, 3:7]) - 1.0)
             for at in robot.unbounded:
                 excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
-            # A finite sum tells at once that all are finite.
+            # A finite sum shows that all entries are finite.
             finite = np.isfinite(block.sum()) or np.isfinite(block).all(axis=1)
-        # NaN compares false, so that it is among them.
+        # Comparisons with NaN are false, so rows with NaN are doubtful.
         doubtful = ~((excess <= ROUND_OFF) & finite)
         if robot.followers:
             followed = block.copy()
@@ -97,7 +97,7 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
 
 
 def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
-    """Return velocities (N, nv) of an array (N, nv), or (nv,) for all; read-only."""
+    """Return read-only velocities (N, nv) from an array (N, nv), or (nv,) for all points."""
     if dimension("v", v) == 1:
         return np.broadcast_to(robot.checked_velocity(v).copy(), (count, robot.nv))
     rows = _rows("v", v, robot.nv, "one velocity in Pinocchio's order per row", count)
@@ -108,7 +108,7 @@ def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
 
 
 def checked_inputs(names: tuple[str, ...], u: ArrayLike, count: int) -> Array:
-    """Return inputs (N, nu) of an array (N, nu), or (nu,) for all; read-only."""
+    """Return read-only inputs (N, nu) from an array (N, nu), or (nu,) for all points."""
     nu = len(names)
     if dimension("u", u) == 1:
         return np.broadcast_to(vector("u", u, nu, "the robot's inputs").copy(), (count, nu))
@@ -121,7 +121,7 @@ def checked_inputs(names: tuple[str, ...], u: ArrayLike, count: int) -> Array:
 
 
 def _not_finite(rows: Array) -> list[int]:
-    """Return the rows with an entry that is not finite; a finite sum excludes any."""
+    """Return the indices of the rows with an entry that is not finite."""
     with np.errstate(all="ignore"):
         if np.isfinite(rows.sum()):
             return []

@@ -1,7 +1,7 @@
-"""Run of a job over rows, chunk by chunk, into a store that may already contain chunks.
+"""Application of a job to rows, chunk by chunk, into a store that may already contain chunks.
 
-Chunks run on threads of this process, or on the workers of an executor. This module is independent
-of the meaning of the rows and of the job's results.
+Chunks run on threads of this process, or on the workers of an executor. The meaning of the rows and
+results is left to the job.
 """
 
 from __future__ import annotations
@@ -19,23 +19,31 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
-from fflin.base.validation import Array, whole
+from fflin.base.validation import Array, Mask, whole
 from fflin.batch.files import FileStore, MemoryStore
 from fflin.batch.workers import NoWorkers, OwnWorkers, WorkerDied
 
-# Chunks that are submitted for each worker at a time, so that none is idle between two.
+# Chunks submitted per worker at a time, so that a worker never waits for its next chunk.
 _QUEUED = 2
 
-# Assumed of an executor that does not tell how many workers it has.
+# Number of workers assumed if an executor does not report it.
 _UNKNOWN_WORKERS = 16
 
-Rows = Callable[[int, int], Any]
 Progress = Callable[[int, int], object]
+
+
+class Rows(Protocol):
+    """Arrays of equal length, as a named tuple has them."""
+
+    def _asdict(self) -> dict[str, Any]: ...
+
+
+R_contra = TypeVar("R_contra", bound=Rows, contravariant=True)
 
 
 class Span(NamedTuple):
@@ -52,17 +60,17 @@ class ChunkResult(NamedTuple):
     notes: list[str]
 
 
-class Job(Protocol):
+class Job(Protocol[R_contra]):
     """Computation on rows; it is pickled, and each worker unpickles it once."""
 
     @property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Shape of each array that it makes, for one row."""
+        """Shape per row of each array that the job returns."""
 
     def run(
-        self, rows: object, start: int, out: Mapping[str, Array] | None = None, /
+        self, rows: R_contra, start: int, out: Mapping[str, Array] | None = None, /
     ) -> ChunkResult:
-        """Do the rows from number `start` on, into arrays `out` or new ones; on any thread."""
+        """Process the rows from `start` on, into arrays `out` or new arrays, on any thread."""
 
 
 class Done(NamedTuple):
@@ -91,8 +99,8 @@ def check_workers(
 
 
 def run_chunks(
-    job: Job,
-    rows: Rows,
+    job: Job[R_contra],
+    rows: Callable[[int, int], R_contra],
     store: FileStore | MemoryStore,
     *,
     executor: Executor | None = None,
@@ -102,9 +110,9 @@ def run_chunks(
     all_needed: bool = False,
 ) -> list[Done]:
     """Compute the missing chunks of a store, save the results, and return failed chunks."""
-    # `rows(start, stop)` is a named tuple, which the store keeps of what it has a name for. Only
-    # chunks that begin before `upto` are done; threads are of this process, without an executor.
-    # If all chunks are needed, the first that fails is the last.
+    # `rows(start, stop)` returns a named tuple; the store saves the fields that it has arrays for.
+    # Only chunks that begin before `upto` are computed. Without an executor, they run on `threads`
+    # threads of this process. If all chunks are needed, the run ends at the first failure.
     size = store.chunk
     spans = [Span(at, min(at + size, store.count)) for at in range(0, store.count, size)]
     left = [span for span in spans if not store.finished(*span)]
@@ -139,9 +147,9 @@ def failure(
     failed: list[Done],
     store: FileStore | MemoryStore,
     of_what: str,
-    made: Callable[[object], object],
+    made: Callable[[Mask], object],
 ) -> SweepError:
-    """Return the error that names the chunks that failed."""
+    """Return the error that lists the failed chunks."""
     kept = np.ones(store.count, dtype=bool)
     for (start, stop), *_ in failed:
         kept[start:stop] = False
@@ -170,7 +178,11 @@ def failure(
 
 
 def _run_here(
-    job: Job, rows: Rows, store: FileStore | MemoryStore, spans: list[Span], threads: int
+    job: Job[R_contra],
+    rows: Callable[[int, int], R_contra],
+    store: FileStore | MemoryStore,
+    spans: list[Span],
+    threads: int,
 ) -> Iterator[Done]:
     def run(span: Span) -> Done:
         view = store.view(*span)
@@ -187,17 +199,19 @@ def _run_here(
     try:
         for span in spans:
             begun.append(pool.submit(run, span))
-            # Results that nobody has taken yet would fill the memory.
+            # Results wait in memory until they are consumed, so their number is limited.
             if len(begun) > threads:
                 yield begun.popleft().result()
         while begun:
             yield begun.popleft().result()
     finally:
-        # Without waiting, so that Ctrl-C ends a compilation too.
+        # Do not wait, so that Ctrl-C can also interrupt a compilation.
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _run_on_workers(job: Job, rows: Rows, spans: list[Span], executor: Executor) -> Iterator[Done]:
+def _run_on_workers(
+    job: Job[R_contra], rows: Callable[[int, int], R_contra], spans: list[Span], executor: Executor
+) -> Iterator[Done]:
     pickled, ahead = pickle.dumps(job), _QUEUED * worker_count(executor)
     waiting, running = deque(spans), dict[Future[ChunkResult], Span]()
     try:
@@ -206,7 +220,7 @@ def _run_on_workers(job: Job, rows: Rows, spans: list[Span], executor: Executor)
                 span = waiting.popleft()
                 try:
                     future = executor.submit(work, pickled, rows(*span), span.start)
-                except Exception as error:  # broken, shut down, or of its own
+                except Exception as error:  # broken, shut down, or specific to the executor
                     yield Done(span, None, _reason(error))
                 else:
                     running[future] = span
@@ -214,7 +228,7 @@ def _run_on_workers(job: Job, rows: Rows, spans: list[Span], executor: Executor)
                 span = running.pop(future)
                 try:
                     done = Done(span, future.result(), "")
-                except Exception as error:  # each executor has its own
+                except Exception as error:  # each executor raises its own types
                     done = Done(span, None, _reason(error))
                     if isinstance(error, NoWorkers):
                         yield from (Done(each, None, done.reason) for each in waiting)
@@ -226,7 +240,7 @@ def _run_on_workers(job: Job, rows: Rows, spans: list[Span], executor: Executor)
 
 
 def _reason(error: Exception) -> str:
-    """Return why a chunk failed."""
+    """Return the reason for which a chunk failed."""
     if isinstance(error, FflinError):
         return str(error)
     if isinstance(error, WorkerDied | NoWorkers):
@@ -244,20 +258,20 @@ def executor_of(executor: Executor | None, workers: int | None) -> Iterator[Exec
         yield pool
 
 
-def work(job: bytes, rows: object, start: int) -> ChunkResult:
-    """Process a chunk in a worker, by a pickled job."""
+def work(job: bytes, rows: Rows, start: int) -> ChunkResult:
+    """Run a pickled job on one chunk; called in a worker."""
     return _unpickled(job).run(rows, start)
 
 
 @lru_cache(maxsize=4)
-def _unpickled(job: bytes) -> Job:
-    """Return a job, unpickled once in each worker: it compiles or prepares at its first chunk."""
-    result: Job = pickle.loads(job)
+def _unpickled(job: bytes) -> Job[Rows]:
+    """Return an unpickled job, cached in each worker so that the job is prepared once."""
+    result: Job[Rows] = pickle.loads(job)
     return result
 
 
 def worker_count(executor: Executor) -> int:
-    """Return the number of workers of an executor, or a default if it is not known."""
+    """Return the number of workers of an executor, or a default if the number is unknown."""
     for name in ("_max_workers", "num_workers"):
         count = getattr(executor, name, None)
         if isinstance(count, int) and count > 0:

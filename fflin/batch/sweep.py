@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 
     from fflin.dynamics.state import Frame
 
-# Size of a chunk's result: large enough that sending it costs little beside computing it, small
-# enough that a handful of them fit in memory.
+# Size of a chunk's result: large enough that computing it takes much longer than sending it, and
+# small enough that several of them fit in memory.
 _CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 
-# Number of chunks that workers share, so that all workers end at about the same time.
+# Least number of chunks, so that all workers finish at about the same time.
 _SHARES = 32
 
 _log = logging.getLogger("fflin")
@@ -174,7 +174,7 @@ def planned_bytes(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
 ) -> int:
-    """Return how large the result of a sweep over so many points is [bytes]."""
+    """Return the size [bytes] of the result of a sweep over `count` points."""
     options: Any = {"frame": frame, "reference": reference, "moving": False}
     return count * _row_bytes(ChunkJob(robot, at_rest=at_rest, **options))
 
@@ -184,7 +184,7 @@ def _row_bytes(job: ChunkJob) -> int:
 
 
 def _chunk_size(task: SweepTask, shares: int, threads: int) -> int:
-    """Return how many points a chunk has, so that all threads have as many chunks."""
+    """Return the number of points per chunk that gives all threads equally many chunks."""
     row = _row_bytes(task.job)
     size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * task.count // shares)) // row
     size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
@@ -209,7 +209,7 @@ def _store(task: SweepTask, path: Path | None, size: int) -> FileStore | MemoryS
 def _finish(task: SweepTask, store: FileStore | MemoryStore, path: Path | None) -> LinearBatch:
     if isinstance(store, FileStore):
         store.complete()
-        # This call has written the file, so that its checksums need no check.
+        # This call has just written the file, so its checksums are not verified.
         return replace(LinearBatch.load(store.path, task.robot, verify=False), verified=True)
     batch = _in_memory(task, store)
     if path is not None:
@@ -222,7 +222,7 @@ def _in_memory(task: SweepTask, store: FileStore | MemoryStore) -> LinearBatch:
     return task.batch(task.given() | store.arrays)
 
 
-# Attributes of a robot that, with its model and its mappings, tell it from others.
+# Attributes that, with the model and the mappings, distinguish a robot from others.
 _OF_THE_ROBOT = (
     *("name", "urdf_sha256", "locked", "joints", "followers"),
     *("inputs", "outputs", "gravity", "orbit"),
@@ -230,7 +230,7 @@ _OF_THE_ROBOT = (
 
 
 class SweepTask:
-    """Points of a sweep, and the part of its result that is the same at all points."""
+    """Points of a sweep, and the arrays of its result that are the same at all points."""
 
     def __init__(
         self,
@@ -246,12 +246,12 @@ class SweepTask:
         self.u = None if u is None else checked_inputs(names, u, self.count)
 
     def points(self, start: int, stop: int) -> Points:
-        """Return some of the points."""
+        """Return points start to stop - 1."""
         v, u = (None if rows is None else rows[start:stop] for rows in (self.v, self.u))
         return Points(self.configurations.rows(start, stop), v, u)
 
     def given(self) -> dict[str, Array]:
-        """Return the arrays of points that differ from point to point and are there already."""
+        """Return the arrays that vary between points and are already known."""
         rows = {"v": self.v, "u0": self.u}
         if isinstance(self.configurations, GivenConfigurations):
             rows["q"] = self.configurations.q
@@ -291,14 +291,14 @@ class SweepTask:
         return LinearBatch(**texts, **rows, columns=columns, _asked=asked)
 
     def texts(self, constants: Iterable[str]) -> dict[str, str]:
-        """Return the texts in a file of the batch."""
+        """Return the strings that a file of the batch contains."""
         one = {key: np.empty((1, *shape)) for key, shape in self.job.shapes.items()}
         example = self.batch(one | {"q": self.points(0, 1).q})
         return {**example.header(self.count), "constant": json.dumps(list(constants))}
 
     @property
     def request(self) -> str:
-        """Hash of all that the result depends on."""
+        """Digest of everything on which the result depends."""
         robot, prepared = self.robot, self.job.linearizer.prepared
         inertias = [inertia.toDynamicParameters() for inertia in robot.model.inertias]
         placements = [placement.homogeneous for placement in robot.model.jointPlacements]

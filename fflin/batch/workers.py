@@ -16,20 +16,20 @@ from typing import Any
 from fflin.base.errors import FflinWarning
 from fflin.kernel.compiled import available_cores
 
-# How long a process that was terminated may take to end, before it is killed [s].
+# Time for a terminated process to end before it is killed [s].
 _PATIENCE = 5.0
 
 
 class WorkerDied(BrokenExecutor):
-    """Error of a task whose worker process died; other workers continue."""
+    """Error for a task whose worker process died; other workers continue."""
 
 
 class NoWorkers(BrokenExecutor):
-    """Error if no worker process can be started."""
+    """Error for worker processes that cannot be started."""
 
 
 class OwnWorkers(Executor):
-    """Executor of worker processes; if one dies, only its task fails and it is replaced."""
+    """Executor with worker processes; if one dies, its task fails and another one starts."""
 
     def __init__(self, count: int) -> None:
         cores = available_cores()
@@ -38,7 +38,7 @@ class OwnWorkers(Executor):
             warnings.warn(said, FflinWarning, stacklevel=5)
             count = cores
         self._max_workers = count
-        # A fork would take a copy of locks that other threads hold.
+        # With fork, a process would inherit locks that other threads hold.
         self._context = get_context("spawn")
         self._threads = ThreadPoolExecutor(count)
         self._mine = local()
@@ -46,17 +46,18 @@ class OwnWorkers(Executor):
         self._processes: dict[Any, Connection] = {}
 
     def submit(self, fn: Callable[..., object], /, *args: object, **kwargs: object) -> Future[Any]:
-        """Have a process call a function; `WorkerDied` is raised where it dies of it."""
+        """Call a function in a worker process; raise `WorkerDied` if the process dies."""
         return self._threads.submit(self._do, (fn, args, kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes, whatever they are doing."""
+        """End the processes, even in the middle of a task."""
         with self._lock:
             self._closed = True
             for process in self._processes:
                 process.terminate()
-        # The threads end with their processes. To join them could take for ever: Ctrl-C in the
-        # middle of waiting for a future leaves its lock taken, which they need to say the end.
+        # Do not join the threads; they end with their processes. If Ctrl-C interrupts a wait for a
+        # future, the lock of the future remains locked. A thread that needs this lock to set the
+        # result would never end.
         self._threads.shutdown(wait=False, cancel_futures=True)
         for process in list(self._processes):
             self._end(process)
@@ -78,7 +79,7 @@ class OwnWorkers(Executor):
         return result
 
     def _start(self) -> Any:
-        """Start a process for this thread and wait until it is there."""
+        """Start a process for this thread and wait until it is ready."""
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_serve, args=(theirs,), daemon=True)
         with self._lock:
@@ -103,7 +104,7 @@ class OwnWorkers(Executor):
 
     def _end(self, process: Any) -> None:
         pipe = self._processes.pop(process, None)
-        if pipe is None:  # its thread or the one that shuts down is at it
+        if pipe is None:  # another thread is already ending it
             return
         pipe.close()
         process.join(_PATIENCE)
@@ -113,7 +114,7 @@ class OwnWorkers(Executor):
         process.close()
 
 
-# Threads of one process start workers one at a time: `_isolated` changes what is theirs in common.
+# Threads start workers one at a time, because `_isolated` changes a module that all threads share.
 _STARTING = Lock()
 
 
@@ -121,8 +122,8 @@ _STARTING = Lock()
 def _isolated() -> Iterator[None]:
     """Start processes that import nothing from the working folder.
 
-    By default multiprocessing runs them with the working folder in front of all that they import
-    from, until they take over the `sys.path` of the process that started them.
+    By default, a process that multiprocessing starts imports from the working folder first, until
+    it has copied the `sys.path` of its parent process.
     """
     from multiprocessing import util
 
@@ -138,13 +139,13 @@ def _isolated() -> Iterator[None]:
 
 @contextmanager
 def _deaf_to_ctrl_c() -> Iterator[None]:
-    """Block Ctrl-C in the processes that are started: their caller gets it too, and ends them."""
+    """Start processes that ignore Ctrl-C, because their parent receives it too and ends them."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     from multiprocessing import resource_tracker
 
-    # Started together with a process it would unblock the signal.
+    # A tracker that is started together with a process would unblock the signal.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -154,7 +155,7 @@ def _deaf_to_ctrl_c() -> Iterator[None]:
 
 
 def _serve(pipe: Connection) -> None:
-    """Do tasks until the caller closes the pipe or ends."""
+    """Run tasks until the parent closes the pipe or ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_the_caller, daemon=True).start()
     try:
@@ -172,7 +173,7 @@ def _serve(pipe: Connection) -> None:
 
 
 def _end_with_the_caller() -> None:
-    """End this process with the one that started it, in the middle of a task too."""
+    """End this process when its parent process ends, even in the middle of a task."""
     caller = parent_process()
     assert caller is not None
     caller.join()

@@ -300,7 +300,7 @@ class Campaign(FrozenArrays):
         return intervals.mean(values, share("confidence", confidence))
 
     def worst(self, k: int = 5, name: str | None = None) -> list[int]:
-        """Return the indices of the k runs with the largest values of a figure.
+        """Return the indices of the k runs in which a figure, such as ``attitude``, is largest.
 
         The default figure is `about`. Runs that were stopped early come first, the earliest stop
         before the others.

@@ -12,13 +12,12 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.analysis.names import rate_of
 from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
-from fflin.base.validation import Array, as_double
+from fflin.base.validation import Array, Indices, Mask, as_double
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, Over
@@ -150,7 +149,8 @@ def settling_runs(
     options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
     options |= {"limits": limits, "project": not predicts}
     # Without limits no input saturates, and thrusters may pull.
-    options |= {"unlimited": limits is None, "histories": checks + 1 if predicts else 1}
+    options |= {"unlimited": limits is None}
+    options |= {"histories": checks + 1} if predicts else {}
     judge = Settling(loop, _transition(loop, dt, every) if predicts else None)
     return CampaignJob(loop.robot, StateFeedback(lin, loop.K), None, 0, "python", options, judge)
 
@@ -187,9 +187,9 @@ class Settling:
         """Stop condition of the runs: settled or diverged; None if they are compared."""
         return self._is_over if self.step is None else None
 
-    def _is_over(self, first: Array, e: Array) -> NDArray[np.bool_]:
+    def _is_over(self, first: Array, e: Array) -> Mask:
         first, size = (self.loop.size(each[:, self.loop.watched]) for each in (first, e))
-        over: NDArray[np.bool_] = (size <= SETTLED * first) | ~(size < DIVERGED * first)
+        over: Mask = (size <= SETTLED * first) | ~(size < DIVERGED * first)
         return over
 
     def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
@@ -214,7 +214,7 @@ class Settling:
 
 def settle(
     runs_of: Callable[[int], CampaignJob],
-    starts: Callable[[NDArray[np.intp]], Array],
+    starts: Callable[[Indices], Array],
     count: int,
     engine: str | None = None,
     **how: Any,
@@ -229,7 +229,7 @@ def settle(
         job = runs_of(fine)
         job.choose(engine)
 
-        def rows(start: int, stop: int, left: NDArray[np.intp] = left) -> Draws:
+        def rows(start: int, stop: int, left: Indices = left) -> Draws:
             return Draws(starts(left[start:stop]))
 
         found = completed(job, rows, len(left), **how)

@@ -9,12 +9,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.intervals import until_failure
 from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays, number, share, whole
+from fflin.base.validation import Array, FrozenArrays, Indices, number, share, whole
 from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import expect
@@ -284,8 +283,8 @@ def _starts(
     largest: dict[str, float],
     seed: int,
     levels: Array,
-    streams: NDArray[np.intp],
-    runs: NDArray[np.intp],
+    streams: Indices,
+    runs: Indices,
 ) -> Array:
     """Return deviations of the initial states of some runs, each from its own random stream."""
     x = []
@@ -329,8 +328,8 @@ def _checked_displacement(
     given = {key: number(key, value) for key, value in given.items()}
     if not 0.0 <= given["attitude"] < 175.0 or min(given.values()) < 0.0:
         raise InputError(
-            f"the displacements are {shown(given)}; expected values of 0 or more, and an "
-            "attitude below 175 deg, because the chart ends at 180 deg"
+            f"the displacements are {shown(given)}, but each must be 0 or more, and the rotation "
+            "must be less than 175 deg, because the attitude chart ends at 180 deg"
         )
     if max(given.values()) > _FARTHEST:
         raise InputError(

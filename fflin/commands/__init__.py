@@ -1,6 +1,6 @@
-"""The command line, a module for each group: parse, call one function, print or save.
+"""Command line with one module per group of commands: parse, call one function, print or save.
 
-Imports every room; no room imports it.
+This package imports every other package of fflin; no other package imports it.
 """
 
 DONE, FELL_SHORT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130

@@ -1,4 +1,4 @@
-"""The commands `analyze`, `modes`, `sensitivity` and `uncertain`."""
+"""Commands `analyze`, `modes`, `equilibrium`, `sensitivity` and `uncertain`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SLACK = 1e-9  # up to which a value is at its limit, in SI units
 
 
 def add_commands(commands: parser.Commands) -> None:
-    """Add analyze, modes, sensitivity and uncertain."""
+    """Add the commands analyze, modes, equilibrium, sensitivity and uncertain."""
     analyze = parser.command(
         commands,
         "analyze",

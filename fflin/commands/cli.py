@@ -1,4 +1,4 @@
-"""Entry point: parse, run a command, convert errors to one line and an exit code."""
+"""Entry point: parse, run a command, and convert errors to one line and an exit code."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fflin.base.writing import check_ending, check_output_path, files_of_command
 from fflin.commands import BAD_INPUT, DONE, parser
 from fflin.commands.results import finish, require_own_kind
 
-# The commands by task, in the order of the help, each with its module.
+# {task: {command: module}}, in the order of the help.
 TASKS = {
     "inspect robots": {"robots": "models", "info": "models", "init": "models", "view": "visual"},
     "make and check a linear model": {"linearize": "models", "check": "models"},
@@ -39,7 +39,7 @@ _MODULES = {name: module for names in TASKS.values() for name, module in names.i
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return 0 done, 1 a check failed, 2 invalid input."""
+    """Run the command line; return 0 if done, 1 if a check failed, 2 for invalid input."""
     reported: set[str] = set()  # each warning once per command
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
@@ -49,13 +49,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     warnings.showwarning = show
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # Names may contain characters that the terminal cannot show.
+        # Names may contain characters that the terminal cannot encode.
         sys.stdout.reconfigure(errors="backslashreplace")
     argv = sys.argv[1:] if argv is None else argv
     try:
         main_parser = _parser(argv[0] if argv else "")
         arguments, unknown = main_parser.parse_known_args(argv)
-        if unknown:  # its command has the list of options
+        if unknown:  # the error refers to the options of the command
             chosen = getattr(arguments, "command", main_parser)
             from difflib import get_close_matches
 
@@ -72,7 +72,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_error(f"fflin: error: {error}")
         return BAD_INPUT
     except BrokenPipeError:
-        # The reader, such as head, closed the pipe; the interpreter must not report it at exit.
+        # The reader of the pipe, such as head, has closed it. Python would report this again at
+        # exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:
@@ -82,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser(asked: str) -> parser.Command:
-    """Return the parser of one command, or of all commands."""
+    """Return the parser of the command `asked`, or of all commands if there is no such command."""
     main = parser.Command(
         prog="fflin",
         usage="fflin [-h] [--version] COMMAND ...",
@@ -95,7 +96,7 @@ def _parser(asked: str) -> parser.Command:
     )
     for name in [_MODULES[asked]] if asked in _MODULES else dict.fromkeys(_MODULES.values()):
         import_module(f"fflin.commands.{name}").add_commands(commands)
-    # argparse puts all commands in one group.
+    # argparse puts all commands in one group; sort them into a group for each task.
     left = {command.dest: command for command in commands._choices_actions}
     commands._choices_actions = []
     for task, names in TASKS.items():
@@ -105,9 +106,9 @@ def _parser(asked: str) -> parser.Command:
 
 
 def check_outputs(arguments: argparse.Namespace) -> None:
-    """Refuse output files that cannot be written, before any computation."""
+    """Raise an error before any computation if an output file cannot be written."""
     for path, kind in parser.outputs_of(arguments):
-        check_output_path(path)  # first, since it says that an output is an input
+        check_output_path(path)  # first, because it reports an output that is also an input
         check_ending(path, kind.endings)
         if kind is parser.FIGURE:
             from fflin.base.figures import require_matplotlib

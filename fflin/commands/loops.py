@@ -1,4 +1,4 @@
-"""The loop that commands simulate, with a controller from files or by design."""
+"""Closed loop that commands simulate, with a controller from files or designed from options."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce"
 
 
 class Loop(NamedTuple):
-    """A policy, its simulation options, and for state feedback the model of the prediction."""
+    """Policy, simulation options, and for state feedback the model that predicts the motion."""
 
     policy: Any
     options: dict[str, Any]
@@ -55,7 +55,7 @@ class Loop(NamedTuple):
 
 
 def refuse_law(arguments: argparse.Namespace) -> None:
-    """Refuse the options of a regulator together with --free."""
+    """Raise an error if --free is combined with options of a regulator."""
     refuse(
         arguments,
         ("limit", "delay"),
@@ -71,7 +71,7 @@ def refuse_law(arguments: argparse.Namespace) -> None:
 
 
 def add_loop(command: parser.Command) -> None:
-    """Add the options of the loop."""
+    """Add the options that define the closed loop and its simulation."""
     options.add_robot(command)
     start, goal = command.group("start"), command.group("target")
     options.add_pose(start)
@@ -145,7 +145,7 @@ def _add_controllers(group: parser.Group) -> None:
 
 
 def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
-    """Return the loop of the options of `add_loop`."""
+    """Return the loop that the options of `add_loop` define."""
     from fflin.control.policies import StateFeedback
     from fflin.simulation.times import SHORTEST, time_to_settle
 
@@ -188,7 +188,7 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
 def start_of(
     robot: Robot, arguments: argparse.Namespace, reference: pin.SE3 | None = None
 ) -> tuple[Array, Array | None]:
-    """Return the initial q (nq,) and v (nv,) of the arguments or of the robot."""
+    """Return the initial q (nq,) and v (nv,) from the arguments or the robot."""
     from fflin.base.names import rates_by_name
     from fflin.dynamics.points import combined
 
@@ -209,7 +209,7 @@ def start_of(
 def about_point(
     robot: Robot, arguments: argparse.Namespace
 ) -> tuple[Feedback | Allocation, Any, LinearModel | None]:
-    """Return the policy, its feedback, and the model that predicts every row."""
+    """Return the policy, its feedback, and the model that predicts every row of the motion."""
     from fflin.control.linear_controller import LinearController
     from fflin.control.policies import Allocation, StateFeedback
 
@@ -251,7 +251,7 @@ def about_point(
 
 
 def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Feedback:
-    """Return the predictive controller of the weights and limits."""
+    """Return the predictive controller with the weights and limits of the arguments."""
     from fflin.control.mpc import mpc
     from fflin.control.weights import rule_weights
 
@@ -266,7 +266,7 @@ def _mpc(lin: LinearModel, arguments: argparse.Namespace) -> Feedback:
 
 
 def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
-    """Return the feedback along a trajectory, and its start options."""
+    """Return the feedback along a trajectory, and the options of its start."""
     from fflin.control.gain_schedule import GainSchedule
     from fflin.control.policies import Allocation
     from fflin.control.tracking import TrajectoryFeedback
@@ -301,9 +301,9 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
 
 
 def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> LinearModel:
-    """Return the model about the operating point of a gain.
+    """Return the linear model about the operating point of a gain.
 
-    If the gain is about its reference, the reference is the target pose of the base.
+    If the operating point is at its own reference, the target pose of the base is the reference.
     """
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
@@ -339,7 +339,7 @@ def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
 
 
 def target_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:
-    """Return q (nq,) and v (nv,) of the target, which is the point of the robot by default."""
+    """Return the target q (nq,) and v (nv,), by default the operating point of the robot."""
     from fflin.dynamics.points import combined
 
     refuse_pose(arguments, "target_")

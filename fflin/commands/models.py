@@ -1,4 +1,4 @@
-"""The commands `robots`, `info`, `init`, `linearize` and `check`."""
+"""Commands `robots`, `info`, `init`, `linearize` and `check`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: parser.Commands) -> None:
-    """Add robots, info, init, linearize and check."""
+    """Add the commands robots, info, init, linearize and check."""
     summary = "list the robots that can be loaded by name"
     parser.command(commands, "robots", _robots, summary, example="fflin robots")
     info = parser.command(
@@ -117,7 +117,7 @@ def _robots(_: argparse.Namespace) -> Report:
     for name in list_robots():
         try:
             with warnings.catch_warnings():
-                # `fflin info` shows the warnings of each robot.
+                # These warnings are left to `fflin info`.
                 warnings.simplefilter("ignore", FflinWarning)
                 entries.append((name, load(name), find_robot(name).origin))
         except FflinError as error:
@@ -232,7 +232,7 @@ _MOVES = 1e-9
 
 
 def model_report(lin: LinearModel) -> str:
-    """Show a linear model: its point, A, B, C, D and its certificate."""
+    """Format a linear model: its operating point, A, B, C, D and its certificate."""
     import numpy as np
 
     nx, nu = lin.B.shape
@@ -245,7 +245,7 @@ def model_report(lin: LinearModel) -> str:
     head += f"; the operating point is {point}"
     parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # In motion the poles of a frozen model do not show stability. If A A = 0, all are zero.
+    # The poles of a model in motion do not show stability. If A A = 0, all poles are zero.
     if stays and not lin.dt and (lin.A @ lin.A).any():
         from fflin.analysis.modes import modes
 
@@ -281,7 +281,7 @@ def model_report(lin: LinearModel) -> str:
 
 
 def inputs_report(robot: Robot) -> str:
-    """Show the inputs of a robot and their limits."""
+    """Format the inputs of a robot and their limits."""
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
     from fflin.robot.limits import limits_of
@@ -302,7 +302,7 @@ def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Seque
 
 
 def _units(lin: LinearModel) -> str:
-    """Return the units of states, inputs and outputs, once for each group."""
+    """Return the units of the states, inputs and outputs, once for each group of names."""
     lines = [("x", lin.state_names, lin.state_units), ("u", lin.input_names, lin.input_units)]
     if lin.output_names != lin.state_names:
         lines.append(("y", lin.output_names, lin.output_units))

@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""Options that are shared by several commands."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fflin.commands.parser import (
 
 
 class _FormerName(argparse.Action):
-    """Option under its former name, which warns of the new one."""
+    """Option under its former name; it warns that there is a new name."""
 
     def __call__(
         self, _: object, given: argparse.Namespace, value: object, option: object = None
@@ -37,7 +37,7 @@ class _FormerName(argparse.Action):
 
 
 def add_former_name(group: Group, name: str, new: str) -> None:
-    """Add the former name of an option for a time in seconds."""
+    """Add the former name of a time option."""
     text = f"former name of --{new}"
     group.add_argument(name, dest=new, type=number, metavar="H", action=_FormerName, help=text)
 
@@ -56,7 +56,7 @@ def add_robot(command: Command) -> None:
 
 
 def add_point(command: Command) -> None:
-    """Add the robot and the options of its operating point."""
+    """Add the robot and the options of the operating point."""
     point = command.group(POINT)
     add_robot(command)
     add_pose(point)
@@ -128,7 +128,7 @@ def add_limits(group: Group) -> None:
 
 
 def add_step(group: Group) -> None:
-    """Add --dt, and --step as it was called."""
+    """Add --dt, and its former name --step."""
     group.add("--dt", "integration step [s]; chosen automatically by default", float, "H")
     group.add("--step", "former name of --dt", float, "H")
 
@@ -176,7 +176,7 @@ def add_inputs_there(group: Group) -> None:
 
 
 def add_reference(group: Group) -> None:
-    """Add the option for the reference of attitude and position."""
+    """Add the option for the origin of attitude and position."""
     group.add(
         "--reference",
         "pose from which the attitude and position in the state are measured: the base pose at "
@@ -212,7 +212,7 @@ def add_orbit(group: Group) -> None:
 
 
 def add_system(command: Command) -> None:
-    """Add the options for forces, inputs and outputs, which robot.toml may set too."""
+    """Add the options for forces, inputs and outputs, which robot.toml can also set."""
     group = command.group(ROBOT)
     add_orbit(group)
     group.add(
@@ -257,7 +257,7 @@ def add_system(command: Command) -> None:
 def add_output_file(
     group: Group, what: str, endings: OutputFile, *kinds: str, required: bool = False
 ) -> None:
-    """Add -o FILE, and --force if `kinds` of results are given; see `require_own_kind`."""
+    """Add -o FILE, and --force if `kinds` of results are given (see `require_own_kind`)."""
     group.add_argument(
         "-o",
         "--output-file",

@@ -1,4 +1,4 @@
-"""Parser of the command line: commands, groups of options, and readers of values."""
+"""Command line parser: commands, groups of options, and functions that read values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Commands: TypeAlias = "argparse._SubParsersAction[Command]"
 
-# Titles of groups of options in the help. Those of ROBOT repeat settings of a robot.toml.
+# Titles of groups of options in the help. The options of ROBOT override settings of robot.toml.
 POINT, ROBOT, OUTPUT = "operating point", "robot (these options override robot.toml)", "output"
 TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 
@@ -59,13 +59,13 @@ def input_file(text: str) -> Path:
 
 
 def input_name(text: str) -> str:
-    """Read the path of an input file, or a bundled name."""
+    """Read a bundled name or the path of an input file."""
     return text
 
 
 @dataclass(frozen=True)
 class OutputFile:
-    """Reader of the path of an output file, with the endings that it may have."""
+    """Reader for the path of an output file, with the allowed endings."""
 
     endings: tuple[str, ...]
 
@@ -93,7 +93,7 @@ def assignment(text: str) -> tuple[str, float]:
 
 
 def joint_or_all(text: str) -> tuple[str | None, float | str]:
-    """Read NAME=VALUE, or VALUE or urdf for all joints (name None)."""
+    """Read NAME=VALUE, or a single VALUE (or urdf) for all joints; its name is None."""
     if "=" in text:
         return assignment(text)
     return None, text if text == "urdf" else number(text)
@@ -106,12 +106,12 @@ def orbit(text: str) -> dict[str, float | str]:
 
 
 def lock(text: str) -> tuple[str, float | None]:
-    """Read NAME=VALUE, or NAME for the neutral position (value None)."""
+    """Read NAME=VALUE, or a single NAME for the neutral position; its value is None."""
     return assignment(text) if "=" in text else (text, None)
 
 
 _REPEATABLE = " (repeatable)"
-# Types of Python that `Group.add` takes in place of a reader.
+# Readers for the Python types that `Group.add` accepts.
 _READERS: dict[object, Callable[[str], object]] = {float: number, int: count_of, Path: input_file}
 _METAVARS: dict[object, str] = {
     input_file: "FILE",
@@ -140,8 +140,9 @@ class Group(argparse._ArgumentGroup):
     ) -> None:
         """Add an option with a value.
 
-        The type float reads a finite number, int a positive integer, and Path the name of an input
-        file. A tuple `metavar` takes as many values. The help states the default of a number.
+        For the type float, the value must be finite. For int, it must be a positive integer. For
+        Path, it is the name of an input file. If `metavar` is a tuple, the option takes one value
+        for each entry. The help contains the default of a number.
         """
         reader = _READERS.get(type, type)
         if repeatable:
@@ -163,12 +164,12 @@ class Group(argparse._ArgumentGroup):
         self.add_argument(name, help=help, action="store_true")
 
     def yes_or_no(self, name: str, help: str) -> None:
-        """Add the options --NAME and --no-NAME; the value is None without them."""
+        """Add the options --NAME and --no-NAME; the value is None if neither is given."""
         self.add_argument(name, help=help, action=argparse.BooleanOptionalAction)
 
 
 class Command(argparse.ArgumentParser):
-    """Parser of a command; its errors are one line."""
+    """Parser of a command that reports errors in one line."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -176,7 +177,7 @@ class Command(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 
     def group(self, title: str, description: str | None = None) -> Group:
-        """Return the group of options with this title; the first call creates it."""
+        """Return the group of options with this title, which the first call creates."""
         for group in self._action_groups:
             if isinstance(group, Group) and group.title == title:
                 return group
@@ -185,13 +186,13 @@ class Command(argparse.ArgumentParser):
         return group
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        # argparse ignores errors when it writes a help.
+        # argparse would ignore errors while it writes a help.
         if file is not None:
             file.write(message)
             file.flush()
 
     def error(self, message: str) -> NoReturn:
-        """Report wrong arguments in one line, with the meaning of missing ones, and exit."""
+        """Report invalid arguments in one line, explain missing arguments, and exit."""
         if "required: DISPERSIONS" in message:
             message += "; DISPERSIONS is a TOML file with lines such as [dispersions] and "
             message += '"base.mass" = 0.05'
@@ -200,7 +201,7 @@ class Command(argparse.ArgumentParser):
 
 
 def print_error(line: str) -> None:
-    """Write a line to stderr; if stderr is closed, the exit code is the only report."""
+    """Write a line to stderr. If stderr is closed, only the exit code reports the error."""
     try:
         print(one_line(line), file=sys.stderr, flush=True)
     except OSError:
@@ -218,8 +219,8 @@ def command(
 ) -> Command:
     """Add a command and its option --json.
 
-    Its help ends with `example`. ``--help`` lists the `common` options and --json, by default all
-    options.
+    The help of the command ends with `example`. ``--help`` lists --json and the `common` options,
+    or all options if `common` is empty.
     """
     command = commands.add_parser(
         name,
@@ -247,10 +248,10 @@ class _Help(argparse.Action):
 
 
 def short_help(command: argparse.ArgumentParser) -> str:
-    """Return the help of a command with the first sentence about each common option."""
+    """Return a short help: the first sentence about each common option of a command."""
     arguments = [each for each in command._actions if not each.option_strings]
     every = [each for each in command._actions if each.option_strings]
-    options = {each.dest: each for each in reversed(every)}  # a former name comes second
+    options = {each.dest: each for each in reversed(every)}  # a new name overrides its former name
     del options["help"]
     common = [name.replace("-", "_") for name in command.get_default("common")] or list(options)
     formatter = argparse.HelpFormatter(command.prog, max_help_position=30)
@@ -276,7 +277,7 @@ def short_help(command: argparse.ArgumentParser) -> str:
 
 
 def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[Path]]:
-    """Return the input files and the output files that the arguments name."""
+    """Return all input files and output files in the arguments."""
     inputs: list[Path] = []
     for action in arguments.command._actions:
         value = getattr(arguments, action.dest, None)
@@ -286,7 +287,7 @@ def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[Path]]:
 
 
 def outputs_of(arguments: argparse.Namespace) -> list[tuple[Path, OutputFile]]:
-    """Return the output files that the arguments name, with their readers."""
+    """Return all output files in the arguments, each with its reader."""
     actions = arguments.command._actions
     given = ((getattr(arguments, action.dest, None), action.type) for action in actions)
     return [(path, kind) for path, kind in given if isinstance(kind, OutputFile) and path]

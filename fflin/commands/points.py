@@ -1,4 +1,4 @@
-"""The robot and the operating point of a command's arguments."""
+"""Robot and operating point that the arguments of a command define."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def load_robot(arguments: argparse.Namespace) -> Robot:
-    """Load the robot with the passive joints, inputs, outputs, gravity and orbit as given."""
+    """Load the robot with the joints, inputs, outputs, gravity and orbit of the arguments."""
     from fflin.robot.loading import load, with_fields
 
     lock, passive = once("--lock", arguments.lock), getattr(arguments, "passive", [])
@@ -66,19 +66,19 @@ def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
 
 
 def limits_of_options(arguments: argparse.Namespace) -> Any:
-    """Return the limits of --limits and --limit."""
+    """Return the limits that --limits and --limit define."""
     given = once("--limit", arguments.limit)
     return ["urdf", given] if arguments.limits == "urdf" else given or None
 
 
 def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
-    """Refuse options that have no effect with others."""
+    """Raise an error if options are given that have no effect in combination with others."""
     if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
         raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 
 def once(option: str, pairs: list[tuple[str, object]]) -> dict[str, Any]:
-    """Return the pairs of a repeatable option; refuse a name that is given twice."""
+    """Return {name: value} of a repeatable option; raise an error if a name is given twice."""
     values = dict(pairs)
     if len(values) < len(pairs):
         names = [name for name, _ in pairs]
@@ -90,9 +90,9 @@ def once(option: str, pairs: list[tuple[str, object]]) -> dict[str, Any]:
 def configuration_of(
     robot: Robot, arguments: argparse.Namespace, state: Mapping[str, Any], prefix: str = ""
 ) -> Array:
-    """Return q (nq,) of --joint, --rpy and --position, which override a state of the robot.
+    """Return q (nq,) of a robot's state, overridden by --joint, --rpy and --position.
 
-    The names of the options may have a prefix, such as ``target_``.
+    The option names may have a prefix, such as ``target_``.
     """
     from fflin.dynamics.points import base_of
 
@@ -110,7 +110,7 @@ def placed(
     base: pin.SE3 | None = None,
     of_state: Mapping[str, float] | None = None,
 ) -> Array:
-    """Return q (nq,) with the joints of a state and of an option; warn outside limits."""
+    """Return q (nq,) of a state's joints, overridden by an option; warn about exceeded limits."""
     from fflin.base.names import joints_by_name
     from fflin.dynamics.points import configuration
 
@@ -139,7 +139,7 @@ def placed(
 def linear_model(
     arguments: argparse.Namespace, robot: Robot | None = None
 ) -> tuple[Robot, LinearModel]:
-    """Return the robot, by default as given, and its linear model about the given point."""
+    """Return the robot and its linear model about the operating point of the arguments."""
     from fflin.linear.linearization import linearize
 
     robot, q, v, reference = point_of(arguments, robot)
@@ -150,7 +150,7 @@ def linear_model(
 def point_of(
     arguments: argparse.Namespace, robot: Robot | None = None
 ) -> tuple[Robot, Array, Array | None, pin.SE3 | None]:
-    """Return the robot, q (nq,), v (nv,) and the reference of the given point."""
+    """Return the robot, and q (nq,), v (nv,) and the reference of the operating point."""
     import pinocchio as pin
 
     robot = robot or load_robot(arguments)
@@ -161,7 +161,7 @@ def point_of(
 
 
 def refuse_pose(arguments: argparse.Namespace, prefix: str = "") -> None:
-    """Refuse --rpy and --position, with a prefix, together with --relative-equilibrium."""
+    """Raise an error if --relative-equilibrium is combined with --rpy or --position."""
     names = [f"{prefix}{name}" for name in ("rpy", "position")]
     if arguments.relative_equilibrium and any(getattr(arguments, name) for name in names):
         rpy, position = (f"--{name.replace('_', '-')}" for name in names)
@@ -174,7 +174,7 @@ def refuse_pose(arguments: argparse.Namespace, prefix: str = "") -> None:
 def velocity_of(
     robot: Robot, arguments: argparse.Namespace, state: Mapping[str, Any], *options: str
 ) -> Array | None:
-    """Return the velocity (nv,) of a state of the robot, overridden by these options in turn."""
+    """Return the velocity (nv,) of a robot's state, overridden by the given options in turn."""
     from fflin.base.names import rates_by_name
     from fflin.dynamics.points import velocity
 
@@ -193,7 +193,7 @@ def held_at(
     arguments: argparse.Namespace,
     reference: pin.SE3 | None = None,
 ) -> tuple[Array, Array | None, pin.SE3 | None]:
-    """Return q, u (nu,) and the reference with --effort or in an equilibrium."""
+    """Return q, u (nu,) and the reference, with the inputs of --effort or of an equilibrium."""
     number = arguments.relative_equilibrium
     if not arguments.equilibrium and not number:
         from fflin.dynamics.points import effort
@@ -214,7 +214,7 @@ def held_at(
 
 
 def attitude(robot: Robot, q: Array, number: int, frame: Any) -> tuple[Array, pin.SE3]:
-    """Return q (nq,) and the base placement of a relative equilibrium, numbered from 1."""
+    """Return q (nq,) and base placement of the relative equilibrium with a number from 1 to 24."""
     import pinocchio as pin
 
     from fflin.analysis.relative_equilibria import relative_equilibria

@@ -1,4 +1,4 @@
-"""The commands `validity` and `funnel`: regions in which a model or a regulator is valid."""
+"""Commands `validity` and `funnel`: regions in which a model or a regulator is valid."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from fflin.commands.results import Report, figure_of
 _ERRORS = "attitude [deg], position [m], joints, omega_b, v_b or joint rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
 
-# Options of other commands, which `along` refuses.
+# `along` refuses these options of other commands, so they need a value here.
 _NONE = "free mpc gain controller target_joint target_rpy target_position target_velocity effort"
 _NONE += " equilibrium"
 _NONE += " joint rpy position velocity"
 
 
 def add_commands(commands: parser.Commands) -> None:
-    """Add validity and funnel."""
+    """Add the commands validity and funnel."""
     _add_validity(commands)
     _add_funnel(commands)
 

@@ -1,4 +1,4 @@
-"""The commands `lqr`, `tvlqr` and `export`, and the design options that other commands share."""
+"""Commands `lqr`, `tvlqr` and `export`, and design options that other commands share."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: parser.Commands) -> None:
-    """Add lqr, tvlqr and export."""
+    """Add the commands lqr, tvlqr and export."""
     _add_lqr(commands)
     _add_tvlqr(commands)
     _add_export(commands)
@@ -111,9 +111,9 @@ def _add_export(commands: parser.Commands) -> None:
 
 
 def add_weights(command: parser.Command, *, integrated: bool = False) -> None:
-    """Add the options of the cost, the sample time and the regulated states.
+    """Add the options for the cost, the sample time and the regulated states.
 
-    If a loop is `integrated`, --dt is its integration step; otherwise it is the former --sample.
+    With `integrated`, --dt is the integration step. Otherwise, --dt is the former name of --sample.
     """
     group = command.group(parser.CONTROLLER)
     group.add(
@@ -182,10 +182,10 @@ def add_allocation(group: parser.Group) -> None:
 def robot_of_design(
     robot: Robot, allocate: bool | None, law: Gain | GainSchedule | Compensator | None = None
 ) -> Robot:
-    """Return the robot of a design: with allocation, base torque and force replace the thrusters.
+    """Return the robot of a design; with allocation, base torque and force replace the thrusters.
 
-    By default, thrusters that push in every direction are allocated, unless a law from a file was
-    designed for other inputs.
+    By default, thrusters are allocated if they can push in every direction, unless the law in a
+    file was designed for other inputs.
     """
     from fflin.control.authority import thrusters_give_every_wrench
     from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
@@ -198,7 +198,8 @@ def robot_of_design(
     others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
     if len(others) == len(robot.inputs):
         raise InputError(
-            f"--allocate: '{robot.name}' has no thrusters; give --inputs with thrusters"
+            f"--allocate needs thrusters, but '{robot.name}' has none; define them in the file of "
+            "--inputs"
         )
     missing = [
         kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)
@@ -207,7 +208,7 @@ def robot_of_design(
 
 
 def designed(arguments: argparse.Namespace) -> tuple[Robot, Robot, LinearModel, Gain]:
-    """Return the robot, the robot of the design, the model to be regulated, and the regulator."""
+    """Return the robot, the robot of the design, the regulated model, and the regulator."""
     robot = load_robot(arguments)
     design = robot_of_design(robot, arguments.allocate)
     lin = regulated_part(linear_model(arguments, design)[1], arguments)
@@ -215,14 +216,14 @@ def designed(arguments: argparse.Namespace) -> tuple[Robot, Robot, LinearModel, 
 
 
 def weights_of(arguments: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """Return the weights of --q, --r and --bryson; nothing if none of them is given."""
+    """Return the weights of --q, --r and --bryson, or {} if none of these options is given."""
     names = ("q", "r", "bryson")
     given = {name: once(f"--{name}", getattr(arguments, name)) for name in names}
     return given if any(given.values()) else {}
 
 
 def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearModel:
-    """Return the model of the design; with --reduce, its controllable part."""
+    """Return the model for the design: the controllable part of `lin` if --reduce is given."""
     if not arguments.reduce:
         return lin
     from fflin.analysis.reduction import momentum_reduction
@@ -231,7 +232,7 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
 
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace, *, allocated: bool = False) -> Gain:
-    """Return the regulator of the weights; warn if its margins are small."""
+    """Return the regulator for the weights in the arguments; warn if its margins are small."""
     from fflin.control.gain import fragility, one_sided
     from fflin.control.lqr import lqr, require_fixed_point
     from fflin.control.weights import rule_weights
@@ -239,7 +240,8 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace, *, allocated: bool 
     try:
         require_fixed_point(lin)
     except EquilibriumError as error:
-        # --equilibrium balances forces, but a moving base is not a fixed point.
+        # --equilibrium balances the forces, but a moving base is still not a fixed point. The hint
+        # is therefore omitted at nonzero velocity.
         given = arguments.equilibrium or arguments.relative_equilibrium or lin.v.any()
         more = ", --relative-equilibrium" if lin.frame in ("lvlh", "hill") else ""
         raise EquilibriumError(str(error) if given else f"{error} (--equilibrium{more})") from None
@@ -273,7 +275,7 @@ def _lqr(arguments: argparse.Namespace) -> Report:
     from fflin.base.record import record_of
 
     robot, design, _, gain = designed(arguments)
-    # The warnings are on the standard error output.
+    # The warnings of the gain already appear on stderr.
     text = "\n\n".join(x for x in str(gain).split("\n\n") if not x.startswith("warning: "))
     if design is not robot:
         text += f"\n\n{folded([_ALLOCATED])}"
@@ -312,7 +314,7 @@ def _export(arguments: argparse.Namespace) -> Report:
 
 
 def add_trajectory(command: parser.Command, *, required: bool = False) -> None:
-    """Add --trajectory, --hold and --strict; the file then sets the default of --frame."""
+    """Add --trajectory, --hold and --strict. A trajectory file sets the default of --frame."""
     group = command.group(parser.TRAJECTORY)
     group.add(
         "--trajectory",
@@ -335,7 +337,7 @@ def add_trajectory(command: parser.Command, *, required: bool = False) -> None:
 
 
 def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> LinearTrajectory:
-    """Return the linear models along the given trajectory."""
+    """Return the linear models along the trajectory in the arguments."""
     from fflin.linear.linear_trajectory import linearize_trajectory
     from fflin.linear.trajectory import Trajectory
 
@@ -353,7 +355,7 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
 
 
 def linearize_along(arguments: argparse.Namespace) -> Report:
-    """Show or save the models along a trajectory."""
+    """Show or save the linear models along a trajectory."""
     along = models_along(arguments)
     if arguments.dt is not None:
         along = along.discretize(arguments.dt)
@@ -361,7 +363,7 @@ def linearize_along(arguments: argparse.Namespace) -> Report:
 
 
 def check_along(arguments: argparse.Namespace) -> Report:
-    """Check the models along a trajectory."""
+    """Check the linear models along a trajectory."""
     from fflin.linear.check import held_to
 
     along = models_along(arguments)
@@ -370,7 +372,7 @@ def check_along(arguments: argparse.Namespace) -> Report:
 
 
 def checked(robot: Robot, found: Check, text: str, files: Any = MappingProxyType({})) -> Report:
-    """Return the report of a check."""
+    """Return the report of a check, with the exit code."""
     result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
     return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)
 
@@ -390,7 +392,7 @@ def _tvlqr(arguments: argparse.Namespace) -> Report:
 def schedule_of(
     along: LinearTrajectory, arguments: argparse.Namespace, Qf: Any = "steady"
 ) -> GainSchedule:
-    """Return the regulator of the weights along a trajectory."""
+    """Return the regulator along a trajectory for the weights in the arguments."""
     from fflin.control.default_weights import pace_along
     from fflin.control.tvlqr import steady_end, tvlqr
     from fflin.control.weights import rule_weights

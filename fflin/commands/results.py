@@ -1,4 +1,4 @@
-"""Result of a command: the files that it writes, and its report as text or as JSON."""
+"""Results of commands: files to write, and a report as text or JSON."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from fflin.base.tables import first_paragraph, headed
 from fflin.base.writing import followed_path
 from fflin.commands import DONE
 
-# Files whose size is reported.
+# The report includes the size of these files.
 _PAGES = (".html", ".gif")
 
 
-# The entries by which a result is known whose file does not name its kind.
+# Entries that identify a result if its file does not contain its kind.
 _ENTRIES = {
     "Sensitivity": {"urdf_sha256", "dA", "dB"},
     "LinearModel": {"urdf_sha256", "certificate"},
@@ -58,11 +58,11 @@ class Report:
 
 
 def finish(report: Report, arguments: argparse.Namespace) -> int:
-    """Write the files of a report, print it, and return the exit code."""
+    """Write the files of a report, print the report, and return the exit code."""
     command, said = arguments.command.prog.split()[-1], [report.interrupted]
     written: list[Path] = []
-    # The report is printed after the files are written, so that a closed pipe does not prevent
-    # them, and also if one of them cannot be written.
+    # Files are written first, so that a closed pipe cannot prevent writing them. The report is
+    # also printed if writing a file fails.
     try:
         for path, write in report.files.items():
             if path is None:
@@ -84,7 +84,7 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
 
 
 def figure_of(name: str, drawn: object) -> Callable[[Path], object]:
-    """Return a function that draws with the public function of this name and saves the figure."""
+    """Return a function that plots `drawn` with the public function `name` and saves the figure."""
 
     def save(path: Path) -> None:
         import fflin
@@ -100,7 +100,7 @@ def _wrote(path: Path) -> str:
 
 
 def _record(command: str, report: Report, files: list[Path]) -> dict[str, Any]:
-    """Return what --json prints: the entries of every command, then the fields of the result."""
+    """Return the JSON object of --json: entries of every command, then the fields of the result."""
     head = {
         "fflin": __version__,
         "command": command,
@@ -112,7 +112,7 @@ def _record(command: str, report: Report, files: list[Path]) -> dict[str, Any]:
 
 
 def plain(value: object) -> Any:
-    """Return a value of JSON: arrays as lists, results as objects, and null if not finite."""
+    """Convert a value for JSON: arrays to lists, results to objects, infinity and NaN to null."""
     import numpy as np
 
     if isinstance(value, np.ndarray | np.generic):
@@ -128,7 +128,7 @@ def plain(value: object) -> Any:
 
 
 def _fields(value: object) -> Any:
-    """Return the fields of a result, as its file has them if it can be saved."""
+    """Return the fields of a result; a result that can be saved has the fields of its file."""
     from fflin.base.record import Design, record_of
     from fflin.linear.files import record_of as record_of_model
     from fflin.linear.model import LinearModel
@@ -139,13 +139,13 @@ def _fields(value: object) -> Any:
         return record_of(value)
     if is_dataclass(value):
         own = {each.name: getattr(value, each.name) for each in fields(value)}
-        # The model of a result is a result of its own.
+        # The model of a result is omitted, because it is a result itself.
         return {key: x for key, x in own.items() if not isinstance(x, LinearModel)}
     return value._asdict() if hasattr(value, "_asdict") else value
 
 
 def require_own_kind(arguments: argparse.Namespace) -> None:
-    """Raise `FileError` if -o names a file of a kind that the command does not write."""
+    """Raise `FileError` if -o would replace a file of another kind."""
     path, kinds = getattr(arguments, "output_file", None), getattr(arguments, "kinds", ())
     if path is None or not kinds or arguments.force:
         return
@@ -166,16 +166,16 @@ def require_own_kind(arguments: argparse.Namespace) -> None:
 
 
 def kind_of(path: Path) -> str:
-    """Return the name of the class of a file's result; "" if it is not known."""
+    """Return the class name of the result in a file, or "" if the class is unknown."""
     try:
         names, kind = _entries(path)
-    except Exception:  # each decoder has its own
+    except Exception:  # each decoder raises its own types
         return ""
     return kind or next((name for name, of in _ENTRIES.items() if of <= names), "")
 
 
 def _entries(path: Path) -> tuple[set[str], str]:
-    """Return the names of a file's entries, and its kind where it has one."""
+    """Return the names of a file's entries, and the kind of its result or ""."""
     from fflin.base.record import decoded, text
 
     entries: Any
@@ -193,5 +193,5 @@ def _entries(path: Path) -> tuple[set[str], str]:
 
         with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
             return {*entries.files}, text(entries["kind"]) if "kind" in entries.files else ""
-    entries, _ = decoded(path.suffix, path.read_bytes())  # `read_file` would make it an input
+    entries, _ = decoded(path.suffix, path.read_bytes())  # `read_file` would register an input
     return {*entries}, text(entries["kind"]) if "kind" in entries else ""

@@ -1,4 +1,4 @@
-"""The commands `plan`, `simulate` and `montecarlo`: a trajectory, a motion, and many motions."""
+"""Commands `plan`, `simulate` and `montecarlo`: plan a trajectory, simulate one or many motions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
 
 
 def add_commands(commands: parser.Commands) -> None:
-    """Add plan, simulate and montecarlo."""
+    """Add the commands plan, simulate and montecarlo."""
     _add_plan(commands)
     _add_simulate(commands)
     _add_montecarlo(commands)
@@ -58,7 +58,8 @@ def _add_plan(commands: parser.Commands) -> None:
     options.add_output_file(
         plan.group(parser.OUTPUT), "the trajectory", parser.TABLE, "Trajectory", "Motion"
     )
-    # Options of other commands, which the start and the target read.
+    # The functions for start and target read these options of other commands, so they need a value
+    # here.
     plan.set_defaults(relative_equilibrium=None)
 
 
@@ -128,11 +129,12 @@ def _simulate(arguments: argparse.Namespace) -> Report:
 
 
 def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
-    """Return the motion of the arguments."""
+    """Return the motion that the arguments define."""
     from fflin.simulation.simulate import simulate
 
     loop = loop_of(robot, arguments)
-    # The continuous model predicts every row, a sampled model only its samples.
+    # A continuous model predicts all rows of the motion, a sampled model only the rows at its
+    # samples.
     shown = {"every": arguments.every, "engine": arguments.engine}
     return simulate(robot, loop.policy, **shown, **loop.options, **loop.prediction)
 

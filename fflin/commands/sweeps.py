@@ -1,4 +1,4 @@
-"""The command `sweep`: linear models about many points."""
+"""Command `sweep`: linear models about many points."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def add_commands(commands: parser.Commands) -> None:
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
-    """Split JOINT=A:B:... into the name and the values of the form."""
+    """Split JOINT=A:B:... into the name and its values, as many as `form` has."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
     if not name or len(parts) != len(form.split(":")):
@@ -142,7 +142,7 @@ def _sweep(arguments: argparse.Namespace) -> Report:
 def _points(
     robot: Robot, arguments: argparse.Namespace
 ) -> tuple[Configurations, Array | None, Array | None]:
-    """Return q, v and u of the points."""
+    """Return q, v and u of the points of a sweep."""
     import numpy as np
 
     from fflin.batch.configurations import grid, random_configurations
@@ -179,7 +179,7 @@ def _base(robot: Robot, q: Array) -> pin.SE3:
 
 @contextmanager
 def going_on(path: Path | None, what: str) -> Iterator[Progress]:
-    """Yield the progress bar; after Ctrl-C report the progress and the saved part."""
+    """Show a progress bar; after Ctrl-C, report the progress and the file that can be resumed."""
     from fflin.base.process import Progress
     from fflin.batch.files import part_of
 

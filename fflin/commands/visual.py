@@ -1,4 +1,4 @@
-"""The command `view`, and the options of commands that display a motion."""
+"""Command `view`, and the options of commands that display a motion."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def add_commands(commands: parser.Commands) -> None:
 
 
 def add_pictures(command: parser.Command, page: str = "that plays the motion offline") -> None:
-    """Add the options of pages, pictures and animations of a motion."""
+    """Add the options for pages, pictures and animations of a motion."""
     group = command.group(parser.OUTPUT)
     group.add("--html", f"write a page {page}", parser.PAGE)
     group.add(
@@ -74,7 +74,7 @@ def _add_scene(group: parser.Group) -> None:
 
 
 def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
-    """Refuse the options that `pictures` refuses, before the simulation."""
+    """Raise an error before the simulation if `pictures` would refuse the options."""
     from fflin.view.visualize import check_outputs, check_rates, check_times, check_tool
 
     if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
@@ -93,7 +93,7 @@ def pictures(
     motion: Callable[[], Motion],
     arguments: argparse.Namespace,
 ) -> dict[Path | None, Callable[[Path], object]]:
-    """Return the files of the options of `add_pictures`, with the functions that write them."""
+    """Return {path: function that writes the file} for the options of `add_pictures`."""
     how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *_SHOWN)}
 
     def show(path: Path) -> None:

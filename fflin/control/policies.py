@@ -329,7 +329,7 @@ class Loop(Compensation):
             self._clock.tick(t)
         elif len(self.estimate) and len(self.rates) != self.stages + 1:
             raise InputError(
-                "the states of a continuous controller are integrated by fflin.simulate; pass "
+                "only fflin.simulate can integrate the states of a continuous controller; pass "
                 "the LinearController itself to fflin.simulate as the policy, or sample the "
                 "controller"
             )

@@ -36,8 +36,24 @@ class Aba:
         if tau is not None:
             forces += self.state.forces(tau)
         absolute = self.field.absolute(q, v) if self.field else v
-        rate = self._accelerate(self._model, q, absolute, forces, self._pulls(q, absolute, u))
+        rate = self._accelerate(
+            self._model, q, absolute, forces, self._external_wrenches(q, absolute, u)
+        )
         return self.field.relative(v, absolute, rate) if self.field else rate
+
+    def accelerations(self, q: Array, v: Array, u: Array) -> Array:
+        """Return dv/dt (N, nv) of N points, see `acceleration`."""
+        state = self.state
+        if self.field or state.robot.followers or state.robot.stored_momentum:
+            return np.array([self.acceleration(*point) for point in zip(q, v, u, strict=True)])
+        forces = u @ self.actuation.fixed.T
+        if self._resists:
+            forces += self._passive_force(q, v)
+        tau, found = state.lift(forces.T).T, np.empty_like(v)
+        for k, point in enumerate(zip(q, v, tau, strict=True)):
+            wrenches = self.actuation.wrenches(u[k]) or self._none
+            found[k] = pin.aba(self._model, self._data, *point, wrenches)
+        return found
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
         """Return the sum of the magnitudes of the terms of the accelerations (6 + n,)."""
@@ -58,10 +74,10 @@ class Aba:
         here = q, v
         if field:
             q, v = field.near(q, v)
-        external = self._pulls(q, v, u)
+        external = self._external_wrenches(q, v, u)
         if state.robot.followers:
             assert state.S is not None
-            by_q, by_v, by_force = self._constrained_slopes(q, v, external, tau, state.S)
+            by_q, by_v, by_force = self._constrained_derivatives(q, v, external, tau, state.S)
         else:
             slopes = pin.computeABADerivatives(self._model, self._data, q, v, tau, external)
             by_q, by_v, by_force = (state.velocities(slope.T).T for slope in slopes)
@@ -69,7 +85,7 @@ class Aba:
             by_force = state.velocities(by_force)
         self.inverse = by_force
         for joint, momentum in state.robot.stored_momentum:
-            jacobian, turning = self._turning(joint, q, v)
+            jacobian, turning = self._angular_velocity_derivatives(joint, q, v)
             torque = by_force @ state.forces(jacobian.T) @ skew(momentum)
             by_q += torque @ state.columns(turning)
             by_v += torque @ state.columns(jacobian)
@@ -87,7 +103,7 @@ class Aba:
             by_u.append(state.velocities(rate))
         return by_q, by_v, np.column_stack(by_u)
 
-    def _pulls(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
+    def _external_wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
         """Return the wrenches on the links, including the gravity gradient of an orbit."""
         wrenches = self._wrenches(q, v, u)
         if self.field:
@@ -110,7 +126,7 @@ class Aba:
             total[joint] = wrenches[joint] + pin.Force(np.zeros(3), torque)
         return total
 
-    def _turning(self, joint: int, q: Array, v: Array) -> tuple[Array, Array]:
+    def _angular_velocity_derivatives(self, joint: int, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the derivatives (3, nv) over v and q of a link's angular velocity in its axes."""
         # Let a joint between base and link have the axis s (in link axes) and a parent with the
         # angular velocity omega_p. The derivative over the joint angle is omega_p x s. The
@@ -130,9 +146,9 @@ class Aba:
 
     def _passive_force(self, q: Array, v: Array) -> Array:
         stiffness, damping, rest = self.state.robot.springs
-        force = np.zeros(6 + self.state.robot.n)
-        force[6:] -= stiffness * (self.state.joint_positions(q) - rest)
-        force[6:] -= damping * self.state.velocities(v)[6:]
+        force = np.zeros((*q.shape[:-1], 6 + self.state.robot.n))
+        force[..., 6:] -= stiffness * (self.state.joint_positions(q) - rest)
+        force[..., 6:] -= damping * self.state.velocities(v)[..., 6:]
         return force
 
     def _accelerate(
@@ -146,7 +162,7 @@ class Aba:
         bias = pin.rnea(model, self._data, q, v, np.zeros(model.nv), external)
         return state.spread(np.linalg.solve(M, forces - state.forces(bias)))
 
-    def _constrained_slopes(
+    def _constrained_derivatives(
         self, q: Array, v: Array, external: pin.StdVec_Force, tau: Array, S: Array
     ) -> tuple[Array, Array, Array]:
         """Return the derivatives for robots with mimic joints: S^T M a = S^T (tau - b)."""

@@ -16,7 +16,7 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Actuation:
-    """Inputs of a robot, prepared for evaluation."""
+    """Inputs of a robot, with their names, units, columns and wrenches."""
 
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
@@ -93,7 +93,7 @@ class Actuation:
         return columns
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
-        """Return u (.., nu) with reference-frame wrenches in base axes."""
+        """Rotate the reference-frame wrenches in u (.., nu) to base axes."""
         if not self.held:
             return u
         return chart.to_base(self.held, u[..., None])[..., 0]

@@ -75,13 +75,13 @@ class World(NamedTuple):
 # f(point, sensed, *frames) writes outputs and derivatives into `sensed`. Functions with frames
 # require that pin.computeForwardKinematicsDerivatives was called; functions without frames call
 # the Pinocchio functions that they need.
-Slopes: TypeAlias = Callable[..., None]
+Derivatives: TypeAlias = Callable[..., None]
 
 # f(world, attitudes of the frames at the point of linearisation, *frames) returns the output.
 Value: TypeAlias = Callable[..., Array]
 
 
-def _center_of_mass_slopes(at: Point, to: Sensed) -> None:
+def _center_of_mass_derivatives(at: Point, to: Sensed) -> None:
     jacobian = pin.jacobianCenterOfMass(at.model, at.data, at.q, False)
     to.y[:] = at.r_b + at.R.dot(at.data.com[0])
     to.by_q[:] = at.R.dot(jacobian)
@@ -98,7 +98,7 @@ def _center(world: World) -> Array:
     return np.asarray(sum(moments) / sum(inertia.mass for inertia, _ in bodies))
 
 
-def _momentum_slopes(at: Point, to: Sensed) -> None:
+def _momentum_derivatives(at: Point, to: Sensed) -> None:
     # The function also differentiates the rate of momentum, which is not used here. So any value
     # may stand for the acceleration.
     by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
@@ -126,7 +126,7 @@ def _momentum(world: World, _: object) -> Array:
     return np.concatenate((turned @ angular, turned @ linear))
 
 
-def _frame_pose_slopes(at: Point, to: Sensed, frame: Carried) -> None:
+def _frame_pose_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     placement = at.placement(frame)
     _, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     to.y[:3] = at.r_b + at.R.dot(placement.translation)
@@ -140,8 +140,8 @@ def _frame_pose(world: World, before: Sequence[Array], frame: Carried) -> Array:
     return np.concatenate((world.reference.actInv(placement.translation), rotation))
 
 
-def _frame_velocity_slopes(at: Point, to: Sensed, frame: Carried) -> None:
-    _angular_slopes(at, to.part(slice(0, 3)), frame)
+def _frame_velocity_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
+    _angular_derivatives(at, to.part(slice(0, 3)), frame)
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
     R = at.R.dot(at.placement(frame).rotation)
@@ -159,7 +159,7 @@ def _frame_velocity(world: World, _: object, frame: Carried) -> Array:
     return np.concatenate((velocity.angular, R @ velocity.linear))
 
 
-def _relative_pose_slopes(at: Point, to: Sensed, *frames: Carried) -> None:
+def _relative_pose_derivatives(at: Point, to: Sensed, *frames: Carried) -> None:
     placement, other = map(at.placement, frames)
     jacobian, of_other = (
         pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)[1] for frame in frames
@@ -181,15 +181,15 @@ def _relative_pose(world: World, before: Sequence[Array], *frames: Carried) -> A
     return np.concatenate((position, rotation))
 
 
-def _angular_slopes(at: Point, to: Sensed, frame: Carried) -> None:
+def _angular_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     to.y[:] = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL).angular
     to.by_q[:] = by_q[PIN_ANGULAR]
     to.by_v[:] = jacobian[PIN_ANGULAR]
 
 
-def _gyroscope_slopes(at: Point, to: Sensed, frame: Carried) -> None:
-    _angular_slopes(at, to, frame)
+def _gyroscope_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
+    _angular_derivatives(at, to, frame)
     spin = at.placement(frame).rotation.T.dot(at.spin)
     to.y[:] += spin
     to.by_q[:] += skew(spin).dot(to.by_v)  # the frame's angular Jacobian
@@ -200,7 +200,7 @@ def _gyroscope(world: World, _: object, frame: Carried) -> Array:
     return np.asarray(world.velocity(frame).angular + spin)
 
 
-def _accelerometer_slopes(at: Point, to: Sensed, frame: Carried) -> None:
+def _accelerometer_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     # `Sensing.evaluate` sets the base's acceleration to dv_b/dt + omega_b x v_b - g in base axes.
     _, by_q, by_v, by_a = pin.getPointClassicAccelerationDerivatives(
         at.model, at.data, *frame, _LOCAL
@@ -222,14 +222,14 @@ def _accelerometer(world: World, _: object, frame: Carried) -> Array:
 
 
 # Outputs of all other types consist of states.
-KINDS: dict[type[kinds.Output], tuple[Slopes, Value]] = {
-    kinds.CenterOfMass: (_center_of_mass_slopes, _center_of_mass),
-    kinds.Momentum: (_momentum_slopes, _momentum),
-    kinds.FramePose: (_frame_pose_slopes, _frame_pose),
-    kinds.FrameVelocity: (_frame_velocity_slopes, _frame_velocity),
-    kinds.RelativePose: (_relative_pose_slopes, _relative_pose),
-    kinds.Gyroscope: (_gyroscope_slopes, _gyroscope),
-    kinds.Accelerometer: (_accelerometer_slopes, _accelerometer),
+KINDS: dict[type[kinds.Output], tuple[Derivatives, Value]] = {
+    kinds.CenterOfMass: (_center_of_mass_derivatives, _center_of_mass),
+    kinds.Momentum: (_momentum_derivatives, _momentum),
+    kinds.FramePose: (_frame_pose_derivatives, _frame_pose),
+    kinds.FrameVelocity: (_frame_velocity_derivatives, _frame_velocity),
+    kinds.RelativePose: (_relative_pose_derivatives, _relative_pose),
+    kinds.Gyroscope: (_gyroscope_derivatives, _gyroscope),
+    kinds.Accelerometer: (_accelerometer_derivatives, _accelerometer),
 }
 
 
@@ -258,7 +258,7 @@ class Sensing:
 
         # (output, state) for each output that is a state.
         self.states: list[tuple[int, int]] = []
-        self._kinds: list[tuple[slice, Slopes, list[Carried]]] = []
+        self._kinds: list[tuple[slice, Derivatives, list[Carried]]] = []
         signals: list[tuple[str, str]] = []
         for output in outputs:
             at = len(signals)

@@ -149,7 +149,7 @@ class CLaw:
 
     def _state_policy(self, robot: Robot) -> Policy:
         world, n, real = StateMap(robot, frame=self.frame), robot.n, self._real
-        # In C an array has one entry at least.
+        # C has no empty arrays, so an array for joints has at least one entry.
         given, u = (real * (13 + 2 * max(n, 1)))(), (real * len(self._about["u0"]))()
         at = [*range(7 + n), *range(7 + max(n, 1), 13 + n + max(n, 1))]
         samples = self._about["kind"] == "samples"
@@ -180,7 +180,7 @@ class CLaw:
 
 
 class _OutputLoop(Loop):
-    """Loop whose controller is the C code."""
+    """Control loop that calls the C code as its controller."""
 
     def __init__(self, law: CLaw, state: StateMap) -> None:
         about = law._about
@@ -190,7 +190,10 @@ class _OutputLoop(Loop):
         self._law, self._u0 = law, np.array(about["u0"])
 
     def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
-        """Return the command of a sample; an accelerometer measures under this command."""
+        """Return the command of a sample.
+
+        Outputs are measured twice, since an accelerometer must measure under this command.
+        """
         by = self.at(t)
         u, _ = self._law.output_step(self.estimate, measure(by, self._u0), t)
         u, self.estimate = self._law.output_step(self.estimate, measure(by, u), t)
@@ -198,7 +201,7 @@ class _OutputLoop(Loop):
 
 
 def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
-    """Return the shared library of a source file."""
+    """Compile a source file, and return its shared library."""
     if not isinstance(compiler, str) or "\0" in compiler:
         raise InputError(f"compiler is {compiler!r}, expected the name of a C compiler, such as cc")
     command = shutil.which(compiler)

@@ -34,10 +34,9 @@ CASES = 200
 
 
 class Case(NamedTuple):
-    """Test case: arguments of a step and its results, and the sizes that rounding is relative to.
+    """Test case: arguments `given` of a step, its results `out`, and the scale of rounding errors.
 
-    The bound of the error of `out` is the unit roundoff times `scale`, times the number of
-    operations.
+    The error of `out` is at most the unit roundoff times `scale` times the number of operations.
     """
 
     sample: int
@@ -90,7 +89,7 @@ class StateLaw(Law):
         return self.state.nx + 32.0 + 8.0 * sum(cells)
 
     def cases(self) -> list[Case]:
-        """Return random states and singular ones, with the inputs that the policy computes."""
+        """Return test cases at random and near-singular states, with the inputs of the policy."""
         random = np.random.default_rng(0)
         return [self._case(random, k % len(self.x0), k) for k in range(CASES)]
 
@@ -122,7 +121,7 @@ class StateLaw(Law):
         given = measured(world, q, v)
         given[7 : 7 + n] += 2.0 * np.pi * turns
         u = np.asarray(self.policy(row * self.dt, q, v))
-        # Sizes of the terms that each state is made of.
+        # Magnitudes of the terms whose sum is a state.
         omega, v = given[7 + n : 10 + n], given[10 + n : 13 + n]
         pose = [1.0] * 3 + [float(norm(given[4:7]) + norm(about[:3]))] * 3
         rates = np.repeat((norm(omega), norm(v)), 3)
@@ -151,7 +150,7 @@ class OutputLaw(Law):
         return float(len(self.terms.A) + len(self.names) + 16)
 
     def cases(self) -> list[Case]:
-        """Return random states of the controller and outputs, with u and the next z."""
+        """Return test cases at random controller states and outputs, with u and the next z."""
         random, by, found = np.random.default_rng(0), self.terms, list[Case]()
         (nz, ny), turning = by.B.shape, np.flatnonzero(self.continuous)
         for _ in range(CASES):
@@ -196,7 +195,7 @@ _KINDS = (
 
 
 def law_of(given: object, robot: object, limits: object) -> StateLaw | OutputLaw:
-    """Return the tables of a policy or design; `limits` as in `simulate`."""
+    """Convert a policy or design to the tables of a law; `limits` are as in `simulate`."""
     if not isinstance(given, _KINDS) or isinstance(given, TrajectoryOutputFeedback):
         raise InputError(
             f"law has type {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
@@ -251,7 +250,7 @@ def _robot_of(given: Any, lin: LinearModel | None) -> Robot | None:
 
 
 def _model_of(gain: Gain, robot: Robot) -> LinearModel:
-    """Return the model about the point of a gain from a file, relative to its reference."""
+    """Linearise the robot at the point and reference of a gain that was read from a file."""
     if not gain.placement.size:
         raise InputError(
             "the file of the gain does not contain the reference pose, because the file was "
@@ -281,7 +280,7 @@ def _common(
     names: tuple[str, ...],
     units: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Return the fields of a law that belong to its inputs; without `limits` they are infinite."""
+    """Return the fields common to all laws; without `limits`, the input limits are infinite."""
     low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     if limits is not None:
         own = [x for _, group in named_inputs(robot.inputs if robot else ()) for x in group]
@@ -303,7 +302,7 @@ def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: object) -> S
         )
     dt, state = policy.schedule.dt, policy.state_map(robot)
     world = StateMap(robot, frame="local")
-    # One row for each sample, and the last for all times after the end.
+    # One row for each sample; the last row applies after the end of the trajectory.
     last = int(np.ceil(policy.over / dt * (1.0 - 1e-12)))
     while last * dt <= policy.over:
         last += 1
@@ -359,7 +358,7 @@ def _output_law(
 
 
 def _units_of(robot: Robot | None, *names: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Return the units of inputs and outputs of a robot, by name; "unknown" for others."""
+    """Return the units of named inputs and outputs of a robot, "unknown" for other names."""
     known: dict[str, str] = {}
     if robot is not None:
         state = StateMap(robot)

@@ -24,7 +24,7 @@ from fflin.robot.robot import Robot
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
 _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
 
-# Greatest error of a double relative to the sizes of the terms.
+# Largest rounding error in double precision, relative to the magnitudes of the terms.
 _DOUBLE_ERROR = 1e-14
 
 
@@ -135,7 +135,7 @@ def _title(path: Path) -> str | None:
 
 
 class _Texts:
-    """The files of a law, filled into the templates of this folder."""
+    """Files of a law, made from the templates of this folder."""
 
     def __init__(self, law: StateLaw | OutputLaw, name: str, real: str) -> None:
         self.law, self.name, self.real, self.cases = law, name, real, law.cases()
@@ -166,7 +166,7 @@ class _Texts:
         self.words |= self._state(law) if isinstance(law, StateLaw) else self._output(law)
 
     def files(self) -> dict[str, str]:
-        """Return {file name: content}."""
+        """Return the files as {file name: content}."""
         self.words["interface"] = self._filled(f"{self.kind}_interface.h")
         self.words["limiting"] = self._filled("limiting.c").rstrip()
         self.words |= self._vectors()
@@ -200,7 +200,7 @@ class _Texts:
         return Template(text).substitute(self.words)
 
     def _vectors(self) -> dict[str, str]:
-        """Return the words of the test program."""
+        """Return the entries of the test program's template."""
         law, rows, nu = self.law, [], len(self.law.low)
         for case in self.cases:
             out = case.out.copy()
@@ -267,7 +267,7 @@ class _Texts:
         }
 
     def array(self, values: object) -> str:
-        """Return an initialiser of an array."""
+        """Return the C initialiser of an array."""
         values = np.asarray(values)
         if values.ndim > 1:
             return "{\n" + ",\n".join(map(self.array, values)) + "}"
@@ -285,7 +285,7 @@ class _Texts:
 
 
 def _at_least_one(matrix: Array) -> Array:
-    """Return a matrix with a zero row or column where it has none, as C has no empty arrays."""
+    """Add a zero row or column to a matrix without rows or columns: C has no empty arrays."""
     rows, columns = matrix.shape
     return np.pad(matrix, ((0, int(not rows)), (0, int(not columns))))
 
@@ -295,12 +295,12 @@ def _whole(values: Iterable[Any]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text that is valid in a comment and in a string of C."""
+    """Replace the characters of a text that may be invalid in comments and strings of C."""
     return re.sub(r"[^\w .,+^()\[\]/-]", "_", text, flags=re.ASCII)
 
 
 def _listed(array: str, names: Sequence[str], units: Sequence[str]) -> str:
-    """Return lines of a comment: index, name and unit of each entry of an array."""
+    """Return the lines of a C comment with index, name and unit of each entry of an array."""
     return "\n".join(
         f" *   {array}[{k}]  {_plain(name)} [{_plain(unit) or '-'}]"
         for k, (name, unit) in enumerate(zip(names, units, strict=True))

@@ -125,7 +125,7 @@ def allocate(allocation, point, commanded):
 
 @called
 def _realise(allocation, point, commanded):
-    """Write the inputs whose accelerations are nearest to those of a command."""
+    """Write the inputs whose accelerations are nearest to the accelerations of a command."""
     work, asking, giving = allocation.work, allocation.asking, allocation.giving
     own, tree, problem = allocation.point, asking.tree, allocation.problem
     size, count, columns = len(tree.row), len(problem.least), problem.columns

@@ -81,7 +81,7 @@ def _coriolis_transposed(work, at, along):
 
 
 @inlined
-def _passive_slopes(work, tree, layout, loads):
+def _passive_derivatives(work, tree, layout, loads):
     """Write the derivatives of springs and dampers, and zeros in all other entries."""
     size = len(tree.row)
     n, width = size - 6, 2 * size
@@ -102,7 +102,7 @@ def _add_column(work, at, width, force):
 
 
 @inlined
-def _joint_slopes(work, tree, layout):
+def _joint_derivatives(work, tree, layout):
     """Add the derivatives over each joint, and of each joint's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
     spin = vec.get3(work, layout.motion)
@@ -151,7 +151,7 @@ def _joint_slopes(work, tree, layout):
 
 
 @inlined
-def _base_slopes(work, tree, layout):
+def _base_derivatives(work, tree, layout):
     """Write the derivatives of the base's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
     zero, one = 0.0, 1.0
@@ -172,9 +172,9 @@ def _base_slopes(work, tree, layout):
 @inlined
 def differentiate(work, tree, layout, loads):
     """Write the derivatives of M c + bias - forces over the state, in rows of 12 + 2 n."""
-    _passive_slopes(work, tree, layout, loads)
-    _joint_slopes(work, tree, layout)
-    _base_slopes(work, tree, layout)
+    _passive_derivatives(work, tree, layout, loads)
+    _joint_derivatives(work, tree, layout)
+    _base_derivatives(work, tree, layout)
 
 
 @inlined

@@ -246,7 +246,7 @@ def below(typing: Any, value: Any, bound: Any) -> Any:
 
 @intrinsic
 def angle(typing: Any, sine: Any, cosine: Any) -> Any:
-    """Return the angle in (-pi, pi] with a sine and a cosine."""
+    """Return the angle in (-pi, pi] from its sine and cosine."""
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         kind = ir.FunctionType(_DOUBLE, [_DOUBLE, _DOUBLE])

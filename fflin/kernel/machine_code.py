@@ -70,7 +70,7 @@ class PartLibrary(CPUCodeLibrary):
         self._reload_init.update(library._reload_init)
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Return 0: there is no machine code."""
+        """Return 0, because a part has no machine code."""
         self._ensure_finalized()
         return 0
 

@@ -106,7 +106,7 @@ class Check:
         return tuple(row for row in self.rows if not row.ok)
 
     def __str__(self) -> str:
-        """Show the verdict, and the largest error of each kind of comparison."""
+        """Return a text with the verdict and the largest error of each kind of comparison."""
         if failures := self.failures:
             names = [f"{row.block} ({row.test})" for row in failures[:6]]
             names += ["..."] * (len(failures) > 6)

@@ -143,8 +143,8 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
 
     Use `line_up` to keep a gain after a change of the robot, such as a jammed joint or a captured
     payload, which leaves most states the same. Columns of K belong to states, and rows to inputs.
-    If the gain lacks a state or an input of the model, the column or row is zero. If the model
-    lacks a state or an input of the gain, the column or row is dropped.
+    A state of the model that K does not have gets a zero column, and such an input a zero row.
+    Columns and rows of K for states and inputs that the model does not have are dropped.
 
     Parameters
     ----------

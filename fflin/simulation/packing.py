@@ -31,7 +31,7 @@ def packed(plan: Plan, plant: Plant) -> loop.Arguments:
     h, state, method = plan.times.dt, plant.state, plan.method
     tree, conserved = batch_tree(plant.robot), conserved_by(plant.robot, plan.q, plant.field)
     assert tree is not None
-    size, (shift, speed) = 6 + state.robot.n, method.shares(h)
+    size, (shift, speed) = 6 + state.robot.n, method.step_weights(h)
     start = MomentumReference(conserved, method, h, plan.q, plan.v)
     stop = stop_conditions(plan)
     mechanics = mechanics_of(plant, tree)

@@ -211,7 +211,7 @@ def planned(robot: Robot, policy: object, options: SimulationOptions) -> tuple[P
         known=known,
         method=method,
         project=truth("project", options.project) and robot.orbit is None,
-        turning=_turning(robot),
+        turning=_rotating(robot),
         chart=None if lin is None else state,
         events=_checked_functions(options.events, options.callback),
         callback=options.callback,
@@ -284,7 +284,7 @@ def _checked_functions(events: Sequence[Event], callback: Callback | None) -> tu
     return called
 
 
-def _turning(robot: Robot) -> Array:
+def _rotating(robot: Robot) -> Array:
     """Return the indices in v of the angular velocities of the base and of all joints but rotors.
 
     Their rotation within a step is bounded. Rotors may spin fast, because nothing depends on their

@@ -102,7 +102,7 @@ def _advance(
     pushed = not plant.isolated(driven=channel is not None)
     stage, wrench, wrenches = plant.stage, conserved.wrench, reference.wrenches
     latest = plan.last_node * plan.times.dt
-    follow, shares = plan.law and plan.law.advance, plan.method.shares(plan.times.dt)[1]
+    follow, weights = plan.law and plan.law.advance, plan.method.step_weights(plan.times.dt)[1]
 
     def asked(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
         stages, last = 0, t + latest
@@ -115,7 +115,7 @@ def _advance(
                 wrenches[stages][:] = wrench(q, push)
             stages += 1
             if follow:
-                follow(shares[stages - 1, : stages + 1], stages == len(shares))
+                follow(weights[stages - 1, : stages + 1], stages == len(weights))
             return a
 
         end = take(f, t, q, v)

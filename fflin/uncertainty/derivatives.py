@@ -1,7 +1,7 @@
 r"""Derivatives of a linear model with respect to the robot's parameters.
 
-M and RNEA are linear in the ten dynamic parameters of a body. The derivative with respect to one of
-them is therefore M or RNEA of bodies that consist of the unit change alone.
+M and RNEA are linear in the ten dynamic parameters of each body. So the derivative with respect to
+a parameter is M or RNEA of a robot whose bodies consist only of the unit change.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from fflin.uncertainty.parameters import Parameter
 
 WEIGH = (CenterOfMass, Momentum)
 
-# Of a difference over a parameter, relative to what M has of it.
+# Step of a finite difference: the relative change of M by the changed parameter.
 _STEP = 2e-3
-# Smaller changes by such a step, of A or B, are in their rounding.
+# Smallest relative change of A or B by such a step that rounding errors do not hide.
 _LEAST = 1e-6
 
 
 class ModelDerivatives:
-    """Derivatives of the matrices of a model that is, or is sampled from, `source`."""
+    """Derivatives of the matrices of a model; `source` is the model in continuous time."""
 
     def __init__(self, lin: LinearModel, robot: Robot, source: LinearModel) -> None:
         self.lin, self.robot, self._source = lin, robot, source
@@ -53,12 +53,11 @@ class ModelDerivatives:
         state, data = ready.map, robot.create_data()
         self._chart = Standing() if own else state.chart(lin.q)
         self._u = ready.actuation.in_base_axes(self._chart, lin.u0)
-        nu, q_m = state.velocities(lin.v), state.joint_positions(lin.q)
+        nu = state.velocities(lin.v)
         self._rates = Accelerations(state, ready.actuation, data).rates(
             lin.q,
             lin.v,
             nu,
-            q_m,
             self._u,
             slopes=np.empty((len(nu), state.nx)),
             by_u=np.empty((len(nu), len(self._u))),
@@ -76,7 +75,8 @@ class ModelDerivatives:
     def over(self, parameters: Sequence[Parameter]) -> tuple[Array, ...]:
         """Return dA, dB, dC, dD, df0 and dy0 (P, ..)."""
         rates = derivatives_of(parameters, self.bodies, self._of_bodies, self._u)
-        # All is affine in the rates: what no parameter changes is that of none.
+        # A, B and f0 are affine in the rates. A last row with zero rates gives the constant part,
+        # which is subtracted below.
         ready, state, nu = self._ready, self._ready.map, self._ready.map.velocities(self.lin.v)
         count, nv = len(rates.c) + 1, len(nu)
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
@@ -106,9 +106,9 @@ class ModelDerivatives:
         return A, B, C, D, f0, y0[..., 0]
 
     def _seen(self, parameters: Sequence[Parameter], rates: AccelerationDerivatives) -> Array:
-        """Return dC, dD and dy0 side by side (P, ny, ..) of outputs that depend on masses."""
-        # The robot's mass times such an output is quadratic in a parameter, with rates that are
-        # linear in it: of three values the derivative is exact, whatever the step.
+        """Return dC, dD and dy0, side by side (P, ny, ..), of outputs that depend on masses."""
+        # The robot's mass times such an output is quadratic in a parameter, if the rates change
+        # linearly with it. So a difference of three values is exact for any step.
         lin, now = self.lin, self._rates
         found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
         outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)
@@ -143,12 +143,12 @@ class ModelDerivatives:
 
 
 def with_bodies(robot: Robot, one: Parameter, size: float) -> dict[int, pin.Inertia]:
-    """Return the bodies that so much more of a parameter changes."""
+    """Return {joint: body} of the bodies that change if a parameter grows by `size`."""
     found = {}
     for joint, change in one.bodies.items():
         changed = robot.model.inertias[joint].toDynamicParameters() + size * change
         found[joint] = pin.Inertia.FromDynamicParameters(changed)
-        if not changed[0]:  # a wheel, whose centre of mass Pinocchio takes for 0 / 0
+        if not changed[0]:  # a wheel without mass, for which Pinocchio would divide 0 by 0
             about = changed[4:][[[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
             found[joint] = pin.Inertia(0.0, np.zeros(3), about)
     return found
@@ -188,7 +188,10 @@ _E = np.eye(3)
 
 
 def _units() -> Array:
-    """Return the spatial inertias (10, 6, 6) of a unit of each dynamic parameter, linear first."""
+    """Return the spatial inertias (10, 6, 6) per unit of each dynamic parameter.
+
+    Linear rows come before angular rows.
+    """
     found = np.zeros((10, 6, 6))
     found[0, :3, :3] = _E
     for axis in range(3):
@@ -199,7 +202,7 @@ def _units() -> Array:
 
 
 UNITS = _units()
-# Bodies that Pinocchio can hold, whose parameters span all ten: at the joint, and beside it.
+# Valid bodies whose parameters span all ten: a mass at the joint, masses beside it, and inertias.
 _BODIES = (
     pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3))),
     *(pin.Inertia(1.0, axis, np.zeros((3, 3))) for axis in _E),
@@ -209,14 +212,14 @@ _OF_BODIES = np.linalg.inv([body.toDynamicParameters() for body in _BODIES]).rou
 
 
 class BodyDerivatives:
-    """Derivatives over the ten dynamic parameters of every body at one point, (12.1) and (12.2)."""
+    """Derivatives over the ten dynamic parameters of each body at one point, (12.1) and (12.2)."""
 
     def __init__(
         self, ready: Prepared, rates: AccelerationDerivatives, q: Array, v: Array, inverse: Array
     ) -> None:
         self.state, self.model = ready.map, ready.robot.model
         self.q, self.v, self.inverse = q.copy(), v.copy(), inverse
-        # Nothing depends on where the base is and how fast it moves along, see `Accelerations`.
+        # The accelerations do not depend on position and velocity of the base; see `Accelerations`.
         self.q[:3] = self.v[:3] = 0.0
         field = field_of(ready.robot, self.state.frame)
         self._gradient = GravityGradient.at(field, q) if field else None
@@ -226,7 +229,7 @@ class BodyDerivatives:
         self.joints = range(ROOT, self.model.njoints)
 
     def all(self) -> AccelerationDerivatives:
-        """Return them as rates, (bodies * 10, ..), of the joints in Pinocchio's order."""
+        """Return the derivatives (bodies * 10, ..) of the rates, in Pinocchio's joint order."""
         rates, size = self.rates, len(self.inverse)
         given = np.concatenate((rates.by_u, rates.slopes), axis=1)
         moved = self._by_inertia(given).reshape(-1, size, given.shape[1])
@@ -248,13 +251,13 @@ class BodyDerivatives:
         return found
 
     def fraction(self, changes: Mapping[int, Array]) -> float:
-        """Return how much of M a change of bodies is at the most: the radius of M^-1 M_p."""
+        """Return the largest relative change of M: the spectral radius of M^-1 times the change."""
         of_bodies = self._by_inertia(np.eye(len(self.inverse)))
         total = sum(np.tensordot(change, of_bodies[at - ROOT], 1) for at, change in changes.items())
         return float(np.abs(np.linalg.eigvals(total)).max())
 
     def _by_inertia(self, given: Array) -> Array:
-        """Return -M^-1 M_p times a matrix (6 + n, k): (bodies, 10, 6 + n, k)."""
+        """Return -M^-1 M_p (bodies, 10, 6 + n, k) times a matrix (6 + n, k)."""
         pin.computeJointJacobians(self.model, self.data, self.q)
         J = np.array(
             [
@@ -270,7 +273,7 @@ class BodyDerivatives:
         return product.reshape(bodies, size, 10, k).transpose(0, 2, 1, 3)
 
     def _forces(self) -> tuple[Array, ...]:
-        """Return F_p (bodies * 10, 6 + n), F_qp over q_m, F_nup, and in orbit that over turns."""
+        """Return F_p (bodies * 10, 6 + n) and its derivatives over q_m, nu and base rotations."""
         lone = self.model.copy()
         lone.armature = np.zeros_like(lone.armature)
         for joint in range(lone.njoints):
@@ -289,10 +292,13 @@ class BodyDerivatives:
     def _rnea_derivatives(
         self, model: pin.Model, v: Array, c: Array, gradient: GravityGradient | None = None
     ) -> tuple[Array, ...]:
-        """Return RNEA and its derivatives over q_m, nu and turns, without springs and inputs."""
+        """Return the forces of RNEA and their derivatives over q_m, nu and base rotations.
+
+        Springs and inputs are left out.
+        """
         state, data, q = self.state, self.data, self.q
         by_turn: Array = np.zeros((len(v), 3))
-        if gradient:  # first, as what Pinocchio returns is overwritten
+        if gradient:  # before RNEA, because these calls overwrite Pinocchio's results
             pull = gradient.force(model, data, q)
             pull_by_q, by_turn = gradient.slopes(model, data, q)
         by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q, v, state.spread(c))
@@ -310,7 +316,7 @@ def derivatives_of(
     of_bodies: AccelerationDerivatives,
     u: Array,
 ) -> AccelerationDerivatives:
-    """Return the derivatives of the rates over each parameter, (P, ..); u (nu,) in base axes."""
+    """Return the derivatives (P, ..) of the rates over P parameters; u (nu,) is in base axes."""
     found = AccelerationDerivatives(
         *(np.zeros((len(parameters), *part.shape[1:])) for part in of_bodies)
     )
@@ -328,7 +334,7 @@ def derivatives_of(
 
 
 def _of_force(parameter: Parameter, at: BodyDerivatives, u: Array) -> AccelerationDerivatives:
-    """Return derivatives for parameters of forces only: F_p, F_qp, F_nup and B_p."""
+    """Return the derivatives over a parameter that changes only forces, not bodies."""
     state, rates, size = at.state, at.rates, len(at.inverse)
     F: Array = np.zeros(size)
     B = np.zeros_like(rates.by_u)

@@ -1,13 +1,15 @@
 r"""Linear-fractional form of a robot at rest: the signals that each parameter multiplies.
 
-The force that a link takes of an acceleration a is the chain
+The force F that accelerates a link with the accelerations a is
 
     s = T X a,   f = D s,   F = X^T T^T f
 
-with X the Jacobian of its centre of mass in the axes of its inertia, D = blkdiag(m E, I), and T = E
-where that centre stays. A mass multiplies 3 signals, an entry of the inertia 1 on the diagonal and
-2 beside it, a density 6, a coordinate of the centre of mass 2 in T and 2 in T^T. Fewer would not
-do: these are the ranks of what each changes of M, since X has full rank on a free base.
+X is the Jacobian of the link's centre of mass in the axes of its inertia, D = blkdiag(m E, I), and
+T is the shift of an uncertain centre of mass (otherwise the identity E). The numbers of signals
+that parameters multiply are: 3 for a mass, 6 for a density, 1 for an entry on the diagonal of the
+inertia, 2 for an entry beside it, and 2 in T and 2 in T^T for a coordinate of the centre of mass.
+These numbers are minimal: they are the ranks of the changes of M, since X has full rank on a free
+base.
 """
 
 from __future__ import annotations
@@ -73,13 +75,13 @@ class Block(NamedTuple):
         return {each.parameter.name: each.middle + each.half * delta for each in self.ranges}
 
 
-# An inertia's entry beside the diagonal, or a wheel's inertia, which its carrier loses.
-# A mode's frequency is squared.
+# Number of signals for each part. "inertia" is an entry beside the diagonal, or a wheel's inertia,
+# which is subtracted from its carrier. "frequency" is squared.
 _REPEATS = {"mass": 3, "density": 6, "com": 4, "inertia": 2, "frequency": 2}
 
 
 class Fraction(NamedTuple):
-    """A, B1, B2, C1, D11, D12 of the accelerations (6 + n, ..) and of z, over x, w and u."""
+    """Matrices of the accelerations a (6 + n, ..) and of z, each over x, w and u."""
 
     a: tuple[Array, Array, Array]
     z: tuple[Array, Array, Array]
@@ -92,7 +94,7 @@ def fraction(
     pieces: Mapping[str, Piece],
     ranges: Sequence[Range],
 ) -> Fraction:
-    """Return the form about a point at rest where nothing pulls."""
+    """Return the linear-fractional form about a point at rest without forces."""
     form = _Form(state, actuation, q, ranges)
     of_pieces: dict[str, dict[str, int]] = {}
     of_modes: dict[str, dict[str, int]] = {}
@@ -114,7 +116,10 @@ def fraction(
 
 
 class _Form:
-    """Signals are rows over (a, x, u, w); z fills as parameters come, the force adds up."""
+    """Linear-fractional form under construction.
+
+    Signals are rows over (a, x, u, w). Each parameter adds rows to z and terms to the force.
+    """
 
     def __init__(
         self, state: StateMap, actuation: Actuation, q: Array, ranges: Sequence[Range]
@@ -138,7 +143,7 @@ class _Form:
         self.unit = np.eye(self.ends[-1])
         self.next = list(np.cumsum((0, *repeats[:-1])))
         self.z = np.zeros((sum(repeats), self.ends[-1]))
-        # What is taken less what is given; zero by the equation of motion.
+        # Inertial and spring forces minus input forces, which is zero by the equation of motion.
         self.force = np.zeros((len(M), self.ends[-1]))
         g, (stiffness, damping, _) = state.groups, state.robot.springs
         a, x, u, _ = self.parts(self.force)
@@ -146,18 +151,21 @@ class _Form:
         x[6:, g.q_m], x[6:, g.qdot_m] = np.diag(stiffness), np.diag(damping)
 
     def parts(self, signals: Array) -> list[Array]:
-        """Return the views over a, x, u and w."""
+        """Return the views of signals over a, x, u and w."""
         return np.split(signals, self.ends[:-1], axis=1)
 
     def times(self, at: int, signals: Array) -> Array:
-        """Return the parameter's shift from now times signals, with the w that it varies by."""
+        """Return a parameter's change times signals: (shift + half * delta) * signals.
+
+        The varying part is a new w, and `half` times the signals is added to z.
+        """
         one, first = self.ranges[at], self.next[at]
         self.next[at] += len(signals)
         self.z[first : self.next[at]] = one.half * signals
         return one.shift * signals + self.unit[self.ends[2] + first : self.ends[2] + self.next[at]]
 
     def add_piece(self, piece: Piece, parts: Mapping[str, int]) -> None:
-        """Put the chain of a link in place of what it takes now."""
+        """Replace the nominal inertial force of a link by the force with uncertain parameters."""
         J = piece.placement.inverse().toActionMatrix() @ self.jacobians[piece.joint]
         shifts = []
         for axis, direction in zip(AXES, piece.frame.rotation.T, strict=True):
@@ -212,7 +220,7 @@ class _Form:
             self.force += L @ self.times(at, (values[most, None] * L.T) @ a)
 
     def add_mode(self, index: int, parts: Mapping[str, int]) -> None:
-        """Put omega I (omega x + 2 zeta x') in place of the force of a mode."""
+        """Replace the spring and damper force of a mode by omega I (omega x + 2 zeta x')."""
         joint, springs = self.state.robot.joints[index], self.state.robot.springs
         K, D = springs.stiffness[index], springs.damping[index]
         omega, ratio = joint.oscillation(K, D)
@@ -233,7 +241,7 @@ class _Form:
         self.force[6 + index] += (force - K * position - D * rate)[0]
 
     def solved(self) -> Fraction:
-        """Solve the equation of motion for a, and put it into z."""
+        """Solve the equation of motion for a, and eliminate a from z."""
         (M, *others), (Z, *direct) = self.parts(self.force), self.parts(self.z)
         x, u, w = (-np.linalg.solve(M, each) for each in others)
         zx, zu, zw = (d + Z @ each for d, each in zip(direct, (x, u, w), strict=True))

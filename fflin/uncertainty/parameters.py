@@ -1,4 +1,4 @@
-"""Named parameters of a robot, their effect per unit, and robots with other values."""
+"""Named parameters of a robot, their effect per unit, and robots with changed parameters."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fflin.robot.robot import Robot
 AXES = "xyz"
 # (row, column) of the six entries of an inertia.
 ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", "xy", "xz", "yz")}
-# The parameters of a link or body.
+# Parameters of a link or body.
 OF_PIECES = {
     *("mass", "density"),
     *(f"com.{axis}" for axis in AXES),
@@ -34,19 +34,20 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter, such as "inertia.xx" of "arm", and how a unit of it changes the robot."""
+    """One parameter, such as "inertia.xx" of "arm", and its effect on the robot per unit."""
 
     of: str
     part: str
     unit: str
     value: float
-    # {Pinocchio joint: change (10,)} of bodies: m, m c, and I xx, xy, yy, xz, yz, zz at the joint.
+    # {Pinocchio joint: change (10,) of its body}: m, m c, and xx, xy, yy, xz, yz, zz of I about
+    # the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
-    spring: int = -1  # the joint whose stiffness or damping it changes, in state order
-    damper: int = -1
-    by_stiffness: float = 1.0  # change of this stiffness, and of this damping, by a unit of it
-    by_damping: float = 1.0
-    # (Pinocchio joint, input, change (6,) of the wrench of a unit of it in the joint's frame)
+    spring: int = -1  # joint whose stiffness changes, in state order; -1 for none
+    damper: int = -1  # joint whose damping changes
+    by_stiffness: float = 1.0  # change of the stiffness per unit
+    by_damping: float = 1.0  # change of the damping per unit
+    # (Pinocchio joint, index of the input, change (6,) of its unit wrench in the joint's frame)
     wrench: tuple[int, int, Array] | None = None
 
     @property
@@ -88,7 +89,7 @@ def moments(mass: float, first: Array, inertia: Array) -> Array:
 
 
 def _of_piece(name: str, piece: Piece) -> Iterator[Parameter]:
-    """Give mass, centre of mass, inertia and density of a link or body."""
+    """Yield the mass, centre of mass, inertia and density of a link or body."""
 
     def change(part: str, unit: str, value: float, parameters: Array) -> Parameter:
         return Parameter(name, part, unit, value, {piece.joint: parameters})
@@ -123,7 +124,7 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
 
 
 def _of_mode(joint: Joint, index: int, stiffness: float, damping: float) -> Iterator[Parameter]:
-    r"""Return frequency and damping ratio of a mode with inertia I and a clamped link.
+    r"""Yield the frequency and damping ratio of a mode with inertia I and a clamped link.
 
     The stiffness is :math:`I \omega^2` and the damping :math:`2 \zeta I \omega`.
     """
@@ -151,7 +152,7 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
             joint, placement = find_frame(robot.model, item.frame)
             where, along = np.array(item.position), np.array(item.direction)
             for letter, d in zip(AXES, np.eye(3), strict=True):
-                # A direction is of unit length: only what turns it counts.
+                # The direction has unit length, so only the perpendicular part of d changes it.
                 turned = d - along * (along @ d)
                 moved = np.concatenate((np.zeros(3), np.cross(d, along)))
                 tilted = np.concatenate((turned, np.cross(where, turned)))
@@ -186,14 +187,14 @@ class Variants:
         """Return why {parameter: value} are not physically realisable, or an empty string."""
         try:
             changed = self._changed(values)
-            if self._robot.wheels or self._robot.modes:  # for which a carrier may be too light
+            if self._robot.wheels or self._robot.modes:  # the link below may be too light for them
                 self._with(changed, values)
         except InputError as error:
             return str(error)
         return ""
 
     def robot(self, values: Mapping[str, float]) -> Robot:
-        """Return the robot of {parameter: value}, or raise `InputError`."""
+        """Return the robot with {parameter: value}, or raise `InputError` if it is impossible."""
         return self._with(self._changed(values), values)
 
     def _parts(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
@@ -204,7 +205,7 @@ class Variants:
         return found
 
     def _changed(self, values: Mapping[str, float]) -> dict[str, tuple[Piece, float]]:
-        """Return the links that are others, each with its density."""
+        """Return {name: (link with changed parameters, density)}."""
         found = {}
         for name, parts in self._parts(values).items():
             own = {part: value for part, value in parts.items() if part in OF_PIECES}
@@ -250,7 +251,7 @@ class Variants:
 
 
 def _spring(joint: Joint, parts: Mapping[str, float], robot: Robot) -> dict[str, float]:
-    """Return the stiffness and damping of a joint that are changed by {part: value}."""
+    """Return the stiffness and damping of a joint with changed parameters {part: value}."""
     stiffness = robot.stiffness.get(joint.name, 0.0)
     if not (joint.mode and stiffness):
         return {part: x for part, x in parts.items() if part in ("stiffness", "damping")}
@@ -261,7 +262,7 @@ def _spring(joint: Joint, parts: Mapping[str, float], robot: Robot) -> dict[str,
 
 
 def _piece(piece: Piece, parts: Mapping[str, float]) -> tuple[Piece, float]:
-    """Return a link with other parameters, and its density."""
+    """Return a link with changed parameters {part: value}, and its density."""
     own, inertia = np.array(piece.frame.actInv(piece.placement.translation)), piece.inertia.copy()
     for at, axis in enumerate(AXES):
         own[at] = parts.get(f"com.{axis}", own[at])
@@ -275,7 +276,10 @@ def _piece(piece: Piece, parts: Mapping[str, float]) -> tuple[Piece, float]:
 
 
 def _no_body(before: Piece, piece: Piece, name: str) -> str:
-    """Return why a link is not a rigid body; nothing if it is, or is no less than it was."""
+    """Return why a changed link is physically impossible, or an empty text.
+
+    A link that was impossible before the change is accepted unless it becomes worse.
+    """
     if not piece.mass > 0.0:
         return f"the mass of '{name}' is {piece.mass:.4g} kg, expected above 0"
     if (piece.inertia == before.inertia).all():  # a point mass has none
@@ -290,7 +294,7 @@ def _no_body(before: Piece, piece: Piece, name: str) -> str:
 
 
 def _input(item: Any, parts: Mapping[str, float]) -> Any:
-    """Return a thruster that sits elsewhere or a wheel of another inertia, or the same."""
+    """Return a thruster with a changed position, a wheel with a changed inertia, or the input."""
     if "inertia" in parts:
         return replace(item, inertia=parts["inertia"])
     if not isinstance(item, Thruster):

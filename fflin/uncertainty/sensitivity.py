@@ -20,9 +20,9 @@ from fflin.linear.model import LinearModel
 from fflin.uncertainty.derivatives import ModelDerivatives, difference
 from fflin.uncertainty.parameters import Parameter, Parameters
 
-# Poles closer than this, relative to the largest, have no derivative of their own.
+# Poles closer than this, relative to the largest pole, count as equal and have no derivative.
 _EQUAL = 1e-6
-_ROUNDING = 1e-12  # effect relative to the largest entry
+_ROUNDING = 1e-12  # smaller effects, relative to the largest entry, are rounding errors
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,8 +125,8 @@ class Sensitivity:
         found = self.parameters.find(name)
         if len(found) > 1:
             raise InputError(
-                f"'{name}' matches {len(found)} parameters, expected one; for several use "
-                "along({...})"
+                f"'{name}' matches {len(found)} parameters, expected one; to change several "
+                "parameters together, use along({...})"
             )
         return self.parameters[found[0]]
 

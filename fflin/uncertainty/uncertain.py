@@ -23,7 +23,7 @@ from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.parameters import Parameter, Variants
 from fflin.uncertainty.worst import Worst, searched
 
-# Draws for one that makes a robot, before it is said that hardly any does.
+# Number of rejected draws per valid draw above which the ranges are refused.
 _TRIES = 1000
 
 
@@ -325,7 +325,7 @@ def _range(one: Parameter, value: object) -> Range:
     expected = "" if least < largest else "least < largest"
     if least < 0.0 and one.part in ("stiffness", "damping"):
         expected = "values of 0 or more"
-    # The inertia is a wheel's.
+    # "inertia" without an entry is the inertia of a wheel.
     if least <= 0.0 and one.part in ("mass", "density", "inertia", "frequency"):
         expected = "values above 0"
     if expected:
@@ -337,7 +337,7 @@ def _range(one: Parameter, value: object) -> Range:
 
 
 def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
-    """Return the block of parameters that have one delta."""
+    """Return the block of tied parameters, which have a common delta."""
     ranges = [_range(one, value) for one in parameters]
     units = {one.unit for one in parameters}
     if isinstance(value, tuple | list):
@@ -349,7 +349,7 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
     relative = abs(float(value))
-    # Of what is below 0 too, more is further from 0.
+    # A relative half width has the sign of the nominal value: delta > 0 increases the magnitude.
     scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
     return Block(key, "1", 1.0, relative, tuple(scaled))
 

@@ -10,40 +10,41 @@ from operator import itemgetter
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
-from fflin.base.validation import Array, shaped
+from fflin.base.validation import Array, Mask, shaped
 from fflin.control.gain import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
 
 _CORNERS = 256
-# Steps of a climb, and how far these go, relative to half a range; 1e9 to a corner.
+# Number of steps of a climb, and step lengths relative to half a range; 1e9 leads to a corner.
 _STEPS, _LENGTHS = 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
-# Loops held exactly in a step, and frequencies at which the others are judged.
+# Number of candidates with an exact criterion in each step, number of frequencies for the quick
+# criterion, and step of finite differences.
 _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
 
-Figure: TypeAlias = Callable[[Array], Array]  # how bad loops are, of rows of deltas
+# Function of rows of deltas that returns a criterion; larger values are worse.
+Figure: TypeAlias = Callable[[Array], Array]
 
-# Signals up to which slycot is asked, whose time grows with the fifth power of them.
+# Largest number of signals for slycot, whose time grows with the fifth power of this number.
 _SIGNALS = 24
-# Frequencies of a first look, those at which an interval is held, and how often intervals are
-# divided or slycot is asked.
+# Number of frequencies in the first grid, number of frequencies checked inside an interval, and
+# largest number of divided intervals or slycot calls.
 _LOOK, _INSIDE, _DIVISIONS = 120, 5, 100
-# How near to the bound of one frequency that of its interval is enough.
+# An interval is not divided if its bound is within this factor of the bound at one frequency.
 _NEAR = 1.01
 
 Scaling: TypeAlias = tuple[Array, Array]  # d > 0 and g, (n,) each
 
 
 class Figures(NamedTuple):
-    """Criterion of a loop: by a few frequencies, by all, and loops worse than a bound."""
+    """One criterion of a loop: from a few frequencies, exact, and as a test against a bound."""
 
     quick: Figure
     exact: Figure
-    above: Callable[[Array, float], NDArray[np.bool_]]
+    above: Callable[[Array, float], Mask]
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ class Worst:
 
 @in_one_thread
 def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
-    """Do what `Uncertain.worst` does."""
+    """Search for the worst closed loops; see `Uncertain.worst`."""
     K = shaped("gain", getattr(gain, "K", gain), lft.B2.T.shape, " (nu, nx)")
     size, loops = len(lft.repeats), Loops(lft, K)
     middle = np.zeros((1, size))
@@ -126,9 +127,9 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     else:
         corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
     physical = np.array([of.makes(corner) for corner in corners])
-    # Draws come last, so that more of them find what fewer found before they go on.
+    # Draws come last, so that a search with more draws repeats the search with fewer draws first.
     tried = np.vstack((middle, corners[physical], draws))
-    # The disk margin is of (S - T)/2, each input counted in sqrt(R_ii), as in control.gain.
+    # The disk margin uses (S - T)/2 with inputs scaled by sqrt(R_ii), as in control.gain.
     scale = np.sqrt(getattr(gain, "R", np.eye(len(K))).diagonal())
     disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
     whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
@@ -154,7 +155,7 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
 
 
 class Gain(NamedTuple):
-    """Channel of a gain, from w to C x + D w, with the disturbance `scale` * w at the inputs."""
+    """Channel whose gain is bounded: from w to C x + D w, with the input disturbance scale * w."""
 
     C: Array
     D: Array
@@ -162,7 +163,7 @@ class Gain(NamedTuple):
 
 
 class Loops:
-    """Loops u = -K x of the robots of a fraction, deltas in rows (N, k); unstable ones are bad."""
+    """Closed loops u = -K x of an LFT at rows of deltas (N, k)."""
 
     def __init__(self, lft: LFT, K: Array) -> None:
         self.lft, self.K = lft, K
@@ -173,13 +174,13 @@ class Loops:
         return A - B @ self.K, B
 
     def undamped(self, rows: Array) -> Array:
-        """Return minus the least damping ratio (N,); 0 or more where a loop is unstable."""
+        """Return minus the least damping ratio (N,); it is 0 or more for an unstable loop."""
         poles = np.linalg.eigvals(self.matrices(rows)[0])
         found: Array = (poles.real / np.maximum(np.abs(poles), 1e-300)).max(axis=-1)
         return found
 
     def gains(self, of: Gain, rows: Array, frequencies: Array) -> Array:
-        """Return the largest gains (N,) at these frequencies, infinite of unstable loops."""
+        """Return the largest gains (N,) at given frequencies; infinite for unstable loops."""
         F, B = self.matrices(rows)
         found = np.zeros(len(F))
         for w in frequencies:
@@ -190,7 +191,7 @@ class Loops:
         return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(found))
 
     def figures(self, of: Gain) -> Figures:
-        """Return what judges gains."""
+        """Return the criterion of a channel's largest gain."""
         middle = np.zeros((1, len(self.lft.repeats)))
         sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))
         at = np.argsort([-self.gains(of, middle, np.array((w,)))[0] for w in sizes])
@@ -201,10 +202,10 @@ class Loops:
             if np.linalg.eigvals(F).real.max() >= 0.0:
                 return np.array((np.inf,))
             value, w = largest_gain(F, B * of.scale, of.C, of.D)
-            peaks.append(min(w, 1e300))  # where others like it have theirs
+            peaks.append(min(w, 1e300))  # similar loops have their peak near this frequency
             return np.array((value,))
 
-        def above(rows: Array, bound: float) -> NDArray[np.bool_]:
+        def above(rows: Array, bound: float) -> Mask:
             F, B = self.matrices(rows)
             unstable = np.linalg.eigvals(F).real.max(axis=-1) >= 0.0
             limit = bound * (1.0 + ACCURACY)
@@ -218,9 +219,9 @@ class Loops:
 
 
 def _largest(figures: Figures, tried: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
-    """Maximise a figure from the first sample, and from each sample worse than the result.
+    """Maximise a criterion from the first sample, and from each sample worse than the result.
 
-    The result is therefore at least as bad as every sample, and more samples never improve it.
+    So the result is at least as bad as each sample, and never less bad with more samples.
     """
     best, at = _climbed(figures, tried[0], makes)
     ahead = tried[1:]
@@ -232,7 +233,7 @@ def _largest(figures: Figures, tried: Array, makes: Callable[[Array], bool]) -> 
 
 
 def _climbed(figures: Figures, start: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
-    """Climb along the gradient of a figure and one delta at a time."""
+    """Maximise a criterion locally, by steps along its gradient and along single deltas."""
     quick, exact, _ = figures
     value, delta, unit = float(exact(start[None])[0]), start, np.eye(len(start))
     for _ in range(_STEPS):
@@ -256,7 +257,7 @@ def _climbed(figures: Figures, start: Array, makes: Callable[[Array], bool]) -> 
 
 
 def _safe(loops: Loops) -> float:
-    """Return by how much the set may be widened: the inverse of the largest bound on mu."""
+    """Return the factor by which the set may be scaled: the inverse of the largest bound of mu."""
     lft, F = loops.lft, loops.matrices(np.zeros(len(loops.lft.repeats)))[0]
     poles = np.linalg.eigvals(F)
 
@@ -269,13 +270,13 @@ def _safe(loops: Loops) -> float:
     return 1.0 / largest if largest else np.inf
 
 
-# Upper bounds of the structured singular value for real repeated parameters. For real parameters
-# it is discontinuous in the frequency, if a pole crosses the axis. Values on a grid of frequencies
-# then say nothing about the frequencies between. So one scaling is used for each whole interval.
+# Upper bounds of the structured singular value mu for real repeated parameters. With real
+# parameters, mu may be discontinuous in the frequency. Bounds on a grid of frequencies then do not
+# hold between them. So one scaling is used for a whole interval of frequencies.
 
 
 def perron(Z: Array) -> Array:
-    """Return the d > 0 (.., n, 1) that make d Z / d small, by Perron's vectors of |Z|."""
+    """Return scalings d > 0 (.., n, 1) with small d Z / d, from the Perron vectors of |Z|."""
     sizes = np.abs(Z) + 1e-9 * np.abs(Z).max(axis=(-2, -1), keepdims=True) + 1e-300
     right, left = np.ones((2, *Z.shape[:-1], 1))
     for _ in range(100):
@@ -286,7 +287,7 @@ def perron(Z: Array) -> Array:
 
 
 def bound_of(Z: Array, scaling: Scaling) -> float:
-    """Return the least b with Z^H D^2 Z + j (G Z - Z^H G) <= b^2 D^2 for all of Z (k, n, n)."""
+    """Return the least b with Z^H D^2 Z + j (G Z - Z^H G) <= b^2 D^2 for all Z in Z (k, n, n)."""
     d, g = scaling
     scaled, turned = d[:, None] * Z / d, (g / d)[:, None] * Z / d
     form = scaled.conj().mT @ scaled + 1j * (turned - turned.conj().mT)
@@ -296,14 +297,17 @@ def bound_of(Z: Array, scaling: Scaling) -> float:
 def largest_bound(
     response: Callable[[Array], Array], end: Array, rates: Array, blocks: Array
 ) -> float:
-    """Return the largest bound of Z = response(w), `end` at infinity, for a loop of such rates."""
+    """Return the largest bound of Z = response(w) over all frequencies w.
+
+    `end` is the response at infinity. `rates` are the magnitudes of the loop's poles.
+    """
     grid = np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _LOOK)
     grid = np.unique(np.concatenate(((0.0,), grid, rates)))
     at_end = min(bound_of(end[None], each) for each in _scalings(end, blocks))
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
     def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
-        """Return the bound of an interval with its scaling, and the bound of its middle alone."""
+        """Return the bound of an interval, its scaling, and the bound of its middle frequency."""
         Z = response(np.linspace(a, b, _INSIDE))
         middle = Z[_INSIDE // 2]
         found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]
@@ -332,7 +336,7 @@ def largest_bound(
 
 
 def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
-    """Return scalings that are good for Z, with the scaling of AB13MD if blocks are given."""
+    """Return candidate scalings for Z, including the one of AB13MD if blocks are given."""
     none: Array = np.zeros(len(Z))
     found: list[Scaling] = [(perron(Z)[:, 0], none)]
     if len(Z) == 1 and len(blocks) and Z[0, 0].imag:
@@ -344,7 +348,7 @@ def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
         return found
     if 0 < len(blocks) and len(Z) <= _SIGNALS:
         try:
-            # A delta on one signal is real, a repeated one a full block.
+            # A delta on one signal is a real block. AB13MD takes a repeated delta as a full block.
             _, d, g, *_ = ab13md(Z, blocks, np.where(blocks == 1, 1, 2))
         except SlycotArithmeticError:
             return found

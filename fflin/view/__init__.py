@@ -1,4 +1,6 @@
-"""Robots, motions and modes in meshcat: one page, pictures, live; JavaScript in `view/assets`.
+"""Views of robots, motions and modes in meshcat: an HTML page, pictures, or a live page.
+
+The JavaScript of the pages is in `view/assets`.
 
 Imports `base`, `robot`, `dynamics`, `linear`, `analysis` and `simulation`.
 """

@@ -24,7 +24,7 @@ _NAMES = (
     *("microsoft-edge", "msedge"),
 )
 
-# WebGL without a graphics card, and nothing that asks the network.
+# Options for WebGL without a graphics card, and without network access.
 _ARGUMENTS = (
     *("--headless=new", "--remote-debugging-pipe", "--hide-scrollbars", "--mute-audio"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
@@ -33,11 +33,11 @@ _ARGUMENTS = (
     *("--disable-dev-shm-usage", "--disable-extensions"),
 )
 
-# It takes commands on descriptor 3 and answers on 4. It ends when they are closed,
-# so that nothing of it outlives this process, however that ends.
+# Chromium reads commands from descriptor 3 and answers on descriptor 4. It ends when they are
+# closed, so it never outlives this process.
 _WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 
-_PATIENCE = 120.0  # seconds for a slow machine without a graphics card
+_PATIENCE = 120.0  # [s] time limit, long enough for a slow machine without a graphics card
 
 _GIF_FPS = 12
 _GIF_FRAMES = 96
@@ -55,7 +55,7 @@ def find_chromium() -> str:
 
 
 def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes:
-    """Return a PNG of a motion's page: with its panel at one time [s], a strip of it at several."""
+    """Return a PNG of a motion's page at one time [s], or a strip of pictures at several times."""
     frames = _film(page, times, size, 1 if len(times) > 1 else -1)
     if len(frames) == 1:
         return frames[0]
@@ -70,7 +70,7 @@ def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes
 
 
 def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[int, int]) -> bytes:
-    """Return a GIF of a motion's page over a span [s], shown faster where it is long."""
+    """Return a GIF of a motion's page over a span [s]; long spans are shown faster."""
     from PIL import Image
 
     start, duration = span[0], span[1] - span[0]
@@ -88,7 +88,11 @@ def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[in
 
 
 def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) -> list[bytes]:
-    """Return a PNG at each time, plain with a legend on so many; below 0: of all of the page."""
+    """Return a PNG of the page at each time.
+
+    Pictures show only the scene, with a legend on the first `keys` of them. If `keys` is negative,
+    they show the whole page.
+    """
     program = find_chromium()
     try:
         with _browser(program, _PATIENCE + 3.0 * len(times)) as browser:
@@ -109,7 +113,7 @@ def _shots(
     for index, moment in enumerate(times):
         if keys >= 0:
             browser.evaluate(f"fflin.plain(true, {json.dumps(index < keys)})")
-        # Two frames: one that draws, one after which it is on the screen.
+        # Wait for two animation frames: the first draws, the second follows the display.
         browser.evaluate(
             f"fflin.seek({float(moment)!r}); new Promise(done => requestAnimationFrame(() => "
             "requestAnimationFrame(() => done(1))))"
@@ -129,8 +133,8 @@ def _browser(program: str, patience: float) -> Iterator[_Browser]:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            # What it leaves behind goes with the folder, unless the path of its socket, which may
-            # have some hundred letters, got too long by that.
+            # Its temporary files are removed with the folder. A long folder name is not used: the
+            # path of its socket may have only about a hundred characters.
             env={**os.environ, **({"TMPDIR": folder} if len(folder) < 56 else {})},
             start_new_session=True,
         )
@@ -150,7 +154,7 @@ def _browser(program: str, patience: float) -> Iterator[_Browser]:
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End the browser and all that it started."""
+    """End the browser and all its child processes."""
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
 
@@ -173,10 +177,10 @@ class _Browser:
         """Send a command and return the answer."""
         self._number += 1
         command = {"id": self._number, "method": method, "params": parameters, **self._session}
-        with suppress(BrokenPipeError):  # seen when it is read
+        with suppress(BrokenPipeError):  # reading the answer reports the error
             self._commands.write(json.dumps(command).encode() + b"\0")
         while (answer := self._message()).get("id") != self._number:
-            pass  # what it tells unasked
+            pass  # skip messages that are not the answer
         if "error" in answer:
             raise _BrowserError(answer["error"].get("message"))
         result: dict[str, Any] = answer["result"]
@@ -193,13 +197,13 @@ class _Browser:
         return message
 
     def open_tab(self) -> None:
-        """Open a tab, which all further commands are for."""
+        """Open a tab, to which all further commands are sent."""
         target = self.tell("Target.createTarget", url="about:blank")
         attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)
         self._session = {"sessionId": attached["sessionId"]}
 
     def quit(self) -> None:
-        """Tell it to go: then it clears up behind itself, which it does not when it is ended."""
+        """Ask the browser to quit, so that it removes its files; if killed, it would not."""
         self._session = {}
         self.tell("Browser.close")
 

@@ -1,4 +1,4 @@
-"""Marks fixed to the bodies of a robot: axes, thrusters, wheels; and links that can be picked."""
+"""Marks fixed to the bodies of a robot: axes, thrusters, wheels, and links that can be selected."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.view.scene import Drawing, body_paths
 
-# Several wheels at one point are drawn apart, along their axes, in sizes of the robot.
+# Distance between wheels at one point, which are drawn apart along their axes, in robot sizes.
 _APART = 0.1
 
 
 def equipment(
     robot: Robot, drawings: list[Drawing], tool: str | None, size: float
 ) -> dict[str, Any]:
-    """Return the axes at base and tool, nozzles, wheels, and the links of the drawings."""
+    """Return the marks of a page: axes at base and tool, nozzles, wheels and selectable links."""
     paths = body_paths(robot)
     found = [(paths[0], pin.SE3.Identity(), 0.3)]
     if tool:
@@ -48,7 +48,7 @@ def equipment(
 
 
 def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
-    """Return name, joint, position and direction of push, in its frame, of each thruster."""
+    """Return name, joint, and position and force direction in the joint's frame, per thruster."""
     found: list[tuple[str, int, Array, Array]] = []
     actuation = Actuation(StateMap(robot))
     names = [actuation.names[index] for index in actuation.groups.get("thrust", ())]
@@ -62,7 +62,7 @@ def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
 
 
 def _wheels(robot: Robot, size: float) -> list[dict[str, Any]]:
-    """Return the wheels at their frames, and the body that spins where the speed is a state."""
+    """Return the wheels at their frames, with the spinning body if the wheel's speed is a state."""
     named, paths = named_wheels(robot.inputs), body_paths(robot)
     frames = [wheel.frame for _, wheel in named]
     found = []

@@ -74,7 +74,7 @@ class Live:
         self._joints = _joints(robot)
         self._lock = threading.Lock()
         self._speed = speed
-        # When on the clock, and at which time, the simulation that is shown began.
+        # Clock time and simulation time [s] at the beginning of the shown simulation.
         self._began: tuple[float, float] | None = None
         self._recorder = Recorder(self._forward)
         self.meshcat = Visualizer(window=self._recorder)
@@ -147,12 +147,12 @@ class Live:
         self.close()
 
     def _forward(self, command: bytes) -> None:
-        # What is drawn before there is a server waits in the recorder.
+        # Until the server exists, the recorder stores the commands.
         if hasattr(self, "_server"):
             self._server.send(command)
 
     def _asked(self, message: Any) -> None:
-        """Execute a browser's request: {"joints": {name: value}}, {"neutral": _}, {"random": _}."""
+        """Execute a request of a browser: {"joints": {name: value}}, "neutral" or "random"."""
         q = self.q.copy()
         if message.get("neutral"):
             q[7:] = self.robot.neutral()[7:]
@@ -168,7 +168,7 @@ class Live:
 
 
 def _joints(robot: Robot) -> list[dict[str, Any]]:
-    """Return name and range of the slider of every joint except wheels."""
+    """Return name and range of the slider of each joint except wheels."""
     model = robot.model
     found = []
     for joint in robot.joints:
@@ -189,14 +189,14 @@ def _joints(robot: Robot) -> list[dict[str, Any]]:
 
 
 class Server:
-    """Serves a page and keeps it up to date; it ends with its process."""
+    """Server of a page and its updates; it ends with its process."""
 
     def __init__(
         self,
         page: str,
-        scene: Callable[[], Iterable[bytes]],  # for a browser that has just come
-        asked: Callable[[object], None],  # takes what a browser sends
-        port: int,  # 0 for one that is free
+        scene: Callable[[], Iterable[bytes]],  # returns the commands for a new browser
+        asked: Callable[[object], None],  # is called with each message of a browser
+        port: int,  # 0 for a free port
     ) -> None:
         self.scene, self.asked = scene, asked
         self.state = "{}"
@@ -238,7 +238,7 @@ class Server:
         self._call(lambda: [client.send(message) for client in list(self.clients)])
 
     def update(self, state: str) -> None:
-        """Send a state to every browser; one that is slow skips those that are old by then."""
+        """Send a state to every browser; slow browsers skip states that are out of date."""
         self.state = state
         self._call(self._update_all)
 
@@ -247,29 +247,29 @@ class Server:
             client.update()
 
     def wait(self) -> None:
-        """Wait until it is closed, or until Ctrl-C."""
+        """Wait until the server is closed, or until Ctrl-C."""
         try:
-            # Without a timeout some platforms do not let Ctrl-C through.
+            # Some platforms do not handle Ctrl-C during a wait without timeout.
             while self._thread.is_alive():
                 self._thread.join(0.5)
         except KeyboardInterrupt:
             self.close()
 
     def close(self) -> None:
-        """End it."""
+        """Stop the server."""
         self._call(self._stop.set)
         self._thread.join(5.0)
 
     def _call(self, what: Callable[[], object]) -> None:
         if self._running and self._thread.is_alive():
-            with contextlib.suppress(RuntimeError):  # it has just been closed
+            with contextlib.suppress(RuntimeError):  # the server was just closed
                 self._loop.call_soon_threadsafe(what)
 
 
 def _listen(port: int) -> socket.socket:
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
-        if os.name == "posix":  # elsewhere it would let two listen on one port
+        if os.name == "posix":  # elsewhere the option would let two servers share a port
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((_HOST, port))
         listener.listen(128)
@@ -284,9 +284,9 @@ def _listen(port: int) -> socket.socket:
 
 
 class _Guarded(RequestHandler):
-    """Answers only to this machine's own names, so that no other site's page gets through."""
+    """Handler that accepts only this machine's names as host, to refuse pages of other sites."""
 
-    def initialize(self, hosts: set[str], **fields: object) -> None:
+    def initialize(self, hosts: set[str], **fields: Any) -> None:
         self._hosts = hosts
         self._fields = fields
 
@@ -305,7 +305,7 @@ class _Page(_Guarded):
 
 
 class _Socket(_Guarded, WebSocketHandler):
-    """Connection to one browser, which receives the newest state after the previous state."""
+    """Connection to one browser, which gets the newest state when the previous one has arrived."""
 
     _busy = False
     _behind = False
@@ -324,7 +324,7 @@ class _Socket(_Guarded, WebSocketHandler):
         self._fields["server"].clients.discard(self)
 
     def on_message(self, message: str | bytes) -> None:
-        # What no page of ours sends is passed over, and what is nested too deep ends it.
+        # Invalid messages are ignored, and too deeply nested messages close the connection.
         try:
             self._fields["server"].asked(json.loads(message))
         except (FflinError, ValueError, TypeError, AttributeError, ArithmeticError):

@@ -16,10 +16,10 @@ from fflin.base.writing import reason
 Color = tuple[float, float, float, float]
 Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 
-# Details smaller than this part of a mesh's extent are not drawn; it halves most CAD exports.
+# Details smaller than this fraction of a mesh's extent are dropped, which halves most CAD meshes.
 _RESOLUTION = 1.0 / 400.0
 
-# Above this many triangles the grid is made coarser until they are fewer.
+# Largest number of triangles; the grid is made coarser until a mesh has fewer.
 _LARGEST = 20_000
 
 
@@ -29,11 +29,11 @@ class Mesh:
 
     vertices: Array  # (V, 3) of float32
     faces: Indices  # (F, 3) of uint32
-    color: Color | None  # where the file says one
+    color: Color | None  # None without a colour in the file
 
 
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
-    """Read a mesh file, in its own unit of length, or raise ValueError where nothing is seen."""
+    """Read a mesh file in its own unit of length; raise ValueError if nothing is visible."""
     try:
         found = os.stat(path)
     except OSError as error:
@@ -43,7 +43,7 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
 
 @lru_cache(maxsize=256)
 def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
-    # Another time or size is another mesh.
+    # A changed time or size of the file is a new key of the cache, so a changed file is read again.
     parts = _colored(path) if path.suffix.lower() == ".dae" else []
     parts = parts or [(*_triangles(path), None)]
     corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
@@ -66,7 +66,7 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
 
 
 def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
-    """Return vertices, faces and colour of each part of a COLLADA file [m]; None if it is odd."""
+    """Return vertices [m], faces and colour of each part of a COLLADA file, [] if malformed."""
     import trimesh
 
     try:
@@ -108,7 +108,7 @@ def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    # The same triangle may be left many times.
+    # Several triangles may have become the same.
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(kept)]
     used, compact = np.unique(faces, return_inverse=True)

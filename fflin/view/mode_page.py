@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from fflin.analysis.modes import Mode, Modes
     from fflin.linear.model import LinearModel
 
-# Poses of a swing, the time that it takes on the screen [s], and how far it goes: until something
-# has turned by so many radians or moved by this share of the robot's size.
+# Number of poses in a period, and its duration on the screen [s]. The amplitude is limited by the
+# largest rotation [rad], and by the largest displacement relative to the robot's size.
 _PHASES, _PERIOD = 48, 2.0
 _ANGLE, _SHARE = 0.5, 0.14
 
@@ -38,7 +38,7 @@ _ANGLE, _SHARE = 0.5, 0.14
 def mode_page(
     robot: Robot, found: Modes, *, scene: str, tool: str | None
 ) -> tuple[str, tuple[str, ...]]:
-    """Return the page of a robot's vibrations, and what could not be drawn; see `visualize`."""
+    """Return the page of a robot's modes, and notes about missing drawings; see `visualize`."""
     lin = found.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
@@ -86,7 +86,7 @@ def mode_page(
 
 
 def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size: float) -> Array:
-    """Return poses (_PHASES, njoints - 1, 7) over a period, of x0 + Re(a shape exp(i phase))."""
+    """Return poses (_PHASES, njoints - 1, 7) over a period of x0 + Re(a shape exp(i phase))."""
     robot, half = state.robot, len(lin.x0) // 2
     data = robot.model.createData()
 
@@ -98,7 +98,7 @@ def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size
             found.append(body_poses(robot, data, state.to_pinocchio(x)[0]))
         return np.array(found)
 
-    # Of a small swing, what one of amplitude 1 would be.
+    # Displacement of the corners per unit amplitude, from a small amplitude.
     small = 1e-4
     rest = corner_points(drawing, body_poses(robot, data, lin.q))
     moved = np.array([corner_points(drawing, each) - rest for each in poses(small)])
@@ -112,7 +112,10 @@ def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size
 
 
 def _shape(mode: Mode, lin: LinearModel) -> list[tuple[str, str, float, float]]:
-    """Return name, unit, size and phase [deg] of the positions that move most; one has size 1."""
+    """Return name, unit, amplitude and phase [deg] of the positions with the largest amplitude.
+
+    The largest amplitude is 1.
+    """
     sizes, phases = np.abs(mode.shape), np.angle(mode.shape, deg=True)
     order = np.argsort(-sizes[: len(sizes) // 2].round(9), kind="stable")[:8].tolist()
     return [

@@ -1,4 +1,4 @@
-"""The page of a motion: the robots in the scene, and the panel of figures beside them."""
+"""The page of a motion: the robots in the scene, and the panel of numbers and plots."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ Moving: TypeAlias = "tuple[Drawing, Array]"
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
 
-# Length of the arrow of the largest force, and the way on which the camera goes along with the
-# base unless it is told otherwise, both in sizes of the robot.
+# Length of the arrow of the largest force, and the path length above which the camera follows the
+# base by default, both in robot sizes.
 ARROW, _FAR = 0.62, 20.0
 
 
@@ -59,7 +59,7 @@ def motion_page(
     target: Array | None,
     tool: str | None,
 ) -> tuple[str, tuple[str, ...]]:
-    """Return the page of a motion, and what could not be drawn; see `visualize`."""
+    """Return the page of a motion, and notes about missing drawings; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
     t, state = motion.t[shown], chart_of(robot, motion)
     film = play_back(robot, state, t, motion.q[shown], motion.u[shown], tool)
@@ -86,7 +86,7 @@ def motion_page(
         clips += each.tracks(t - t[0], poses)
     window.send(Animation(clips))
 
-    # The robot of each phase, if it is known: a captured payload is a part of it.
+    # Robots of the phases, if known. After a capture, the robot includes the payload.
     flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
     flown = flown or [robot] * max(1, len(motion.phases))
     names = [each.name.replace("+", " + ") for each in flown]
@@ -105,7 +105,7 @@ def motion_page(
     points = _points(film, size, (drawing, goals), held.values())
     info["floor"][2] = float(points[:, 2].min())
     if follow is None:
-        # With all of a long path in view, the robot would be a dot.
+        # If a long path were in view as a whole, the robot would be a dot.
         follow = bool(np.ptp(points, axis=0).max() > _FAR * size)
     if follow:
         points = frame_points(drawing, film, size, follow=True)
@@ -135,7 +135,7 @@ def _ghosts(
     goals: Array,
     sent: set[str],
 ) -> list[Moving]:
-    """Draw the robot at the target and at the linear prediction; return those that move."""
+    """Draw the robot at the target and at the linear prediction; return the moving drawings."""
     robot, moving = state.robot, list[Moving]()
     if len(goals):
         ghost = Drawing(robot, scenery["target"], "ghost", sent)
@@ -158,12 +158,12 @@ def _points(film: Playback, size: float, goal: Moving, held: Iterable[Moving]) -
 
 
 def _step(rows: Array) -> int:
-    """Return the step with which about 24 of the rows are chosen."""
+    """Return the step between rows that selects about 24 of them."""
     return max(1, len(rows) // 24)
 
 
 def chart_of(robot: Robot, motion: Motion) -> StateMap:
-    """Return the map between a motion's states and configurations."""
+    """Return the state map with a motion's frame and reference."""
     return StateMap(robot, reference=motion.reference, frame=cast("Frame", motion.frame))
 
 
@@ -175,7 +175,7 @@ def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
 
 
 def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool = False) -> Array:
-    """Return corners of all that moves and tips of forces (M, 3) at some frames, for a camera."""
+    """Return points (M, 3) for the camera: body corners and tips of forces at some frames."""
     chosen = np.unique(np.linspace(0, len(film.t) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
@@ -190,7 +190,7 @@ def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool 
 def marks(
     robot: Robot, film: Playback, tool: str | None, size: float, goals: Array
 ) -> dict[str, Any]:
-    """Return trails, also of moving goals (N, njoints - 1, 7), wrenches and plumes."""
+    """Return the trails (also of a moving target `goals`), wrenches and plumes of a page."""
     trails, followed = [("centre of mass", COM_COLOR, film.com)], {}
     if len(goals) > 1:
         trails, followed = [("base", COM_COLOR, film.poses[:, 0, :3])], {"base": goals[:, 0, :3]}

@@ -1,4 +1,4 @@
-"""The page that shows a scene in one self-contained HTML file, with its stage and its commands."""
+"""Self-contained HTML page of a scene: its parameters and its meshcat commands."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from fflin.view.scene import Drawing, body_paths
 
 Lowered = dict[str, Any]
 
-# Where one looks from, and where the sun stands, in world axes.
+# Directions to the camera and to the sun, in world axes.
 VIEWS = {"space": (1.0, -0.62, 0.50), "lab": (1.0, -0.62, 0.36)}
 SUN = (0.62, -0.78, 0.62)
 
@@ -38,9 +38,12 @@ _SCRIPTS = (
 
 
 def build_page(info: dict[str, Any], commands: Iterable[bytes] = (), connect: str = "") -> str:
-    """Build the page of what scripts show and `Recorder.commands`; it may `connect` there alone."""
+    """Build the page from `info` for its scripts and from the commands of a `Recorder`.
+
+    The page may open connections only to `connect`.
+    """
     info = {**info, "commands": [_base64(command) for command in commands]}
-    # In a script element nothing but its own end tag and a comment's start is special.
+    # In a script element, only its end tag and the start of a comment are special.
     data = json.dumps(info, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     fields = {
         "title": escape(info["title"]),
@@ -59,7 +62,7 @@ def build_page(info: dict[str, Any], commands: Iterable[bytes] = (), connect: st
 
 
 def packed(array: Array) -> str:
-    """Return an array as the page's `floats` reads it, in single precision."""
+    """Encode an array in single precision for the function `floats` of the page."""
     return _base64(np.ascontiguousarray(array, dtype="<f4").tobytes())
 
 
@@ -76,7 +79,7 @@ def _asset(name: str) -> str:
 def _scripts() -> str:
     body = "\n".join(_asset(f"{name}.js") for name in _SCRIPTS)
     body = re.sub(r"(?m)^ *(//.*\n)?", "", body)  # indentation and comments
-    # Names of our own, beside those of meshcat's bundle.
+    # A function scope separates these names from the names in meshcat's bundle.
     return f'(() => {{\n"use strict";\nconst THREE = MeshCat.THREE;\n{body}\nmain();\n}})();'
 
 
@@ -88,7 +91,7 @@ def _meshcat() -> str:
 
 
 class Recorder:
-    """Window of a meshcat.Visualizer that remembers the scene, and forwards each command."""
+    """Window for a meshcat.Visualizer that records the scene and forwards each command."""
 
     def __init__(self, forward: Callable[[bytes], None] | None = None) -> None:
         self.web_url = ""
@@ -98,10 +101,10 @@ class Recorder:
         self._animation: Lowered | None = None
 
     def send(self, command: Any) -> None:
-        """Keep a meshcat command."""
+        """Record and forward a meshcat command."""
         lowered = command.lower()
         kind, path = lowered["type"], lowered.get("path", "")
-        # The browser makes nothing of empty parts of a path.
+        # The browser ignores empty parts of a path.
         path = "/" + "/".join(part for part in path.split("/") if part)
         if kind == "delete":
             below = path.rstrip("/") + "/"
@@ -116,19 +119,19 @@ class Recorder:
             self._forward(_message(lowered))
 
     def commands(self) -> Iterator[bytes]:
-        """Yield the messages that build the scene anew, as meshcat's page takes them."""
+        """Yield the messages with which meshcat's page builds the recorded scene."""
         for node in list(self._nodes.values()):
-            # An object replaces the one before it, so it comes ahead of what changes it.
+            # An object replaces the previous object, so it comes before its properties.
             for key in sorted(node, key=lambda key: key != "set_object "):
                 yield _message(node[key])
         if self._animation:
             yield _message(self._animation)
 
     def wait(self) -> None:
-        """Do nothing: nobody has to connect."""
+        """Do nothing, because no browser has to connect."""
 
     def close(self) -> None:
-        """Do nothing: there is nothing open."""
+        """Do nothing, because nothing is open."""
 
 
 def _message(lowered: Lowered) -> bytes:
@@ -145,7 +148,7 @@ def subtitle(robot: Robot) -> str:
 
 
 def rounded(points: Array, size: float) -> list[list[float]]:
-    """Return points (M, 3) as they are sent: as exact as a robot of that size needs."""
+    """Round points (M, 3) to the digits that a robot of that size [m] needs."""
     digits = max(4, 4 - math.floor(math.log10(size)))
     found: list[list[float]] = points.round(digits).tolist()
     return found
@@ -181,7 +184,7 @@ def stage_info(
     sun, direction, orbit = np.array(SUN), np.array(VIEWS[scene]), dict[str, Any]()
     field = field_of(robot, frame_of(robot, frame)) if scene == "space" else None
     if field and robot.orbit:
-        # Up is away from the body, and x along the orbit.
+        # z is away from the central body, and x along the orbit.
         radial, along, normal = field.axes.T
         sun, direction = (along * x + normal * y + radial * z for x, y, z in (sun, direction))
         far = robot.orbit.radius / robot.orbit.body_radius

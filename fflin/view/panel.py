@@ -16,15 +16,15 @@ from fflin.view.page import packed
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
-# What is below this, in SI units, is rounding.
+# Values below this, in SI units, are rounding errors.
 _NOTHING = 1e-14
 
-# Nor is a line drawn that is below this share of the largest of its plot.
+# Lines below this fraction of the largest line of their plot are not drawn.
 _UNSEEN = 1e-6
 
 _NONE = np.zeros(0)
 
-# Titles of states and inputs of a group and a unit; in a family a name has one colour.
+# {(group, unit): title of its plot}. In plots of one dictionary, a name has one colour.
 _CHARTS: tuple[dict[tuple[str, str], str], ...] = (
     {("tau_b", "N m"): "base torque"},
     {("F_b", "N"): "base force"},
@@ -47,7 +47,7 @@ _CHARTS: tuple[dict[tuple[str, str], str], ...] = (
 
 
 def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
-    """Return {what: (unit, values (N,))}, how far q (N, nq) is from targets.
+    """Return {quantity: (unit, errors (N,))} of q (N, nq) from the target.
 
     Wheels and modes are left out.
     """
@@ -75,7 +75,7 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
 
 
 def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, Any]:
-    """Return readouts and plots of a page's rows (N,), with errors where it has targets (k, nq)."""
+    """Return the readouts and plots of the rows `shown`, with errors from the target (k, nq)."""
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
     of = "{} error" if len(target) else "{} change"
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
@@ -85,7 +85,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
         if values.any()
     ]
     readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
-    if len(motion.com_drift):  # a file may not tell
+    if len(motion.com_drift):  # it may be missing in a file
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
     lines = _lines(robot, motion, shown, followed=len(target) > 1)
     for family, charts in enumerate(_CHARTS):
@@ -98,7 +98,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
                 if size > _UNSEEN * max(sizes)
             ]
             plot = _plot(title, key[1], seen, family)
-            # Of rates their limits alone are of interest.
+            # Plots of rates are shown only if a limit is near.
             if any(each["limits"] or not title.endswith("rates") for each in plot["lines"]):
                 plots.append(plot)
     return {
@@ -115,7 +115,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
 def _lines(
     robot: Robot, motion: Motion, shown: Array, *, followed: bool
 ) -> dict[tuple[str, str], list[Curve]]:
-    """Return the curves that are not zero all along, at the rows shown, by group and unit."""
+    """Return the curves at the rows `shown` that are not always zero, by (group, unit)."""
     found: dict[tuple[str, str], list[Curve]] = {}
     for each in curves(motion, robot.wheels):
         reference = each.reference[shown] if followed and each.reference is not None else None
@@ -126,7 +126,7 @@ def _lines(
 
 
 def _size(curve: Curve) -> float:
-    """Return the largest of a curve's values."""
+    """Return the largest magnitude of a curve."""
     rows = curve.values if curve.reference is None else (*curve.values, *curve.reference)
     return float(np.abs(rows).max())
 
@@ -134,7 +134,7 @@ def _size(curve: Curve) -> float:
 def _plot(
     title: str, unit: str, lines: list[tuple[str, Curve]], family: int = -1
 ) -> dict[str, Any]:
-    """Return a plot of labelled curves, with those limits of each that it comes near."""
+    """Return a plot of labelled curves, with the limits that a curve comes near."""
     return {
         "title": title,
         "unit": unit,

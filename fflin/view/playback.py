@@ -1,4 +1,4 @@
-"""Data of an animation: poses, trails and forces of a motion, and the payloads that it captures."""
+"""Data of an animation: poses, trails and forces of a motion, and its captured payloads."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from fflin.simulation.motion import Motion
 from fflin.simulation.plant import Plant
 from fflin.view.shapes import bendings
 
-# Steps of the way on which a payload came: at most so long [s], and so much of its swing [rad].
+# Largest step [s] of a payload's flight before capture, and largest phase of its swing [rad].
 _STEP, _SWING = 0.05, 0.3
 
-# More frames than this and a file grows for nothing that an eye could see.
+# Largest number of frames; more would enlarge the file without a visible effect.
 _MOST_FRAMES = 3000
 
 
@@ -32,8 +32,8 @@ _MOST_FRAMES = 3000
 class Playback:
     """Poses, trails and forces of a motion at N frames."""
 
-    t: Array  # (N,) [s]; each is one of the motion's own, so that no pose is interpolated
-    poses: Array  # (N, njoints - 1, 7), x, y, z and quaternion of every joint's frame in the world
+    t: Array  # (N,) [s]; each is a time of the motion, so that no pose is interpolated
+    poses: Array  # (N, njoints - 1, 7): x, y, z and quaternion of each joint's frame in the world
     com: Array  # (N, 3) [m]
     tool: Array  # (N, 3) origin of the tool [m]
     force: Array  # (N, 3) on the base in world axes [N]
@@ -42,7 +42,7 @@ class Playback:
 
 
 def frame_indices(t: Array, fps: float, speed: float) -> Array:
-    """Return which samples of a motion (N,) [s] to show: those nearest to a film's frames."""
+    """Return the indices of the samples at t (N,) [s] that are nearest to a film's frames."""
     duration = float(t[-1] - t[0])
     count = min(round(duration * fps / speed), len(t) - 1, _MOST_FRAMES)
     wanted = np.linspace(t[0], t[-1], max(count, 1) + 1)
@@ -53,7 +53,7 @@ def frame_indices(t: Array, fps: float, speed: float) -> Array:
 
 
 def default_tool(robot: Robot) -> str | None:
-    """Return the frame taken for the tool: "tool", or the last link of the longest chain."""
+    """Return the name of the tool frame: "tool", or the last link of the longest chain."""
     model = robot.model
     if robot.n == 0:
         return None
@@ -70,9 +70,9 @@ def default_tool(robot: Robot) -> str | None:
 
 
 def body_poses(robot: Robot, data: pin.Data, q: Array) -> Array:
-    """Return the pose (njoints - 1, 7) of every joint's frame at q (nq,).
+    """Return the poses (njoints - 1, 7) of all joint frames at q (nq,).
 
-    The pose of the first mode of a flexible appendage is that of its bent frame.
+    The first mode of a flexible appendage has the pose of the appendage's bent frame.
     """
     pin.forwardKinematics(robot.model, data, q)
     poses = np.array([pin.SE3ToXYZQUAT(placement) for placement in data.oMi.tolist()[ROOT:]])
@@ -84,7 +84,7 @@ def body_poses(robot: Robot, data: pin.Data, q: Array) -> Array:
 def play_back(
     robot: Robot, state: StateMap, t: Array, q: Array, u: Array, tool: str | None
 ) -> Playback:
-    """Compute what is shown of rows of a motion; the state's frame says a wrench's axes."""
+    """Compute the data of an animation from rows of a motion; wrenches are in the state's frame."""
     model, data = robot.model, robot.model.createData()
     tool_id = frame_index(model, tool) if tool else None
     groups = Actuation(state).groups
@@ -109,7 +109,7 @@ def play_back(
 
 
 def payloads(motion: Motion, shown: Array) -> Iterator[tuple[Capture, Array]]:
-    """Yield what is caught and its poses (N, njoints - 1, 7) at the rows that are shown."""
+    """Yield each capture and the poses (N, njoints - 1, 7) of its payload at the rows `shown`."""
     parts = motion._phases
     first = np.cumsum([0, *(len(part.t) if isinstance(part, Motion) else 0 for part in parts)])
     for k, caught in enumerate(parts):
@@ -124,13 +124,13 @@ def payloads(motion: Motion, shown: Array) -> Iterator[tuple[Capture, Array]]:
 
 
 def _flight(caught: Capture, frame: Any, t: Array) -> list[Array]:
-    """Return the poses of a payload at times before it is caught [s], as it flies undamped."""
+    """Return the poses of an undamped, free payload at times [s] before its capture."""
     payload = caught.payload.replace(damping=0.0)
     data, state = payload.create_data(), StateMap(payload, frame=frame)
     q, v, plant, now, poses = caught.payload_q, caught.payload_v, Plant(state), 0.0, list[Array]()
     none = np.zeros(len(plant.actuation.names))
     softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
-    rate = np.sqrt(softness @ payload.springs.stiffness)  # no swing is faster
+    rate = np.sqrt(softness @ payload.springs.stiffness)  # [rad/s] upper bound of its frequencies
     for time in t[::-1].tolist():
         steps = math.ceil((now - time) * max(1.0 / _STEP, rate / _SWING))
         for _ in range(steps):

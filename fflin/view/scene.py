@@ -19,23 +19,23 @@ from fflin.view.meshes import Indices, Mesh, load_mesh
 from fflin.view.shapes import PLAIN, Shape, bendings, shapes
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore", DeprecationWarning)  # of what meshcat imports, not of ours
+    warnings.simplefilter("ignore", DeprecationWarning)  # from packages that meshcat imports
     from meshcat import Visualizer
     from meshcat.commands import SetAnimation, SetTransform
     from meshcat.geometry import Mesh as MeshcatMesh
 
-# three.js draws cylinders along y, URDF along z.
+# Cylinders are along y in three.js, and along z in URDF.
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 
-# Extension types of msgpack-lite, which the page decodes to typed arrays.
+# Extension types of msgpack-lite, which the page decodes as typed arrays.
 _TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
 
-# Stands for a mesh that the page has already.
+# Placeholder for a mesh that the page has already.
 _ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 
 class _Piece(MeshcatMesh):
-    """A three.js mesh as it is sent; its material, and geometry sent before, are in the page."""
+    """three.js mesh in the form that is sent; the page has its material and earlier geometry."""
 
     def __init__(
         self, geometry: dict[str, object], matrix: Array, about: dict[str, object]
@@ -59,12 +59,12 @@ class _Piece(MeshcatMesh):
 
 
 def body_paths(robot: Robot) -> list[str]:
-    """Return the name of the node of each body, in the order of Pinocchio's joints from 1 on."""
+    """Return the node name of each body, in the order of Pinocchio's joints from 1 on."""
     return [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
 
 
 class Drawing:
-    """A robot drawn below a node of a meshcat scene, whose children are named as its joints."""
+    """Drawing of a robot below a node of a meshcat scene, with a child node for each joint."""
 
     def __init__(
         self,
@@ -77,8 +77,8 @@ class Drawing:
         self.robot = robot
         self._visualizer = visualizer
         self._paths = body_paths(robot)
-        sent = set() if sent is None else sent  # meshes that the page has, of these too
-        found, self.notes = shapes(robot)  # and what could not be drawn
+        sent = set() if sent is None else sent  # meshes that were sent to the page, updated below
+        found, self.notes = shapes(robot)  # shapes, and notes about missing drawings
         self.links = dict[str, list[float]]()  # {name: mass [kg] and pose on its joint}
         corners: dict[int, list[Array]] = {}
         for index, shape in enumerate(found):
@@ -102,13 +102,13 @@ class Drawing:
         ]
 
     def place(self, poses: Array) -> None:
-        """Put every body at its pose, (njoints - 1, 7) of x, y, z and quaternion x, y, z, w."""
+        """Set the poses of all bodies: (njoints - 1, 7) with x, y, z and quaternion x, y, z, w."""
         for path, pose in zip(self._paths, poses, strict=True):
             node = self._visualizer[path]
             node.window.send(SetTransform(pin.XYZQUATToSE3(pose).homogeneous, node.path))
 
     def tracks(self, t: Array, poses: Array) -> list[dict[str, Any]]:
-        """Return the animation of every body over times t (N,), poses (N, njoints - 1, 7)."""
+        """Return the animation of all bodies by times t (N,) and poses (N, njoints - 1, 7)."""
         times = typed(t)
         clips = []
         for index, path in enumerate(self._paths):
@@ -124,7 +124,7 @@ class Drawing:
 def _link(robot: Robot, shape: Shape) -> list[float]:
     """Return the mass [kg] of a shape's link, and its pose (7,) in the joint's frame."""
     model, pieces = robot.model, robot.pieces
-    if not model.existFrame(shape.link, pin.FrameType.BODY):  # a body with boxes of its inertia
+    if not model.existFrame(shape.link, pin.FrameType.BODY):  # a body drawn as a box of its inertia
         mass, at = model.inertias[shape.joint].mass, pin.SE3.Identity()
     else:
         known = pieces.get(shape.link) or robot.links.get(shape.link)
@@ -148,12 +148,12 @@ class Animation(SetAnimation):
 
 
 def typed(array: Array | Indices, kind: str = "<f4") -> Any:
-    """Pack an array so that the page has it as a typed one."""
+    """Pack an array so that the page decodes it as a typed array."""
     return umsgpack.Ext(_TYPED[kind][0], np.ascontiguousarray(array, dtype=kind).tobytes())
 
 
 def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
-    """Return geometry, matrix, colour and the bounding box's two corners of each piece."""
+    """Return geometry, matrix, colour, and two corners of the bounding box of each piece."""
     unit = np.eye(4)
     if shape.kind == "mesh":
         assert shape.mesh is not None
@@ -209,7 +209,7 @@ def _bounds(points: Array) -> Array:
 
 
 def _box_corners(matrix: Array, box: Array) -> Array:
-    """Return the eight corners (8, 3) of a box (2, 3) that a matrix (4, 4) puts in its place."""
+    """Return the corners (8, 3) of a box (2, 3) that is transformed by a matrix (4, 4)."""
     choice = np.array([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)])
     corners = np.take_along_axis(box, choice, axis=0)
     return corners @ matrix[:3, :3].T + matrix[:3, 3]

@@ -1,4 +1,4 @@
-"""Shapes of a robot: visual elements of its URDF, bent appendages, or boxes of its inertias."""
+"""Shapes of a robot: visual elements of its URDF, bent appendages, or boxes from inertias."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from fflin.robot.urdf.reader import expand, first_xacro, read_document
 from fflin.robot.urdf.xml import Element, named, parse
 from fflin.view.meshes import Color, load_mesh
 
-# Where a URDF names no colour.
+# Colour of a shape without a colour in the URDF.
 PLAIN: Color = (0.72, 0.74, 0.77, 1.0)
 
-_DENSITY = 1000.0  # [kg/m^3] of the ball that stands for a mass
+_DENSITY = 1000.0  # [kg/m^3] density of a ball that represents a mass
 
 
 @dataclass(frozen=True)
 class Shape:
     """One visible piece of a robot, rigidly fixed to the body behind one joint."""
 
-    joint: int  # of Pinocchio, that moves it
+    joint: int  # Pinocchio joint that moves the shape
     kind: str  # "box", "sphere", "cylinder", "capsule" or "mesh"
     size: tuple[float, ...]  # side lengths; radius; radius and length [m]; or a mesh's scale
     placement: pin.SE3  # in the joint's frame; the axis of a cylinder is z
-    color: Color | None = PLAIN  # red, green, blue, opacity; None where a mesh brings its own
-    finish: str = ""  # name of its material, which may tell gold from paint
+    color: Color | None = PLAIN  # red, green, blue, opacity; None for the colours of a mesh file
+    finish: str = ""  # name of the material, which decides how metallic the shape looks
     mesh: Path | None = None
-    link: str = ""  # or the body, where inertias are drawn
+    link: str = ""  # name of the link, or of the body if its inertia is drawn
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
-    """Return a robot's pieces, of its URDF or boxes of inertias, and what could not be drawn."""
+    """Return a robot's shapes, from its URDF or its inertias, and notes about missing drawings."""
     notes: list[str] = []
     found = list(_visuals(robot, notes)) if robot.urdf else []
     if not found:
@@ -61,7 +61,7 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
 
 
 def _carried(robot: Robot, prefix: str, other: Robot, shape: Shape) -> Shape:
-    """Return a shape of what a robot has grasped as one of that robot."""
+    """Convert a shape of a grasped payload to a shape of the robot that carries it."""
     held_by = find_frame(robot.model, prefix)
     if shape.joint > ROOT:
         held_by = find_joint(robot.model, f"{prefix}.{other.model.names[shape.joint]}")
@@ -186,7 +186,8 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
         moments, axes = np.linalg.eigh(inertia.inertia)
         if np.linalg.det(axes) < 0.0:
             axes[:, 0] = -axes[:, 0]
-        # A uniform box has moments m (b^2 + c^2)/12; published inertias may be of no real body.
+        # A uniform box has moments m (b^2 + c^2)/12. Inertias of files may be impossible, so
+        # negative squares are set to zero.
         squares = 6.0 / inertia.mass * (moments.sum() - 2.0 * moments)
         sides = np.sqrt(np.maximum(squares, 0.0))
         sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
@@ -197,17 +198,17 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
 
 
 class Bending(NamedTuple):
-    """Motion of an appendage's links by its modes, to first order: a rotation about its frame.
+    """First-order motion of an appendage's links by its modes: a rotation about its frame.
 
-    Of all rotations, it fits the mode shapes best that have the participation of the modes.
+    The rotation is the best fit to mode shapes with the given participation.
     """
 
-    node: int  # Pinocchio joint of the first mode, whose node of the scene carries the links
+    node: int  # Pinocchio joint of the first mode; its scene node carries the links
     carrier: int  # Pinocchio joint
-    frame: pin.SE3  # on the carrier
-    modes: list[int]  # in q
-    twist: Array  # (6, k) for a unit of q: translation over rotation
-    center: Array  # (3,) of a ball that stands for the links, in the frame
+    frame: pin.SE3  # placement on the carrier
+    modes: list[int]  # indices in q
+    twist: Array  # (6, k) per unit of q: translation before rotation
+    center: Array  # (3,) position in the frame of a ball that represents the links
 
     def placement(self, data: pin.Data, q: Array) -> pin.SE3:
         """Return the placement of the bent frame in the world."""
@@ -217,7 +218,7 @@ class Bending(NamedTuple):
 
 @lru_cache(maxsize=4)
 def bendings(robot: Robot) -> dict[str, Bending]:
-    """Return {title: bending} of the flexible appendages of a robot."""
+    """Return {title: bending} for the flexible appendages of a robot."""
     found = {}
     for item in robot.appendages:
         if isinstance(item, FlexibleAppendage):
@@ -248,7 +249,7 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
     carried = {child for links in children.values() for child in links}
     found: dict[str, Bending] = {}
     for item in robot.appendages:
-        if isinstance(item, FlexibleAppendage) and item.frame in carried:  # so not the root link
+        if isinstance(item, FlexibleAppendage) and item.frame in carried:  # excludes the root link
             bending, links = bendings(robot)[item.title], [item.frame]
             for link in links:
                 if robot.model.existFrame(link) and (
@@ -269,7 +270,7 @@ def node_of(frame: pin.Frame, bent: dict[str, Bending]) -> tuple[int, pin.SE3]:
 def balls(
     robot: Robot, bent: dict[str, Bending]
 ) -> list[tuple[int, str, tuple[float, ...], Array]]:
-    """Return Pinocchio joint, kind, size [m] and position of what stands for other appendages."""
+    """Return joint, kind, size [m] and position of shapes that represent undrawn appendages."""
     found: list[tuple[int, str, tuple[float, ...], Array]] = []
     for item in robot.appendages:
         if isinstance(item, Slosh):
@@ -280,7 +281,7 @@ def balls(
             bending = bendings(robot)[item.title]
             mass = float(np.square(item.participation[:3, 0]).sum())
             size = _radius(mass or 1.0)
-            # The rotation of a box is seen.
+            # Without mass, a box is drawn, because its rotation is visible.
             kind, sides = ("sphere", (size,)) if mass else ("box", (size,) * 3)
             found.append((bending.node, kind, sides, bending.center))
     return found

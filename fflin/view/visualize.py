@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 SCENES = ("space", "lab")
 
-# A picture with its panel, and one of several without.
+# Sizes [px] of a picture with its panel, of a picture in a strip, and of a GIF.
 _PICTURE, _STRIP, _GIF = (1280, 720), (640, 480), (640, 400)
 
-# A motion that takes longer than this to watch is shown faster.
+# Longest duration of an animation [s]; longer motions are shown faster.
 _LONGEST = 60.0
 
 
@@ -218,7 +218,7 @@ def _temporary(name: str) -> Path:
 
 
 def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, Path]:
-    """Return {ending: path} of the files that are named, or raise where one cannot be written."""
+    """Return {ending: path} of the given files, or raise an error if one cannot be written."""
     outputs = {}
     for ending, file in files.items():
         if file is None:
@@ -237,13 +237,13 @@ def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, 
 
 
 def check_tool(robot: Robot, tool: str | None) -> None:
-    """Raise UnknownNameError where there is no such frame."""
+    """Raise `UnknownNameError` if the robot has no frame `tool`."""
     if tool is not None:
         find_frame(robot.model, tool)
 
 
 def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float, float]:
-    """Return frames per second and speed, one that suits the duration [s] where it is None."""
+    """Return the checked fps and speed; for speed=None, a speed that suits the duration [s]."""
     fps = number("fps", fps)
     if not 0.0 < fps <= 240.0:
         raise InputError(f"fps is {fps:g}, expected more than 0 and at most 240")
@@ -283,7 +283,7 @@ def _configuration(robot: Robot, name: str, value: Array) -> Array:
 
 
 def check_times(times: Sequence[float], start: float, end: float) -> list[float]:
-    """Return the times [s] of pictures, or raise where one is not in the motion."""
+    """Return the times [s] of pictures, or raise an error if one is outside the motion."""
     times = [number("a time", time) for time in times]
     if not times or not all(start <= time <= end for time in times):
         raise InputError(f"times are {times}, expected times from {start:g} to {end:g} s")
@@ -299,9 +299,9 @@ def _pictures(
 
     start, end = float(motion.t[0]), float(motion.t[-1])
     if times is None:
-        # What settles moves most at first, what follows a trajectory all the time.
-        shares = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
-        times = [start + share * (end - start) for share in shares]
+        # A motion that settles is fastest at the beginning; tracking moves all the time.
+        fractions = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
+        times = [start + fraction * (end - start) for fraction in fractions]
     times = check_times(times, start, end)
     contents = {}
     with tempfile.TemporaryDirectory(prefix="fflin-") as folder:

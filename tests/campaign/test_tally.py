@@ -7,8 +7,17 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob
-from fflin.campaign.statistics import KINDS, Outcome, RunStatistics, kinds_of, marks_of, outcome_of
+from fflin.campaign.statistics import (
+    KINDS,
+    LOOK,
+    Outcome,
+    RunStatistics,
+    kinds_of,
+    marks_of,
+    outcome_of,
+)
 from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
 from fflin.kernel.loop import take
 from fflin.kernel.tree import LANES
@@ -164,3 +173,41 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
     assert np.isfinite(ends[0]["settle"]).any() and (ends[0]["largest"][:, :2] > 0.1).all()
     for name, one in ends[0].items():
         assert np.array_equal(one, ends[1][name])
+
+
+class Halved:
+    """Ends a run when its position error has fallen to half of the one at the start."""
+
+    FIELDS = ("end", "stop")
+
+    @staticmethod
+    def over(first, e):
+        return np.linalg.norm(e[:, 3:6], axis=1) <= 0.5 * np.linalg.norm(first[:, 3:6], axis=1)
+
+    def figures(self, runs):
+        return {key: runs[key] for key in self.FIELDS}
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+def test_a_stop_condition_ends_each_run_where_it_is_first_looked_at_and_met(engine):
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    inputs = {"tau_b": 1e6, "F_b.x": 1.0, "F_b.y": 100.0, "F_b.z": 1e4}
+    gain = fflin.lqr(lin, 1.0, inputs)
+    policy, options = fflin.StateFeedback(lin, gain.K), {"duration": 80.0, "dt": 0.05, "every": 1}
+    starts = np.zeros((10, len(lin.x0)))
+    starts[:9, 3:6] = 0.2 * np.eye(3).repeat(3, axis=0) + 0.01 * np.arange(9)[:, None]
+    starts[9, 5] = 1e-3
+    job = CampaignJob(robot, policy, None, 0, engine, options, Halved())
+    found = job.run(Draws(starts), 0).arrays
+    ends = []
+    for start in starts:
+        x = job.replay(start).x[::LOOK]
+        met = np.linalg.norm(x[:, 3:6], axis=1) <= 0.5 * np.linalg.norm(start[3:6])
+        ends.append(met.argmax() * LOOK * 0.05 if met.any() else 80.0)
+    assert found["end"] == pytest.approx(ends)
+    assert np.array_equal(found["stop"], np.where(np.array(ends) < 80.0, 3.0, 0.0))
+    assert len({*ends}) > 2 and min(ends) < 80.0

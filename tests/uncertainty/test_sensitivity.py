@@ -192,7 +192,8 @@ def test_links_that_are_fixed_to_each_other_have_parameters_of_their_own():
     parts = S["link_3.density"].dB + S["hand.density"].dB + S["target.density"].dB
     assert np.abs(parts - S["joint_3.density"].dB).max() < 1e-12 * np.abs(parts).max()
     heavier = S.along({"target.mass": 5.0, "hand.*": 0.0})
-    assert np.allclose(heavier.dB, 5.0 * S["target.mass"].dB, rtol=1e-13, atol=0.0)
+    alone = 5.0 * S["target.mass"].dB  # differs by rounding: BLAS adds in another order
+    assert np.abs(heavier.dB - alone).max() < 1e-12 * np.abs(alone).max()
     assert S.parameters["target.mass"].value == pytest.approx(50.0)
     locked = fflin.sensitivity(fflin.linearize(fflin.load("servicer_7dof", lock=["joint_3"])))
     assert locked.parameters["link_3.mass"].value == pytest.approx(9.5)

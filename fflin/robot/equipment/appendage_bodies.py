@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -212,7 +212,7 @@ class _Ball(NamedTuple):
     r: Array  # (3,) rotation part of the participation about the ball's centre
     center: Array
     mass: float  # [kg] mass with which no rotor is needed
-    moment: float  # [kg m^2]
+    moment: float  # [kg m^2] moment of inertia of the ball
     lever: float  # [m] distance from the appendage's frame; 0 if it is too small for a rotation
 
     @property
@@ -243,7 +243,7 @@ class _Ball(NamedTuple):
             axis, scale = w / turning, turning
             origin: Array = self.center + np.cross(w, v) / turning**2
             pitch = float(v @ w) / turning**2
-            motion: Any = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
+            motion: pin.JointModel = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
         else:
             axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
             origin, motion = self.center, pin.JointModelPZ()

@@ -1,7 +1,7 @@
 """Wheels and other bodies on new joints, subtracted from the links whose inertia includes them."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -33,7 +33,7 @@ class Mounted(NamedTuple):
     joint: Joint
     carrier: int | str
     placement: pin.SE3
-    motion: Any  # Pinocchio's joint model
+    motion: pin.JointModel
     inertia: pin.Inertia
     armature: float = 0.0
 
@@ -53,7 +53,7 @@ def inertia_of(mass: float, lever: Array, inertia: Array) -> pin.Inertia:
 
 
 def difference(body: pin.Inertia, part: pin.Inertia) -> pin.Inertia:
-    """Return a body without a part of it, both in the same frame."""
+    """Return a body minus one of its parts; both are in the same frame."""
     mass = body.mass - part.mass
     if part.mass == 0.0:
         return inertia_of(mass, body.lever, body.inertia - part.inertia)
@@ -144,7 +144,7 @@ def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
 
 
 def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[int, Array], ...]:
-    """Return the momentum (3,) [N m s] of wheels without inertia on each joint, in its frame."""
+    """Return (joint, momentum (3,) [N m s] in its frame) of the wheels without inertia."""
     stored: dict[int, Array] = {}
     for _, wheel in named_wheels(inputs):
         if wheel.momentum:

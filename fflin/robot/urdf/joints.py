@@ -218,7 +218,7 @@ class Urdf(NamedTuple):
 
 
 def read_description(root: Element) -> Urdf:
-    """Check the elements of a URDF."""
+    """Check the elements of a URDF, and return its content."""
     _check_root(root)
     links = _by_name(read_link, root.find_all("link"))
     if not links:

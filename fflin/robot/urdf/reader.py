@@ -57,7 +57,7 @@ class Advice(NamedTuple):
 
 
 class Description(NamedTuple):
-    """Robot as its file describes it."""
+    """Content of a robot's file."""
 
     model: pin.Model  # free-flyer root joint, zero gravity; mimic joints move freely in it
     sha256: str  # digest of the file that was read, without files that a xacro includes
