@@ -19,11 +19,11 @@ from fflin.analysis.ranks import (
     without_rounding,
 )
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.validation import Array, Values, instance
+from fflin.base.validation import Array, Indices, Values, instance
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    pass
 
 # Springs or dampers with a larger relative asymmetry count as not symmetric.
 _SYMMETRIC = 1e-8
@@ -81,7 +81,7 @@ def rate_matrix(lin: LinearModel) -> Array:
     return (lin.A - np.eye(len(lin.A))) / lin.dt if lin.dt else lin.A
 
 
-def floating_inertia(M: Array, kept: NDArray[np.intp], others: NDArray[np.intp]) -> Array:
+def floating_inertia(M: Array, kept: Indices, others: Indices) -> Array:
     """Return the inertia of the kept coordinates with the others free: a Schur complement of M."""
     across = M[np.ix_(others, kept)]
     return M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(others, others)], across)
@@ -213,12 +213,12 @@ class ConservedMomenta:
     momenta: Array
     coordinates: Array
     # (r,): kept coordinates. They and their rates determine all other states if L1 x = L2 x = 0.
-    kept: NDArray[np.intp]
+    kept: Indices
     T: Array  # (nx, 2 r): state with L1 x = L2 x = 0 from the kept coordinates and rates
     margin: Margin  # of the decision on r
 
     @property
-    def selected(self) -> NDArray[np.intp]:
+    def selected(self) -> Indices:
         """Indices (2 r,) of the kept coordinates and their rates in the state."""
         return np.concatenate((self.kept, self.kept + len(self.T) // 2))
 

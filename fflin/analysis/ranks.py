@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.validation import Array, Values
+from fflin.base.validation import Array, Indices, Values
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    pass
 
 EPS = float(np.finfo(float).eps)
 
@@ -197,7 +197,7 @@ def unit_columns(matrix: Array) -> Array:
 
 def echelon(
     columns: Array, weights: Array, preferred: Array | None = None
-) -> tuple[Array, NDArray[np.intp]]:
+) -> tuple[Array, Indices]:
     """Return a basis (m, r) of independent columns, with identity pivot rows, and the pivots."""
     from scipy.linalg import qr
 

@@ -9,14 +9,13 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from fflin.analysis.mechanics import checked, conserved, floating_inertia, second_order
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin, Noisy, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.names import input_keys
-from fflin.base.validation import Array, frozen
+from fflin.base.validation import Array, Indices, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.files import given
@@ -24,7 +23,6 @@ from fflin.linear.model import LinearModel, same_certificate
 from fflin.robot.joints import frame_index
 from fflin.robot.robot import Robot
 
-Indices: TypeAlias = NDArray[np.intp]
 Make: TypeAlias = Callable[[LinearModel], LinearModel]
 Part = TypeVar("Part", bound=LinearModel)
 

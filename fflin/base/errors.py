@@ -1,8 +1,13 @@
 """Errors that fflin raises; each message gives the value, what is expected, and what to do."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Collection, Iterable
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fflin.analysis.ranks import Margin
 
 # Patterns of control characters, which could break a line or control the terminal, and of names
 # too long to read. Each part of a path counts as a name. _LONGEST is the longest message.
@@ -165,7 +170,7 @@ class StabilizabilityError(FflinError, ValueError):
     fflin.base.errors.StabilizabilityError: the inputs cannot stabilise linear momentum ...
     """
 
-    margin: Any = None
+    margin: Margin | None = None
 
 
 class DetectabilityError(FflinError, ValueError):
@@ -186,7 +191,7 @@ class DetectabilityError(FflinError, ValueError):
     fflin.base.errors.DetectabilityError: the outputs do not observe q_b.x, q_b.y, q_b.z, ...
     """
 
-    margin: Any = None
+    margin: Margin | None = None
 
 
 class MissingPackageError(FflinError, ImportError):

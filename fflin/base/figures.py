@@ -14,13 +14,15 @@ from fflin.base.writing import as_path, check_ending, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.typing import RcKeyType
 
     from fflin.base.validation import Array
 
 FORMATS = (".png", ".pdf", ".svg")
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a6d3b")
-_STYLE: dict[Any, Any] = {
+_STYLE: dict[RcKeyType, object] = {
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
@@ -67,7 +69,9 @@ def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float)
 
 
 @contextmanager
-def drawing(path: str | Path | None, width: float, height: float, **options: Any) -> Iterator[Any]:
+def drawing(
+    path: str | Path | None, width: float, height: float, **options: Any
+) -> Iterator[Figure]:
     """Yield a figure of a size [in] in fflin's style; save the figure if a path is given."""
     target = None if path is None else as_path(path)
     if target is not None:

@@ -1,11 +1,13 @@
 """Rotations: cross-product matrices and Hamilton quaternions stored x, y, z, w."""
 
 import math
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
 from fflin.base.validation import Array
+
+T = TypeVar("T", float, Array)
 
 # Row 3 i + j holds the entry (i, j) of [a]x as a linear function of a.
 _CROSS = np.zeros((9, 3))
@@ -60,7 +62,7 @@ def rotation_matrices(a: Array) -> Array:
     return np.ascontiguousarray(np.array(_rotation(*a.T)).transpose(2, 0, 1))
 
 
-def _rotation(x: Any, y: Any, z: Any, w: Any) -> Any:
+def _rotation(x: T, y: T, z: T, w: T) -> tuple[tuple[T, T, T], ...]:
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),

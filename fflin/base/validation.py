@@ -6,21 +6,28 @@ import math
 import sys
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 
 from fflin.base.errors import InputError
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     import pinocchio as pin
     from numpy.typing import ArrayLike, NDArray
 
     Array = NDArray[np.floating[Any]]
     Complex = NDArray[np.complexfloating[Any]]
     Values = NDArray[np.inexact[Any]]  # real or complex
+    Mask = NDArray[np.bool_]
+    Indices = NDArray[np.intp]
 else:
-    Array = Complex = Values = np.ndarray  # numpy.typing takes a tenth of the command line's start
+    # numpy.typing takes a tenth of the command line's start.
+    Array = Complex = Values = Mask = Indices = np.ndarray
+
+T = TypeVar("T")
 
 # A quaternion or a (cos, sin) pair is renormalised if its squared length differs from 1 by at most
 # this, because the difference is rounding error. A larger difference is an error in the input.
@@ -88,12 +95,18 @@ def share(name: str, value: object) -> float:
 
 def refuse_masked(name: str, value: object) -> None:
     """Raise `InputError` if an entry is masked, because NumPy may ignore the mask."""
-    ma: Any = sys.modules.get("numpy.ma")  # a masked array exists only if this is loaded
+    ma: ModuleType | None = sys.modules.get(
+        "numpy.ma"
+    )  # a masked array exists only if this is loaded
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
 
 
-def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
+@overload
+def instance(name: str, value: object, kind: type[T], expected: str) -> T: ...
+@overload
+def instance(name: str, value: object, kind: tuple[type, ...], expected: str) -> object: ...
+def instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> object:
     """Return a value of the expected type, or raise `InputError` with the given type."""
     if not isinstance(value, kind):
         raise InputError(f"{name} has type {type(value).__name__}, expected {expected}")
@@ -102,7 +115,7 @@ def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
 
 def truth(name: str, value: object) -> bool:
     """Return whether a switch is on, or raise `InputError` if it is not True or False."""
-    return bool(instance(name, value, bool | np.bool_ | int, "True or False"))
+    return bool(instance(name, value, (bool, np.bool_, int), "True or False"))
 
 
 def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int:
@@ -115,13 +128,12 @@ def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int
     return int(value)
 
 
-def by_name(name: str, value: object, of_what: str) -> Mapping[str, Any]:
+def by_name(name: str, value: object, of_what: str) -> Mapping[str, object]:
     """Return a mapping whose keys are names, or raise `InputError`."""
-    mapping: Mapping[str, Any] = instance(name, value, Mapping, f"{{{of_what}: value}}")
-    return mapping
+    return instance(name, value, Mapping, f"{{{of_what}: value}}")
 
 
-def untied(key: str, value: object) -> tuple[Any, bool]:
+def untied(key: str, value: object) -> tuple[object, bool]:
     """Return a range, and whether all names that its key matches get the same random value."""
     if not isinstance(value, Mapping):
         return value, False
@@ -141,16 +153,16 @@ def dimension(name: str, value: object) -> int:
     return _as_array(name, value).ndim
 
 
-def placement(name: str, value: Any) -> pin.SE3:
+def placement(name: str, value: object) -> pin.SE3:
     """Return a copy of a placement; its rotation is normalised if it is valid within 1e-6."""
     import pinocchio as pin
 
-    instance(name, value, pin.SE3, "a pin.SE3 (placement)")
-    if not np.isfinite(value.homogeneous).all():
+    given = instance(name, value, pin.SE3, "a pin.SE3 (placement)")
+    if not np.isfinite(given.homogeneous).all():
         raise InputError(f"{name} has entries that are not finite")
-    if not is_rotation(value.rotation):
+    if not is_rotation(given.rotation):
         raise InputError(f"{name} is not a rotation matrix; expected R^T R = I and det R = 1")
-    return pin.SE3(pin.Quaternion(value.rotation).normalized().matrix(), value.translation)
+    return pin.SE3(pin.Quaternion(given.rotation).normalized().matrix(), given.translation)
 
 
 def is_rotation(R: Array) -> bool:
@@ -168,7 +180,7 @@ def as_double(name: str, value: ArrayLike) -> Array:
     return array.astype(np.float64)
 
 
-def _as_array(name: str, value: object) -> Any:
+def _as_array(name: str, value: object) -> NDArray[np.generic]:
     try:
         return np.asarray(value)
     except ValueError:

@@ -13,7 +13,7 @@ import numpy as np
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.record import NOT_VERIFIED, reading
-from fflin.base.validation import Array, FrozenArrays, frozen, number, refuse_masked
+from fflin.base.validation import Array, FrozenArrays, Indices, Mask, frozen, number, refuse_masked
 from fflin.base.writing import as_path
 from fflin.batch.files import is_constant, read_rows, write_rows
 from fflin.batch.rows import Column, away, positions, values
@@ -22,6 +22,8 @@ from fflin.linear.files import given
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
 
@@ -132,9 +134,9 @@ class LinearBatch(FrozenArrays):
     @overload
     def __getitem__(self, index: int) -> LinearModel: ...
     @overload
-    def __getitem__(self, index: slice | Sequence[int] | Array) -> LinearBatch: ...
+    def __getitem__(self, index: slice | Sequence[int] | Indices | Mask) -> LinearBatch: ...
 
-    def __getitem__(self, index: object) -> LinearModel | LinearBatch:
+    def __getitem__(self, index: int | slice | ArrayLike) -> LinearModel | LinearBatch:
         if isinstance(index, int | np.integer):
             if not -len(self) <= index < len(self):
                 raise IndexError(f"index is {index}, but the batch has {len(self)} points")

@@ -19,12 +19,12 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
-from fflin.base.validation import Array, whole
+from fflin.base.validation import Array, Mask, whole
 from fflin.batch.files import FileStore, MemoryStore
 from fflin.batch.workers import NoWorkers, OwnWorkers, WorkerDied
 
@@ -34,8 +34,16 @@ _QUEUED = 2
 # Number of workers assumed if an executor does not report it.
 _UNKNOWN_WORKERS = 16
 
-Rows = Callable[[int, int], Any]
 Progress = Callable[[int, int], object]
+
+
+class Rows(Protocol):
+    """Arrays of equal length, as a named tuple has them."""
+
+    def _asdict(self) -> dict[str, Any]: ...
+
+
+R_contra = TypeVar("R_contra", bound=Rows, contravariant=True)
 
 
 class Span(NamedTuple):
@@ -52,7 +60,7 @@ class ChunkResult(NamedTuple):
     notes: list[str]
 
 
-class Job(Protocol):
+class Job(Protocol[R_contra]):
     """Computation on rows; it is pickled, and each worker unpickles it once."""
 
     @property
@@ -60,7 +68,7 @@ class Job(Protocol):
         """Shape per row of each array that the job returns."""
 
     def run(
-        self, rows: object, start: int, out: Mapping[str, Array] | None = None, /
+        self, rows: R_contra, start: int, out: Mapping[str, Array] | None = None, /
     ) -> ChunkResult:
         """Process the rows from `start` on, into arrays `out` or new arrays, on any thread."""
 
@@ -91,8 +99,8 @@ def check_workers(
 
 
 def run_chunks(
-    job: Job,
-    rows: Rows,
+    job: Job[R_contra],
+    rows: Callable[[int, int], R_contra],
     store: FileStore | MemoryStore,
     *,
     executor: Executor | None = None,
@@ -139,7 +147,7 @@ def failure(
     failed: list[Done],
     store: FileStore | MemoryStore,
     of_what: str,
-    made: Callable[[object], object],
+    made: Callable[[Mask], object],
 ) -> SweepError:
     """Return the error that lists the failed chunks."""
     kept = np.ones(store.count, dtype=bool)
@@ -170,7 +178,11 @@ def failure(
 
 
 def _run_here(
-    job: Job, rows: Rows, store: FileStore | MemoryStore, spans: list[Span], threads: int
+    job: Job[R_contra],
+    rows: Callable[[int, int], R_contra],
+    store: FileStore | MemoryStore,
+    spans: list[Span],
+    threads: int,
 ) -> Iterator[Done]:
     def run(span: Span) -> Done:
         view = store.view(*span)
@@ -197,7 +209,9 @@ def _run_here(
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _run_on_workers(job: Job, rows: Rows, spans: list[Span], executor: Executor) -> Iterator[Done]:
+def _run_on_workers(
+    job: Job[R_contra], rows: Callable[[int, int], R_contra], spans: list[Span], executor: Executor
+) -> Iterator[Done]:
     pickled, ahead = pickle.dumps(job), _QUEUED * worker_count(executor)
     waiting, running = deque(spans), dict[Future[ChunkResult], Span]()
     try:
@@ -244,15 +258,15 @@ def executor_of(executor: Executor | None, workers: int | None) -> Iterator[Exec
         yield pool
 
 
-def work(job: bytes, rows: object, start: int) -> ChunkResult:
+def work(job: bytes, rows: Rows, start: int) -> ChunkResult:
     """Run a pickled job on one chunk; called in a worker."""
     return _unpickled(job).run(rows, start)
 
 
 @lru_cache(maxsize=4)
-def _unpickled(job: bytes) -> Job:
+def _unpickled(job: bytes) -> Job[Rows]:
     """Return an unpickled job, cached in each worker so that the job is prepared once."""
-    result: Job = pickle.loads(job)
+    result: Job[Rows] = pickle.loads(job)
     return result
 
 

@@ -87,9 +87,11 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     rows += [last[at : at + across] for at in range(0, len(last), across)]
     with drawing(path, 11.0, 0.8 + 2.6 * len(rows)) as figure:
         keys: dict[str, Any] = {}
-        for place, row in zip(figure.add_gridspec(len(rows), 1), rows, strict=True):
-            for cell, (panel, *given) in zip(place.subgridspec(1, len(row)), row, strict=True):
-                panel(axes := figure.add_subplot(cell), campaign, *given)
+        places = figure.add_gridspec(len(rows), 1)
+        for at, row in enumerate(rows):
+            cells = places[at].subgridspec(1, len(row))
+            for column, (panel, *given) in enumerate(row):
+                panel(axes := figure.add_subplot(cells[column]), campaign, *given)
                 keys |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
         below: Any = "outside lower center"
         figure.legend(keys.values(), keys.keys(), loc=below, ncols=7, handlelength=1.8)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 from fflin.base.tables import folded, grid
 from fflin.campaign.statistics import KINDS
 from fflin.simulation.run import STOPS
 
+if TYPE_CHECKING:
+    from fflin.campaign.campaign import Campaign
+
 _SHARES = (0.5, 0.95, 0.99)
 
 
-def campaign_report(campaign: Any) -> str:
+def campaign_report(campaign: Campaign) -> str:
     """Return the report: error quantiles, success rates of goals, and rank correlations."""
     count, quantile = len(campaign), campaign.quantile
     by = ", compiled" if campaign.engine == "compiled" else ""
@@ -36,20 +40,20 @@ def campaign_report(campaign: Any) -> str:
     return "\n".join([head, "", grid(rows, "ll"), "", folded(correlations)])
 
 
-def ended_of(campaign: Any) -> str:
+def ended_of(campaign: Campaign) -> str:
     """Return how many runs completed, and how the others ended."""
     said = ", ".join(f"{number:,} {word}" for word, number in _stops(campaign).items())
     return f"{int((campaign.stop == 0.0).sum()):,} completed; {said or 'none stopped early'}"
 
 
-def goal_met(campaign: Any, goal: str) -> str:
+def goal_met(campaign: Campaign, goal: str) -> str:
     """Return the success rate of a goal, with its interval."""
     met = campaign.fraction(goal, confidence=campaign.confidence)
     value, low, high = (f"{100.0 * x:.4g}" for x in met)
     return f"{goal}: {value} % ({low} to {high} % at {100.0 * campaign.confidence:g} % confidence)"
 
 
-def influences(campaign: Any) -> dict[str, dict[str, float]]:
+def influences(campaign: Campaign) -> dict[str, dict[str, float]]:
     """Return the significant rank correlations of the drawn values with the figures of interest.
 
     These are the figures in the goals, then the worst errors and the settling time, at most five.
@@ -65,7 +69,7 @@ def influences(campaign: Any) -> dict[str, dict[str, float]]:
     }
 
 
-def worst_runs(campaign: Any, k: int) -> list[str]:
+def worst_runs(campaign: Campaign, k: int) -> list[str]:
     """Show the k worst runs, and the influential value that each drew farthest from the median."""
     if not k:
         return []
@@ -90,10 +94,10 @@ def _when(time: float, unit: str = "") -> str:
     return f"{time:.3g}{unit}" if math.isfinite(time) else "not yet"
 
 
-def campaign_record(campaign: Any, worst: int) -> dict[str, Any]:
+def campaign_record(campaign: Campaign, worst: int) -> dict[str, Any]:
     """Return the report as JSON values: [value, low, high] of each, null if one is infinite."""
 
-    def plain(values: Any) -> list[float | None]:
+    def plain(values: Iterable[float]) -> list[float | None]:
         return [x if math.isfinite(x) else None for x in values]
 
     names = [f"{of}{kind}" for kind in KINDS for of in ("", "worst ", "settle ")]
@@ -114,7 +118,7 @@ def campaign_record(campaign: Any, worst: int) -> dict[str, Any]:
     }
 
 
-def _stops(campaign: Any) -> dict[str, int]:
+def _stops(campaign: Campaign) -> dict[str, int]:
     """Return {reason: number of runs that were stopped}."""
     counts = {word: int((campaign.stop == at).sum()) for at, word in enumerate(STOPS) if at}
     return {word: number for word, number in counts.items() if number}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from time import perf_counter
@@ -16,7 +16,7 @@ from fflin.base.errors import FflinError
 from fflin.base.record import content_digest
 from fflin.base.validation import Array
 from fflin.batch.files import MemoryStore
-from fflin.batch.run import ChunkResult, Progress, Rows, run_chunks, worker_count
+from fflin.batch.run import ChunkResult, Progress, run_chunks, worker_count
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.spreads import placed
 from fflin.campaign.statistics import (
@@ -293,7 +293,7 @@ def chunk_size(count: int, workers: int, least: int = LANES) -> int:
 
 def completed(
     job: CampaignJob,
-    rows: Rows,
+    rows: Callable[[int, int], Draws],
     count: int,
     executor: Executor | None = None,
     workers: int | None = None,

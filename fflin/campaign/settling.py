@@ -12,13 +12,12 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.analysis.names import rate_of
 from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
-from fflin.base.validation import Array, as_double
+from fflin.base.validation import Array, Indices, Mask, as_double
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, Over
@@ -188,9 +187,9 @@ class Settling:
         """Stop condition of the runs: settled or diverged; None if they are compared."""
         return self._is_over if self.step is None else None
 
-    def _is_over(self, first: Array, e: Array) -> NDArray[np.bool_]:
+    def _is_over(self, first: Array, e: Array) -> Mask:
         first, size = (self.loop.size(each[:, self.loop.watched]) for each in (first, e))
-        over: NDArray[np.bool_] = (size <= SETTLED * first) | ~(size < DIVERGED * first)
+        over: Mask = (size <= SETTLED * first) | ~(size < DIVERGED * first)
         return over
 
     def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
@@ -215,7 +214,7 @@ class Settling:
 
 def settle(
     runs_of: Callable[[int], CampaignJob],
-    starts: Callable[[NDArray[np.intp]], Array],
+    starts: Callable[[Indices], Array],
     count: int,
     engine: str | None = None,
     **how: Any,
@@ -230,7 +229,7 @@ def settle(
         job = runs_of(fine)
         job.choose(engine)
 
-        def rows(start: int, stop: int, left: NDArray[np.intp] = left) -> Draws:
+        def rows(start: int, stop: int, left: Indices = left) -> Draws:
             return Draws(starts(left[start:stop]))
 
         found = completed(job, rows, len(left), **how)

@@ -10,10 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.rotation import conjugate, quaternion_product
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
 from fflin.dynamics.state import StateMap
 from fflin.kernel import loop
@@ -41,7 +40,7 @@ EDGE = 176.0
 LOOK, _LONG = 64, 2**20
 
 # Returns a mask (N,) of the runs that end, from the state errors (N, nx) at the start and now.
-Over: TypeAlias = Callable[[Array, Array], NDArray[np.bool_]]
+Over: TypeAlias = Callable[[Array, Array], Mask]
 
 # Former names of kinds, which conditions and goals may still use.
 _FORMER = {"turning": "omega_b", "moving": "v_b", "rates": "joint rates"}
@@ -86,7 +85,7 @@ class Judge(Protocol):
         """Return the FIELDS (N,) of runs from their `Outcome`, whose first history is the start."""
 
 
-def kinds_of(state: StateMap) -> NDArray[np.intp]:
+def kinds_of(state: StateMap) -> Indices:
     """Return the index into KINDS of each state (nx,).
 
     It is 0 for the attitude and for states without a kind, such as modes, and -1 for wheels.
@@ -222,7 +221,7 @@ class RunStatistics:
         for lanes, initial in self._fresh:
             lanes[:] = initial
 
-    def over(self, q: Array, v: Array) -> NDArray[np.bool_]:
+    def over(self, q: Array, v: Array) -> Mask:
         """Return the mask (LANES,) of the runs that end early at these q and v (LANES, ..)."""
         if self._over is None:
             return np.zeros(LANES, dtype=bool)

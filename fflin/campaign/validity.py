@@ -9,12 +9,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.intervals import until_failure
 from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays, number, share, whole
+from fflin.base.validation import Array, FrozenArrays, Indices, number, share, whole
 from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import expect
@@ -284,8 +283,8 @@ def _starts(
     largest: dict[str, float],
     seed: int,
     levels: Array,
-    streams: NDArray[np.intp],
-    runs: NDArray[np.intp],
+    streams: Indices,
+    runs: Indices,
 ) -> Array:
     """Return deviations of the initial states of some runs, each from its own random stream."""
     x = []

@@ -198,7 +198,8 @@ def robot_of_design(
     others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
     if len(others) == len(robot.inputs):
         raise InputError(
-            f"--allocate: '{robot.name}' has no thrusters; give --inputs with thrusters"
+            f"--allocate needs thrusters, but '{robot.name}' has none; define them in the file of "
+            "--inputs"
         )
     missing = [
         kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.tables import counted, folded, grid
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Mask
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.equipment.mounting import carrier
@@ -20,7 +20,7 @@ from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    pass
 
 _FACETS = 20_000  # normals that are computed at once
 _MANY = 36  # thrusters, which have 400 000 facets
@@ -164,7 +164,7 @@ def thruster_report(properties: Mapping[str, Any]) -> str:
     return folded([text])
 
 
-def gives_every_wrench(W: Array, pushing: NDArray[np.bool_]) -> bool:
+def gives_every_wrench(W: Array, pushing: Mask) -> bool:
     """Return whether columns W (6, k), some of them only positive, produce every wrench."""
     from scipy.optimize import nnls
 

@@ -1,9 +1,11 @@
 """Channel from command to actuator: sample and hold, delay, limits, wheels and thruster pulses."""
 
+from __future__ import annotations
+
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -16,6 +18,9 @@ from fflin.kernel.channel import PULSES, WHEELS, Pulses, Wheels
 from fflin.robot.fields import Range
 from fflin.robot.inputs import Thruster, named_inputs
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 
 class Saturation(NamedTuple):
@@ -140,7 +145,7 @@ class Law:
 
     def __init__(
         self,
-        policy: Callable[[float, Array, Array], object],
+        policy: Callable[[float, Array, Array], ArrayLike],
         names: tuple[str, ...],
         limits: tuple[Array, Array],
         slow: float,
@@ -155,7 +160,7 @@ class Law:
         """Return the command (nu,), or raise `InputError` if it is not finite or of wrong shape."""
         u = self.policy(t, q.copy(), v.copy())
         own = type(u) is np.ndarray and u.dtype is DOUBLE
-        u = u.copy() if own else as_double(f"policy(t, q, v) at t = {t:g} s", u)
+        u = np.array(u) if own else as_double(f"policy(t, q, v) at t = {t:g} s", u)
         if u.shape == self._shape and math.isfinite(u.dot(u)):
             return u
         names = self._names

@@ -16,12 +16,12 @@ from fflin.base.errors import InputError, listed
 from fflin.base.names import group_of, input_keys
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import cut, grid, matrix, width
-from fflin.base.validation import Array, Values
+from fflin.base.validation import Array, Mask, Values
 from fflin.control.optimal.riccati import rates_of
 from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    import control
 
     from fflin.control.optimal.riccati import Solution
     from fflin.linear.exchange import ToolGain
@@ -161,7 +161,7 @@ class Gain(Design):
         """Closed-loop matrix A - B K (nx, nx)."""
         return self.A - self.B @ self.K
 
-    def to_control(self) -> Any:
+    def to_control(self) -> control.StateSpace:
         """Return -K as a `control.StateSpace` from x - x0 to u - u0, with signal names.
 
         Raises
@@ -364,9 +364,7 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
         found = best
 
 
-def gain_crossings(
-    A: Array, B: Array, C: Array, D: Array, bound: float
-) -> tuple[Values, NDArray[np.bool_]]:
+def gain_crossings(A: Array, B: Array, C: Array, D: Array, bound: float) -> tuple[Values, Mask]:
     """Return eigenvalues (.., 2 nx), and which are imaginary: there the gain crosses the bound.
 
     A superfluous crossing costs only one more evaluation of the response.

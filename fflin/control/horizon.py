@@ -1,15 +1,15 @@
 """Receding horizon: the quadratic program of each sample, and its solution by DAQP."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, MissingPackageError
-from fflin.base.validation import Array, number, vector
+from fflin.base.validation import Array, Indices, Mask, number, vector
 from fflin.control.policies import Clock
 
 # Settings of DAQP for rows of length 1, relative to the typical width of the limits: tolerance,
@@ -60,7 +60,7 @@ class Matrices(NamedTuple):
     G: Array
     low: Array
     high: Array
-    soft: NDArray[np.bool_]
+    soft: Mask
     Phi: Array
     Gamma: Array
     inputs: tuple[str, ...]
@@ -93,7 +93,7 @@ class Horizon:
     samples: int  # N
     dt: float
     inputs: tuple[str, ...]
-    acting: NDArray[np.intp]  # indices of the inputs that have limits
+    acting: Indices  # indices of the inputs that have limits
     limited: tuple[str, ...]
     robot: str
 
@@ -102,7 +102,7 @@ class Horizon:
         k = min(round(min(t / self.dt, len(self.stages))), len(self.stages) - self.samples)
         return self.stages[k : k + self.samples]
 
-    def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
         """Return the lower and upper limits (m,) of samples, and which limits are soft."""
         soft = np.tile(np.arange(len(self.limited)) >= len(self.acting), len(stages))
         low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
@@ -125,10 +125,13 @@ class Horizon:
         return Matrices(*program, states[..., size:], states[..., :size], *names)
 
 
+_At = Callable[[float, Array, Array], tuple[Array, Array]]
+
+
 class Receding:
     """Policy that applies the first input of each plan; `at(t, q, v)` returns u* and e."""
 
-    def __init__(self, horizon: Horizon, at: object = None) -> None:
+    def __init__(self, horizon: Horizon, at: _At) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
         self.solves = self.softened = self.unfinished = self.exceeded = 0

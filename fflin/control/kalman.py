@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +20,9 @@ from fflin.control.optimal.riccati import solve
 from fflin.control.weights import Weight, columns, weight
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel, state_space
+
+if TYPE_CHECKING:
+    import control
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,7 +99,7 @@ class Estimator(Design):
     def __repr__(self) -> str:
         return titled(self, nx=len(self.L), ny=self.L.shape[1])
 
-    def to_control(self) -> Any:
+    def to_control(self) -> control.StateSpace:
         """Return a `control.StateSpace` from u - u0 and y - y0 to xh, with signal names.
 
         Raises
@@ -157,7 +160,7 @@ class Compensator(Design):
     def __repr__(self) -> str:
         return titled(self, nx=len(self.B), ny=self.B.shape[1], nu=len(self.C))
 
-    def to_control(self) -> Any:
+    def to_control(self) -> control.StateSpace:
         """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.
 
         Raises

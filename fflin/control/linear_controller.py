@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
 from fflin.base.record import FORMATS, read_record, reading, texts
-from fflin.base.validation import Array, as_double, instance, number
+from fflin.base.validation import Array, Mask, as_double, instance, number
 from fflin.base.writing import as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Policy, Sample, decider, feedback_of
@@ -127,7 +127,7 @@ class LinearController(Feedback):
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
         by = _fitted(_system_of(self.system), lin)
-        felt = lin.D.any(axis=1) & by.D.any(axis=0)
+        felt: Mask = np.logical_and(lin.D.any(axis=1), by.D.any(axis=0))
         if felt.any():
             raise InputError(
                 "the controller and the model form an algebraic loop through "

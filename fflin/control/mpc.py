@@ -121,7 +121,7 @@ def mpc(
     >>> bool(abs(motion.u[:, 6:]).max() <= 1.0), policy.matrices(motion.x[0]).H.shape
     (True, (90, 90))
     """
-    instance("lin", lin, LinearModel | LinearTrajectory, "a LinearModel or a LinearTrajectory")
+    instance("lin", lin, (LinearModel, LinearTrajectory), "a LinearModel or a LinearTrajectory")
     samples = whole("horizon", horizon, 1)
     if dt is None and not lin.dt:
         raise InputError("dt is missing; give the sampling time [s]")

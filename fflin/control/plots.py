@@ -11,14 +11,13 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing, letters_of, logarithmic
-from fflin.base.validation import Array, Values, instance, number, refuse_masked
+from fflin.base.validation import Array, Mask, Values, instance, number, refuse_masked
 from fflin.control.gain import Gain
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
 _LINE = "#888888"
 
@@ -145,9 +144,7 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     grid = np.geomspace(min(float(rates.min()), end) / 100.0, end, _POINTS)
     values = np.array([response(w) for w in grid])
 
-    def changes(
-        value: Callable[[Values], Array], i: int, among: NDArray[np.bool_]
-    ) -> list[complex]:
+    def changes(value: Callable[[Values], Array], i: int, among: Mask) -> list[complex]:
         """Return the responses of loop i where a function of them changes its sign."""
         from scipy.optimize import brentq
 

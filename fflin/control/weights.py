@@ -75,7 +75,7 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     >>> fflin.lqr(lin, Q, R).K.shape
     (9, 18)
     """
-    instance("lin", lin, LinearModel | LinearTrajectory, "a LinearModel or a LinearTrajectory")
+    instance("lin", lin, (LinearModel, LinearTrajectory), "a LinearModel or a LinearTrajectory")
     if not isinstance(largest, Mapping) or not largest:
         raise InputError(f"largest is {largest!r}, expected {{name: largest acceptable value}}")
     keys = (*lin.state_names, *input_keys(lin))

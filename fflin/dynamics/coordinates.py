@@ -68,7 +68,7 @@ def frame_of(robot: Robot, frame: object) -> Frame:
     return cast("Frame", frame)
 
 
-def refuse_orbit(robot: Any, what: str) -> None:
+def refuse_orbit(robot: Robot, what: str) -> None:
     """Raise `InputError` if a robot is in orbit; `what` names the unsupported feature."""
     if getattr(robot, "orbit", None):
         raise InputError(
@@ -225,7 +225,7 @@ def states_of(state: StateMap, q: Array, nu: Array) -> Array:
     return state.compose(state.charts(q), state.positions(q), state.joint_positions(q), nu)
 
 
-def unwound(state: StateMap, x: Array, near: Any = 0.0) -> Array:
+def unwound(state: StateMap, x: Array, near: Array | float = 0.0) -> Array:
     """Remove full turns of continuous joints from states or errors (.., nx), in place.
 
     Afterwards each angle is within half a turn of its value in `near` (nx,).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +18,9 @@ from fflin.robot.joints import ROOT, by_joint, find_frame
 from fflin.robot.loading import body_alone, inertia_of
 from fflin.robot.robot import Robot
 from fflin.robot.welding import joined, welded
+
+if TYPE_CHECKING:
+    pass
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -199,7 +202,7 @@ def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
     return np.concatenate((linear, angular))
 
 
-def joint_called(robot: Robot, name: str) -> Any:
+def joint_called(robot: Robot, name: str) -> pin.JointModel:
     """Return the joint of Pinocchio's model with a name."""
     return robot.model.joints[robot.model.getJointId(name)]
 
@@ -361,7 +364,7 @@ def capture(
     return Capture(impulse=impulse[robot.nv : robot.nv + 6], **said)
 
 
-def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:
+def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tuple[Array, Array]:
     """Return the checked configuration and velocity of a payload with its base at a placement."""
     configuration = other.neutral() if q is None else other.checked_configuration(q).copy()
     root = other.model.jointPlacements[ROOT]

@@ -1,7 +1,9 @@
 """Configurations, velocities and inputs, built from values by name."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +16,9 @@ from fflin.dynamics.state import StateMap
 from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, by_joint
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 LARGEST_SPEED = 1e50  # [rad/s|m/s], so that squares and their sums do not overflow
 
@@ -95,7 +100,11 @@ def start_of(robot: Robot) -> tuple[Array, Array]:
 
 
 def point_of(
-    state: StateMap, x0: Any, q0: Any, v0: Any, default: Callable[[], tuple[Array, Array]]
+    state: StateMap,
+    x0: ArrayLike | None,
+    q0: ArrayLike | None,
+    v0: ArrayLike | None,
+    default: Callable[[], tuple[Array, Array]],
 ) -> tuple[Array, Array]:
     """Return the configuration (nq,) and velocity (nv,) from x or from q and v."""
     robot = state.robot

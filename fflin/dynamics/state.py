@@ -1,7 +1,10 @@
 """State X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, frames and chart."""
 
+from __future__ import annotations
+
 from copy import copy
 from itertools import compress
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +17,9 @@ from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALL
 from fflin.dynamics.orbital import OrbitField
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 
 class StateMap:
@@ -112,6 +118,7 @@ class StateMap:
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
+        self._flat_transposed = np.ascontiguousarray(self._flat.T)
         # Pinocchio's v per unit of each velocity of the state: 1 except for modal amplitudes.
         self._scale = np.array([1.0] * 6 + [joint.scale for joint in joints])
         self._scaled = bool((self._scale != 1.0).any())
@@ -129,7 +136,7 @@ class StateMap:
         self.falls = self._pulled or robot.orbit is not None
         self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
 
-    def about(self, reference: pin.SE3) -> "StateMap":
+    def about(self, reference: pin.SE3) -> StateMap:
         """Return a copy of the map with another reference placement and the same `frame`."""
         other = copy(self)
         other._refer(reference)
@@ -246,7 +253,7 @@ class StateMap:
             in_frame = self.to_frame(chart, nu[..., None])[..., 0]
         return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
-    def to_pinocchio(self, x: Array) -> tuple[Array, Array]:
+    def to_pinocchio(self, x: ArrayLike) -> tuple[Array, Array]:
         """Convert a state to a Pinocchio configuration and velocity.
 
         Parameters
@@ -329,6 +336,13 @@ class StateMap:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
         return matrix.take(self._flat, out=out, mode="clip")
+
+    def project_transposed(self, matrix: Array, out: Array) -> None:
+        """Write the last rows of ``(S.T @ matrix @ S).T`` into a C-contiguous array (.., 6 + n)."""
+        if self.S is None:
+            matrix.take(self._flat_transposed[out.shape[1] - len(out) :], out=out, mode="clip")
+        else:
+            out[:] = (self.S.T @ matrix @ self.S).T[out.shape[1] - len(out) :]
 
     def to_frame(self, chart: Chart, vectors: Array) -> Array:
         """Transform velocities or wrenches (.., 6 + n, k) from base axes to the axes of `frame`.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, listed
-from fflin.base.validation import Array, FrozenArrays
+from fflin.base.validation import Array, FrozenArrays, Mask
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ORBITAL, forces_of
 from fflin.dynamics.orbital import field_of
@@ -19,11 +19,8 @@ from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from fflin.linear.model import LinearModel
 
-    Mask: TypeAlias = NDArray[np.bool_]
 
 # Rounding errors of M a and of the accelerations, relative to the terms that they sum.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)

@@ -16,7 +16,10 @@ from fflin.base.validation import Array, FrozenArrays, frozen, number, positive
 from fflin.dynamics.integrators import held_exponential
 
 if TYPE_CHECKING:
+    import control
     import pinocchio as pin
+    from numpy.typing import ArrayLike
+    from scipy import signal
 
     from fflin import ToolModel
     from fflin.dynamics.state import Frame
@@ -367,7 +370,7 @@ class LinearModel(StateSpace):
             )
         return transform(self._robot, self, tool, dt=dt)
 
-    def to_scipy(self) -> Any:
+    def to_scipy(self) -> signal.StateSpace:
         """Return the model of the deviations from x0 and u0 as a `scipy.signal.StateSpace`.
 
         Signal names and f0 are omitted, because a `StateSpace` cannot contain them.
@@ -378,7 +381,7 @@ class LinearModel(StateSpace):
         matrices = (self.A, self.B, self.C, self.D)
         return StateSpace(*matrices, dt=self.dt) if self.dt else StateSpace(*matrices)
 
-    def to_control(self) -> Any:
+    def to_control(self) -> control.StateSpace:
         """Return the model of the deviations from x0 and u0 as a `control.StateSpace`.
 
         The `StateSpace` has the signal names of the model. The constant f0 is omitted.
@@ -433,7 +436,9 @@ class LinearModel(StateSpace):
         return replace(lin, _certify=partial(same_certificate, lin, lin.fingerprint))
 
 
-def state_space(matrices: Any, dt: float, *signals: Sequence[str]) -> Any:
+def state_space(
+    matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str]
+) -> control.StateSpace:
     """Return a `control.StateSpace` of A, B, C, D and names of states, inputs and outputs."""
     try:
         import control

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -16,6 +16,9 @@ from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALL
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 # Complex step along a motion. It is so small that its square vanishes, so derivatives are exact.
 _STEP = 1e-20j
@@ -125,7 +128,7 @@ class ToolCoordinates:
         q, v = (np.concatenate((np.roll(base, self._roll), rest)) for base, rest in parts)
         return q, v
 
-    def to_pinocchio(self, q: Any, v: Any) -> tuple[Array, Array]:
+    def to_pinocchio(self, q: ArrayLike, v: ArrayLike | None) -> tuple[Array, Array]:
         """Convert the tool's q and v to Pinocchio's q and v; v=None means rest."""
         robot, state, size = self.state.robot, self.state, 6 + len(self.joints)
         v = np.zeros(size) if v is None else vector("v", v, size, "the tool's: base, then joints")

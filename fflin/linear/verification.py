@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from copy import copy
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import (
@@ -29,10 +29,7 @@ from fflin.linear.model import Certificate, LinearModel
 from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.robot import Robot
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Index: TypeAlias = slice | NDArray[np.intp]
+Index: TypeAlias = slice | Indices
 
 # Terms that cancel exactly still leave rounding errors of 1e-16 of their size. The scale of errors
 # contains this fraction of such terms, which allows for the rounding and hides no larger error.
@@ -208,9 +205,6 @@ def _in_frame(state: StateMap, q: Array, matrix: Array) -> Array:
     return state.to_frame(chart, state.to_frame(chart, matrix).T).T
 
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 # Speed of the base [m/s] above which its rounding errors would hide the other velocities.
 _FAST = 100.0
 
@@ -306,9 +300,7 @@ class ErrorDynamics(Nonlinear):
         )
 
 
-def jacobian(
-    f: Callable[[Array], Array], point: Array, steps: Array, is_curved: NDArray[np.bool_]
-) -> Array:
+def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask) -> Array:
     """Return the Jacobian of f by central differences; f maps rows of points to rows of values.
 
     Columns with `is_curved` use sixth-order differences, the others use one difference.

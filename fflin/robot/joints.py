@@ -1,9 +1,11 @@
 """Joints and frames of a tree by name, and its configurations in Pinocchio's order."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -11,6 +13,9 @@ import pinocchio as pin
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
 from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
@@ -75,7 +80,7 @@ class Joint(NamedTuple):
             return float(np.arctan2(q[self.idx_q + 1], q[self.idx_q]))
         return float(q[self.idx_q]) / self.scale
 
-    def within(self, model: pin.Model) -> "Joint":
+    def within(self, model: pin.Model) -> Joint:
         """Return this joint with the indices of the joint of the same name in another model."""
         joint = model.joints[model.getJointId(self.name)]
         return self._replace(idx_q=joint.idx_q, idx_v=joint.idx_v)
@@ -185,7 +190,7 @@ class Coordinates:
         for follower in self.followers:
             follower.place(q)
 
-    def checked_configuration(self, q: Array) -> Array:
+    def checked_configuration(self, q: ArrayLike) -> Array:
         """Return a valid configuration q (nq,), corrected within 1e-6, or raise `InputError`."""
         if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
             q = self._sized("q", q, self.nq, _CONFIGURATION)
@@ -205,11 +210,10 @@ class Coordinates:
                 if error > NORM_TOLERANCE:
                     what = f"(cos, sin) of continuous joint '{self.unbounded[index]}'"
                     raise _not_of_length_1(f"{what}, q[{index}:{index + 2}],", square)
-        if worst > ROUND_OFF:
-            q = pin.normalize(self.model, q)
-        return self._followed(q) if self.followers else q
+        near: Array = pin.normalize(self.model, q) if worst > ROUND_OFF else q
+        return self._followed(near) if self.followers else near
 
-    def checked_velocity(self, v: Array) -> Array:
+    def checked_velocity(self, v: ArrayLike) -> Array:
         """Return a velocity v (nv,) unchanged if it is valid, or raise `InputError`."""
         v = self._sized("v", v, self.nv, "a velocity in Pinocchio's order")
         for joint, leader, multiplier, _ in self.followers:
@@ -221,7 +225,7 @@ class Coordinates:
                 )
         return v
 
-    def _sized(self, name: str, value: Array, size: int, of_what: str) -> Array:
+    def _sized(self, name: str, value: ArrayLike, size: int, of_what: str) -> Array:
         """Return a vector (size,); the error for a longer vector names removed coordinates."""
         if self._removed and np.size(value) > size:
             removed = ", ".join(self._removed)

@@ -195,7 +195,7 @@ def from_model(
     """
     if not isinstance(model, pin.Model):
         raise ModelError(f"the model has type {type(model).__name__}, expected a pin.Model")
-    instance("name", name, str | None, "a string")
+    instance("name", name, (str, type(None)), "a string")
     copy = model.copy()
     copy.gravity.setZero()
     name = name or model.name or "model"

@@ -13,11 +13,10 @@ from itertools import pairwise
 from typing import Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.process import Progress
-from fflin.base.validation import Array, vector
+from fflin.base.validation import Array, Indices, Mask, vector
 from fflin.control.linear_controller import LinearController, OutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback, measured_at
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
@@ -53,7 +52,7 @@ def noise_generator(seed: float) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
 
 
-def noises(plan: Plan, size: int, step: int, last: int) -> tuple[NDArray[np.intp], Array]:
+def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]:
     """Return the samples (k,) between two steps, and the policy's noise (k, size) in them."""
     times, noise = plan.times, noise_of(plan)
     at = np.arange(-(-step // times.sample), -(-last // times.sample))
@@ -70,7 +69,7 @@ class Statistics(Protocol):
     every: int  # steps from one row to the next
     span: int  # steps between checks of `over`
 
-    def over(self, q: Array, v: Array) -> NDArray[np.bool_]:
+    def over(self, q: Array, v: Array) -> Mask:
         """Return the mask (LANES,) of the runs that end early at these q and v (LANES, ..)."""
 
     def reset(self) -> None:
@@ -128,7 +127,7 @@ class LaneLoop:
         """Return work space for `most` rows, or for fewer rows if they exceed the memory limit."""
         return work_space(max(1, min(most, _MEMORY // (8 * LANES * self.width))) * self.width)
 
-    def advance(self, clock: NDArray[np.intp], last: int, every: int, rows: Array) -> None:
+    def advance(self, clock: Indices, last: int, every: int, rows: Array) -> None:
         """Advance to the step `last`; see `kernel.loop.advance`."""
         self._advance(self._words, clock, last, every, rows, self._work)
 
@@ -192,7 +191,7 @@ class LaneLoop:
             bar.close()
         return messages
 
-    def _begin(self, runs: Runs, of_lane: NDArray[np.intp]) -> Callable[[int, int], None]:
+    def _begin(self, runs: Runs, of_lane: Indices) -> Callable[[int, int], None]:
         """Write the initial values of runs, and return a function that writes sensor errors."""
         for array, initial in self._fresh:
             array[:] = initial
@@ -205,7 +204,7 @@ class LaneLoop:
         kept.start[9:], self.done = self.parts.point.q[:3], 0
         return self._sensors(runs, of_lane)
 
-    def _sensors(self, runs: Runs, of_lane: NDArray[np.intp]) -> Callable[[int, int], None]:
+    def _sensors(self, runs: Runs, of_lane: Indices) -> Callable[[int, int], None]:
         """Return a function that writes the sensor errors between two steps."""
         law, size = self.parts.law, len(self.parts.law.y)
         rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
@@ -229,14 +228,12 @@ class LaneLoop:
 
         return sense if self._noisy else lambda *_: None
 
-    def _end(
-        self, statistics: Statistics, ending: NDArray[np.bool_], stop: Array, out: Runs
-    ) -> None:
+    def _end(self, statistics: Statistics, ending: Mask, stop: Array, out: Runs) -> None:
         """Write the outcomes of the runs that end at the current step."""
         count = len(ending)
         diverged = (stop == STOPS.index("diverged"))[:count]
 
-        def write(chosen: NDArray[np.bool_]) -> None:
+        def write(chosen: Mask) -> None:
             found = statistics.outcome(self.done, stop)
             for name, rows in out.items():
                 rows[chosen] = found[name][:count][chosen]
@@ -275,7 +272,7 @@ class LaneRows:
         """Number of rows of each run before its end."""
         return [-(-int(steps) // self.every) for steps in self.ends["steps"]]
 
-    def over(self, q: Array, v: Array) -> NDArray[np.bool_]:
+    def over(self, q: Array, v: Array) -> Mask:
         """Return that no run ends early."""
         return np.zeros(len(q), dtype=bool)
 

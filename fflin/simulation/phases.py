@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -16,22 +16,27 @@ from fflin.dynamics.impact import Impact, joint_called
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import ROOT, Robot
 
+if TYPE_CHECKING:
+    from fflin.simulation.motion import Motion
+
 # Largest difference of rates and displacements between the end and the beginning of phases.
 _MET = 1e-6
 
 
-def carried_on(first: Any, later: tuple[Any, ...]) -> Any:
+def carried_on(first: Motion, later: tuple[Motion | Impact, ...]) -> Motion:
     """Join several phases to one motion; see `Motion.then`."""
     if not later or isinstance(later[-1], Impact):
         raise InputError(
             "the last phase is an impact, expected a Motion; simulate the robot after the impact"
         )
-    parts = (*(first._phases or (first,)), *later)
+    parts: tuple[Any, ...] = (*(first._phases or (first,)), *later)
     if not all(getattr(part, "_robot", part) for part in parts):
         raise InputError(
             "a motion that was read from a file lacks its robot; join motions returned by simulate"
         )
-    whole = replace(parts[0], phases=(parts[0].robot,), starts=parts[0].t[:1], _phases=parts)
+    whole: Motion = replace(
+        parts[0], phases=(parts[0].robot,), starts=parts[0].t[:1], _phases=parts
+    )
     robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
     for part in parts[1:]:
         if isinstance(part, Impact):
@@ -73,7 +78,7 @@ def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[
     return own_q, own_v
 
 
-def _longer(whole: Any, motion: Any, name: str) -> Any:
+def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
     """Append the rows of another motion, converted to this motion's chart, joints and inputs."""
     if (motion.frame, motion.circles) != (whole.frame, whole.circles):
         where, before = (f"'{m.frame}'{' in orbit' * bool(m.circles)}" for m in (motion, whole))
@@ -91,10 +96,13 @@ def _longer(whole: Any, motion: Any, name: str) -> Any:
         goals = state_history(state, *_seen(state.robot, there.robot, last, *points), near)
         rows = (whole.target, len(whole.t)), (goals, len(t))
         target = np.vstack([np.broadcast_to(x, (n, state.nx)) for x, n in rows])
-    alike = ("energy", "momentum", "momentum_drift", "com_drift")
+    alike: dict[str, Any] = {
+        key: np.concatenate([getattr(m, key) for m in (whole, motion)])
+        for key in ("energy", "momentum", "momentum_drift", "com_drift")
+    }
     return replace(
         whole,
-        **{key: np.concatenate([getattr(m, key) for m in (whole, motion)]) for key in alike},
+        **alike,
         t=np.concatenate((whole.t, t)),
         q=np.vstack((whole.q, q)),
         v=np.vstack((whole.v, v)),
@@ -111,7 +119,7 @@ def _longer(whole: Any, motion: Any, name: str) -> Any:
     )
 
 
-def _inputs(whole: Any, state: StateMap, motion: Any, there: StateMap) -> Array:
+def _inputs(whole: Motion, state: StateMap, motion: Motion, there: StateMap) -> Array:
     """Return a motion's inputs (N, nu) in the order of the whole; missing inputs are zero."""
     if more := [name for name in motion.input_names if name not in whole.input_names]:
         raise InputError(

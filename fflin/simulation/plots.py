@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
+    from fflin.simulation.motion import Motion
+
 _OF_JOINTS = ("q_m", "qdot_m")
 _MOST_IN_A_PANEL, _ACROSS = 6, 3
 _PALE: dict[str, Any] = {"lw": 3.6, "alpha": 0.3}  # style of a reference, below the motion
@@ -73,7 +75,7 @@ class Curve(NamedTuple):
         return Curve(self.key, "momentum", self.name, "N m s", *scaled)
 
 
-def curves(motion: Any, wheels: Mapping[str, float]) -> Iterator[Curve]:
+def curves(motion: Motion, wheels: Mapping[str, float]) -> Iterator[Curve]:
     """Yield curves of states, inputs, and speed and momentum of wheels {name: inertia or 0}."""
     limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     unlimited = np.full(2, np.inf)
@@ -98,7 +100,7 @@ def curves(motion: Any, wheels: Mapping[str, float]) -> Iterator[Curve]:
         yield Curve(key, key.partition(".")[0], name, unit, column, limits.get(name, unlimited))
 
 
-def resting_from(motion: Any) -> float | None:
+def resting_from(motion: Motion) -> float | None:
     """Return the time [s] from which a moving target is at rest, or None."""
     places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
@@ -107,7 +109,7 @@ def resting_from(motion: Any) -> float | None:
     return float(motion.t[moved[-1] + 1])
 
 
-def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None) -> Figure:
+def draw_motion(motion: Motion, path: str | Path | None, show: Sequence[str] | None) -> Figure:
     """Draw a motion; see `plot_motion`."""
     states, panels = _selected(motion, show)
     what, errors = _errors(motion)
@@ -147,7 +149,7 @@ def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None
     return figure
 
 
-def _selected(motion: Any, show: Any) -> tuple[dict[str, list[Curve]], dict[str, list[Curve]]]:
+def _selected(motion: Motion, show: Any) -> tuple[dict[str, list[Curve]], dict[str, list[Curve]]]:
     """Return the chosen states by group, and chosen inputs, wheel speeds and momenta by title."""
     names = (*motion.state_names, *input_keys(motion))
     show = [show] if isinstance(show, str) else show
@@ -196,7 +198,7 @@ def _draw_panels(
         _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
 
 
-def _title(motion: Any) -> str:
+def _title(motion: Motion) -> str:
     parts = [f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"]
     if motion.linear is not None:
         parts.append("solid: nonlinear, dashed: linear")
@@ -214,7 +216,7 @@ def _panel_of(curve: Curve, wheels: Mapping[str, float]) -> str:
     return "torques" if curve.unit == "N m" else "forces"
 
 
-def _errors(motion: Any) -> tuple[str, dict[str, Curve]]:
+def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
     """Return the errors from a reference (attitude in degrees), or else from the linear model."""
     names, units, linear = motion.state_names, motion.state_units, motion.linear
     rows, what = [], "error"
@@ -284,7 +286,7 @@ def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -
     figure.legend(handles=named, loc=place, ncols=columns, handlelength=1.6, title=title)
 
 
-def _drifts(axes: Axes, motion: Any) -> None:
+def _drifts(axes: Axes, motion: Motion) -> None:
     # Drifts below the rounding error of 1 are raised to it, since a logarithmic axis has no zero.
     drifts = {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift}
     shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}

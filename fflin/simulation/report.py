@@ -1,17 +1,21 @@
 """Report of a motion: settling, inputs, limit violations, and conserved quantities."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from textwrap import shorten
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.impact import Impact
+
+if TYPE_CHECKING:
+    from fflin.simulation.motion import Motion
 
 # An error has settled when it stays below this fraction of its largest value.
 SETTLED = 0.02
@@ -106,7 +110,7 @@ def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
     return tuple(sorted(found, key=lambda each: -each.share))
 
 
-def limited(motion: Any) -> Iterator[Limited]:
+def limited(motion: Motion) -> Iterator[Limited]:
     """Yield the states and inputs of a motion that have limits."""
     names = motion.state_names + motion.input_names
     units = motion.state_units + motion.input_units
@@ -130,14 +134,14 @@ def _shown(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 1000.0 else f"{value:.0f}"
 
 
-def settled_at(sizes: Array) -> NDArray[np.intp]:
+def settled_at(sizes: Array) -> Indices:
     """Return the row from which errors (N, ..) have settled; N for errors that have not."""
     outside = sizes > np.maximum(SETTLED * sizes.max(axis=0), THERE)
     first = len(sizes) - outside[::-1].argmax(axis=0)
     return np.where(outside.any(axis=0), first, 0)
 
 
-def is_late(settled: Array | NDArray[np.intp] | int, count: int) -> Any:
+def is_late(settled: Array | Indices | int, count: int) -> Mask | bool:
     """Return whether errors settle too late in a run of `count` rows to count as settled.
 
     So an error that only passes through zero at the end does not count as settled.
@@ -179,7 +183,7 @@ class ErrorHistory(NamedTuple):
         return [self.title, self.unit, *cells, when]
 
 
-def motion_report(motion: Any) -> str:
+def motion_report(motion: Motion) -> str:
     """Return the report of a motion: settling, inputs, violations, and conserved quantities."""
     kinds = error_histories(motion)
     head = [verdict(motion, kinds)] if kinds or motion.stopped else []
@@ -226,7 +230,7 @@ def motion_report(motion: Any) -> str:
     return "\n".join(parts)
 
 
-def motion_record(motion: Any) -> dict[str, Any]:
+def motion_record(motion: Motion) -> dict[str, Any]:
     """Return the numbers of the report by name."""
     t = motion.t
     errors = {
@@ -260,7 +264,7 @@ def motion_record(motion: Any) -> dict[str, Any]:
     }
 
 
-def _phases(motion: Any) -> list[list[str]]:
+def _phases(motion: Motion) -> list[list[str]]:
     """Return the table of phases; it has no impacts for a motion from a file."""
     table = [["phase", "", "t [s]", "energy [J]", "|p| [N s]", "|h| [N m s]"]]
 
@@ -285,7 +289,7 @@ def _phases(motion: Any) -> list[list[str]]:
     return table
 
 
-def error_histories(motion: Any) -> list[ErrorHistory]:
+def error_histories(motion: Motion) -> list[ErrorHistory]:
     """Return the errors of each kind, or an empty list without a target.
 
     Wheel speeds and modes have their own kinds. Wheel angles are left out.
@@ -318,7 +322,7 @@ def pushed(of: object) -> bool:
     return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
 
-def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
+def verdict(motion: Motion, kinds: list[ErrorHistory]) -> str:
     """Return one line: whether a motion settled at its target, and why not."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
@@ -346,7 +350,7 @@ def verdict(motion: Any, kinds: list[ErrorHistory]) -> str:
     return f"{said}; saturated inputs: {_full(motion)}"
 
 
-def _full(motion: Any) -> str:
+def _full(motion: Motion) -> str:
     """Return the inputs and wheels that were at a limit, with their fraction of the run."""
     shares: dict[str, float] = {}  # sum for both limits
     for each in motion.saturated:
@@ -360,7 +364,7 @@ def _and(words: list[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
 
 
-def _largest_modes(motion: Any) -> str:
+def _largest_modes(motion: Motion) -> str:
     """Return the largest amplitude of each mode, and the corresponding rotation."""
     rows = [["mode", "unit", "largest", "rotation [deg]", "at [s]"]]
     far = []
@@ -384,7 +388,7 @@ def _largest_modes(motion: Any) -> str:
     return f"{table}\n{folded([said])}"
 
 
-def _largest_inputs(motion: Any) -> str:
+def _largest_inputs(motion: Motion) -> str:
     largest = np.abs(motion.u).max(axis=0)
     kinds: dict[tuple[str, str], float] = {}
     for name, unit, value in zip(input_keys(motion), motion.input_units, largest, strict=True):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from fflin.base.record import Design
 from fflin.base.tables import counted, cut, folded, grid
 from fflin.base.validation import Array, as_double, numbers
 from fflin.linear.model import state_space
+
+if TYPE_CHECKING:
+    import control
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -162,7 +165,7 @@ class LFT(Design):
             self.D22 + self.D21 @ by[..., nx:],
         )
 
-    def to_control(self) -> Any:
+    def to_control(self) -> control.StateSpace:
         """Return a `control.StateSpace` from (w, u) to (z, y), with signal names.
 
         The channels of w and z have names such as ``w_PARAMETER_1`` and ``z_PARAMETER_1``. Dots in

@@ -125,8 +125,8 @@ class Sensitivity:
         found = self.parameters.find(name)
         if len(found) > 1:
             raise InputError(
-                f"'{name}' matches {len(found)} parameters, expected one; for several use "
-                "along({...})"
+                f"'{name}' matches {len(found)} parameters, expected one; to change several "
+                "parameters together, use along({...})"
             )
         return self.parameters[found[0]]
 

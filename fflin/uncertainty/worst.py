@@ -10,12 +10,11 @@ from operator import itemgetter
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
-from fflin.base.validation import Array, shaped
+from fflin.base.validation import Array, Mask, shaped
 from fflin.control.gain import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
 
@@ -45,7 +44,7 @@ class Figures(NamedTuple):
 
     quick: Figure
     exact: Figure
-    above: Callable[[Array, float], NDArray[np.bool_]]
+    above: Callable[[Array, float], Mask]
 
 
 @dataclass(frozen=True)
@@ -206,7 +205,7 @@ class Loops:
             peaks.append(min(w, 1e300))  # similar loops have their peak near this frequency
             return np.array((value,))
 
-        def above(rows: Array, bound: float) -> NDArray[np.bool_]:
+        def above(rows: Array, bound: float) -> Mask:
             F, B = self.matrices(rows)
             unstable = np.linalg.eigvals(F).real.max(axis=-1) >= 0.0
             limit = bound * (1.0 + ACCURACY)

@@ -286,7 +286,7 @@ def _listen(port: int) -> socket.socket:
 class _Guarded(RequestHandler):
     """Handler that accepts only this machine's names as host, to refuse pages of other sites."""
 
-    def initialize(self, hosts: set[str], **fields: object) -> None:
+    def initialize(self, hosts: set[str], **fields: Any) -> None:
         self._hosts = hosts
         self._fields = fields
 

@@ -3,10 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.errors import MissingPackageError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Indices
 
 # What may be left of the optimality conditions of the scaled problem, absolute and relative.
 _ACCURACY = 1e-10
@@ -23,7 +22,7 @@ class StageSolution(NamedTuple):
 class StageRows(NamedTuple):
     """Soft limits low - s <= G (x[k], u[k], u[k + 1]) <= high + s of combined variables."""
 
-    k: NDArray[np.intp]  # (m,)
+    k: Indices  # (m,)
     G: Array  # (m, nx + 2 nu)
     low: Array  # (m,)
     high: Array

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -243,7 +243,7 @@ class _Ball(NamedTuple):
             axis, scale = w / turning, turning
             origin: Array = self.center + np.cross(w, v) / turning**2
             pitch = float(v @ w) / turning**2
-            motion: Any = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
+            motion: pin.JointModel = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
         else:
             axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
             origin, motion = self.center, pin.JointModelPZ()

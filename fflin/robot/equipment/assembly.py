@@ -1,8 +1,10 @@
 """A robot's equipment: reaction wheels, flexible appendages and slosh, as joints of its model."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -26,13 +28,16 @@ from fflin.robot.fields import checked_inputs, of_joints
 from fflin.robot.joints import find_frame
 from fflin.robot.mass_properties import LinkMass, as_inertia
 
+if TYPE_CHECKING:
+    from fflin.robot.robot import Robot
 
-def with_inputs(robot: Any, inputs: Any) -> Any:
+
+def with_inputs(robot: Robot, inputs: object) -> Robot:
     """Return a robot with other inputs, and with the wheels among them as joints."""
     return _equipped(robot, inputs, robot.appendages)
 
 
-def with_appendages(robot: Any, appendages: Any) -> Any:
+def with_appendages(robot: Robot, appendages: object) -> Robot:
     """Return a robot with other flexible appendages and slosh, whose modes are joints."""
     checked = checked_appendages(appendages)
     bare, taken = robot._bare, set[int]()
@@ -47,8 +52,7 @@ def with_appendages(robot: Any, appendages: Any) -> Any:
             taken.add(joint)
             bare = _with_rigid(bare, item)
     if taken:
-        own = {"links": bare.links, "urdf_sha256": bare.urdf_sha256}
-        robot = replace(robot, **own, _unequipped=bare)
+        robot = replace(robot, links=bare.links, urdf_sha256=bare.urdf_sha256, _unequipped=bare)
         checked = tuple(
             replace(item, rigid=False) if isinstance(item, FlexibleAppendage) else item
             for item in checked
@@ -56,7 +60,7 @@ def with_appendages(robot: Any, appendages: Any) -> Any:
     return _equipped(robot, robot.inputs, checked)
 
 
-def _with_rigid(bare: Any, item: FlexibleAppendage) -> Any:
+def _with_rigid(bare: Robot, item: FlexibleAppendage) -> Robot:
     """Return a robot whose link at an appendage's frame has the inertia of the appendage's file."""
     assert item.inertia is not None
     joint, placement = find_frame(bare.model, item.frame)
@@ -73,7 +77,7 @@ def _with_rigid(bare: Any, item: FlexibleAppendage) -> Any:
     return replace(bare.with_bodies({joint: difference(rest, negative)}), links=links)
 
 
-def _equipped(robot: Any, inputs: Any, appendages: Sequence[Appendage]) -> Any:
+def _equipped(robot: Robot, inputs: object, appendages: Sequence[Appendage]) -> Robot:
     bare = robot._bare
     checked = checked_inputs(inputs, bare.joint, bare.joint_names, robot.passive)
     model, joints, followers = bare.model, bare.joints, bare.followers

@@ -1,7 +1,7 @@
 """Wheels and other bodies on new joints, subtracted from the links whose inertia includes them."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -33,7 +33,7 @@ class Mounted(NamedTuple):
     joint: Joint
     carrier: int | str
     placement: pin.SE3
-    motion: Any  # Pinocchio's joint model
+    motion: pin.JointModel
     inertia: pin.Inertia
     armature: float = 0.0
 

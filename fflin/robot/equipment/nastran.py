@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.errors import InputError, unknown
-from fflin.base.validation import Array, vector, whole
+from fflin.base.validation import Array, Mask, vector, whole
 from fflin.base.writing import as_path, remember
-
-Mask: TypeAlias = "NDArray[np.bool_]"
 
 LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254, "ft": 0.3048}  # [m]
 MASSES = {
