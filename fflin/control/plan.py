@@ -16,7 +16,7 @@ from fflin.base.names import chosen, input_keys
 from fflin.base.process import Progress
 from fflin.base.validation import Array, Mask, number, whole
 from fflin.control.channel import input_limits
-from fflin.control.optimal.plan_search import Search, cost_of_inputs, excess, limited_values
+from fflin.control.optimal.plan_search import Search, cost_of_inputs, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
@@ -164,7 +164,7 @@ def plan(
     size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
     size[size == 0.0] = 1.0
     for name, point, which in (("start", start, slice(None)), ("goal", end, asked)):
-        _require_within(state, bounds, name, point, which)
+        _require_within(shooting, bounds, name, point, which)
     # A search without a solution may diverge; this is reported as an error instead of NumPy
     # warnings.
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
@@ -205,14 +205,16 @@ class _Made(NamedTuple):
 
 def _least(search: Search, guess: tuple[Array, Array, Array], size: Array) -> _Made:
     """Return the plan of least effort, or the plan that is closest to the goal and the limits."""
-    state, bounds, best = search.shooting.state, search.bounds, None
+    shooting, bounds, best = search.shooting, search.bounds, None
     # If limits cannot be respected between knots, they are respected at knots only.
     for parts in (_PARTS, 1) if np.isfinite(bounds).any() else (1,):
         q, v, u = search._replace(parts=parts).best(*guess)
-        missed = np.abs(search.shooting.between((q[-1], v[-1]), search.end)) * search.asked
-        fine = search.shooting.parts(q, v, u, _PARTS)
-        beyond = excess(bounds[:, None, None] - limited_values(state, *fine))
-        at_knots = excess(bounds[:, None] - limited_values(state, q, v)).max(axis=0)
+        missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked
+        every = max(1, shooting.steps // _PARTS)
+        fine = shooting.motions(q, v, u, every * _PARTS)
+        points = (each[:, every::every] for each in fine[:2])
+        beyond = excess(bounds[:, None, None] - shooting.limited_values(*points))
+        at_knots = excess(bounds[:, None] - shooting.limited_values(q, v)).max(axis=0)
         made = _Made(q, v, u, missed, at_knots, beyond, float((beyond / size).max()))
         if best is None or (made.reached, -made.most) > (best.reached, -best.most):
             best = made
@@ -223,10 +225,10 @@ def _least(search: Search, guess: tuple[Array, Array, Array], size: Array) -> _M
 
 
 def _require_within(
-    state: StateMap, bounds: Array, what: str, point: Point, which: slice | Mask
+    shooting: Shooting, bounds: Array, what: str, point: Point, which: slice | Mask
 ) -> None:
     """Raise `InputError` if a point is outside the limits of some states."""
-    values = limited_values(state, *point)
+    values, state = shooting.limited_values(*point), shooting.state
     asked = np.zeros(state.nx, dtype=bool)
     asked[which] = True
     outside = [

@@ -104,19 +104,21 @@ def _over_rotations(
 ) -> Array:
     """Return the derivatives Theta (.., 6 + n, 3) of `rates` over base rotations (4.4)."""
     omega_in_reference, v_in_reference = state.axes
-    # `by_turn`, the derivative in base axes, is zero without an orbit.
+    # `by_turn`, the derivative in base axes, is zero without an orbit; it is converted in place.
     theta, c = rates.by_turn, rates.c
     for columns in actuation.held if np.count_nonzero(u) else ():
-        theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
+        theta += product(rates.by_u[..., columns], skew(u[..., columns]))
+    # A name for each part, because `x[part] -= y` would copy the part onto itself.
+    turning, shifting = theta[..., ANGULAR, :], theta[..., LINEAR, :]
     if omega_in_reference:
-        theta = theta + product(rates.by_nu[..., ANGULAR], W)
-        theta[..., ANGULAR, :] -= skew(c[..., ANGULAR])
+        theta += product(rates.by_nu[..., ANGULAR], W)
+        turning -= skew(c[..., ANGULAR])
     if v_in_reference:
-        theta[..., LINEAR, :] -= skew(c[..., LINEAR])
+        shifting -= skew(c[..., LINEAR])
     elif state.falls:
-        theta[..., LINEAR, :] += skew(rates.gravity)
+        shifting += skew(rates.gravity)
     if state.orbit:  # (14.5)
-        theta[..., ANGULAR, :] += W @ skew(chart.R.mT @ state.orbit[0])
+        turning += W @ skew(chart.R.mT @ state.orbit[0])
     return theta
 
 

@@ -12,7 +12,6 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.optimal.stage_qp import StageQP, StageRows
-from fflin.dynamics.state import StateMap
 
 # Accuracy [rad, m, s] with which the goal and the limits are met.
 _ENDS = 1e-8
@@ -133,16 +132,15 @@ class Search(NamedTuple):
         return size
 
     def _trial(self, q: Array, v: Array, u: Array) -> Trial:
-        shooting, state = self.shooting, self.shooting.state
-        parts = shooting.parts(q, v, u, self.parts)
-        knots = self.bounds[:, None] - limited_values(state, q, v)
+        shooting = self.shooting
+        motions = shooting.motions(q, v, u)
+        knots = self.bounds[:, None] - shooting.limited_values(q, v)
         knots[0, 0], knots[1, 0] = -np.inf, np.inf
         to_end = shooting.between((q[-1], v[-1]), self.end)
         knots[:, -1, self.asked] = np.clip(to_end, *knots[:, -1])[self.asked]
-        points = limited_values(state, *(each[:, :-1] for each in parts))
         tighter = self.bounds + _TIGHTER * np.array((self._size, -self._size))
-        inside = tighter[:, None, None] - points
-        return Trial(q, v, u, shooting.apart(q, v, parts), knots, inside)
+        inside = tighter[:, None, None] - shooting.inside(motions, self.parts)
+        return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
 
     def _exceeding(self, trial: Trial) -> Flags:
         """Return whether points (N, parts - 1, nx) or their neighbours exceed a limit."""
@@ -206,8 +204,7 @@ class Search(NamedTuple):
 
     def _flown(self, u: Array) -> Trial:
         """Return the motion from the start under the inputs, which has no gaps."""
-        q, v = (x[:: self.parts] for x in self.shooting.flown(self.start, u, self.parts))
-        trial = self._trial(q, v, u)
+        trial = self._trial(*self.shooting.flown(self.start, u), u)
         return trial._replace(missed=0.0 * trial.missed)
 
     def _acting(self, trial: Trial) -> tuple[Array, Array, Array]:
@@ -224,14 +221,6 @@ def cost_of_inputs(shooting: Shooting, R: Array, u: Array) -> Array:
     cost = held[:, None] * R
     cost /= (cost * u * u).sum() or cost.sum()
     return cost
-
-
-def limited_values(state: StateMap, q: Array, v: Array) -> Array:
-    """Return the limited values (.., nx): positions and rates of joints, zero for the base."""
-    n, values = state.robot.n, np.zeros((*q.shape[:-1], state.nx))
-    values[..., 6 : 6 + n] = state.joint_positions(q)
-    values[..., state.nx - n :] = state.velocities(v)[..., 6:]
-    return values
 
 
 def excess(room: Array) -> Array:
