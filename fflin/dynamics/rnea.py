@@ -106,7 +106,7 @@ class Inertia:
         """Raise an error for a singular M, or warn of an ill-conditioned M, naming coordinates."""
         name, scale = self._state.robot.name, np.sqrt(np.maximum(M.diagonal(), 0.0))
         scale[scale == 0.0] = 1.0
-        lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # or NaN
+        lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # true for NaN as well
         mode = np.linalg.eigh(M / scale / scale[:, None])[1][:, 0]
         names = coordinate_names(self._state.robot)
         involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
