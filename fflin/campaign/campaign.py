@@ -1,4 +1,4 @@
-"""The record of a campaign: the outcomes of its runs, and statistics with their intervals."""
+"""Campaign: the outcomes of its runs, and statistics with confidence intervals."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Bound(NamedTuple):
 def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> list[Bound]:
     """Return the comparisons in a condition such as ``attitude < 1 deg and settle < 40 s``.
 
-    `figure` returns the values (N,) and the unit of a name.
+    `figure` returns the values (N,) and the unit of a quantity.
     """
     bounds = []
     for part in condition.split(" and "):
@@ -383,7 +383,7 @@ class Campaign(FrozenArrays):
         write_atomically({path: content.getvalue()})
 
     def _save(self, path: Path, **texts: str) -> None:
-        """Write it with more texts, such as the request that `monte_carlo` knows its call by."""
+        """Write the campaign with further strings, such as the request that identifies its call."""
         arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in _ARRAYS}
         rest = {key: getattr(self, key) for key in _HEADER}
         texts["header"] = json.dumps({"kind": "Campaign", **rest})

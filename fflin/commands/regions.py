@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from fflin.base.errors import InputError
+from fflin.base.tables import folded
 from fflin.commands import options, parser
 from fflin.commands.loops import along
 from fflin.commands.points import limits_of_options, load_robot, once
@@ -123,7 +124,8 @@ def _validity(arguments: argparse.Namespace) -> Report:
         bar.close()
     text = str(found)
     if cut or any(name in lin.limits for name in lin.input_names):
-        text += "\ninputs were " + ("saturated at the limits of the robot" if cut else _FREE)
+        said = "saturated at the limits of the robot" if cut else _FREE
+        text += f"\n{folded([f'inputs were {said}'])}"
     if design is not robot:
         text += "\nan ideal torque and force on the base replace the thrusters (--no-allocate)"
     return Report(robot.name, found, text, {arguments.plot: figure_of("plot_validity", found)})

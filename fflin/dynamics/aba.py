@@ -41,6 +41,20 @@ class Aba:
         )
         return self.field.relative(v, absolute, rate) if self.field else rate
 
+    def accelerations(self, q: Array, v: Array, u: Array) -> Array:
+        """Return dv/dt (N, nv) of N points, see `acceleration`."""
+        state = self.state
+        if self.field or state.robot.followers or state.robot.stored_momentum:
+            return np.array([self.acceleration(*point) for point in zip(q, v, u, strict=True)])
+        forces = u @ self.actuation.fixed.T
+        if self._resists:
+            forces += self._passive_force(q, v)
+        tau, found = state.lift(forces.T).T, np.empty_like(v)
+        for k, point in enumerate(zip(q, v, tau, strict=True)):
+            wrenches = self.actuation.wrenches(u[k]) or self._none
+            found[k] = pin.aba(self._model, self._data, *point, wrenches)
+        return found
+
     def terms(self, q: Array, v: Array, u: Array) -> Array:
         """Return the sum of the magnitudes of the terms of the accelerations (6 + n,)."""
         state, data = self.state, self._data
@@ -132,9 +146,9 @@ class Aba:
 
     def _passive_force(self, q: Array, v: Array) -> Array:
         stiffness, damping, rest = self.state.robot.springs
-        force = np.zeros(6 + self.state.robot.n)
-        force[6:] -= stiffness * (self.state.joint_positions(q) - rest)
-        force[6:] -= damping * self.state.velocities(v)[6:]
+        force = np.zeros((*q.shape[:-1], 6 + self.state.robot.n))
+        force[..., 6:] -= stiffness * (self.state.joint_positions(q) - rest)
+        force[..., 6:] -= damping * self.state.velocities(v)[..., 6:]
         return force
 
     def _accelerate(

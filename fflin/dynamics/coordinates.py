@@ -123,7 +123,7 @@ class Chart:
     standing: ClassVar[bool] = False  # whether the base is at the reference
 
     q_b: Array  # vector part (.., 3) of the quaternion of refMb
-    q0: float | Array  # its scalar part (.., 1), positive
+    q0: float | Array  # scalar part (.., 1) of this quaternion, positive
     R: Array  # refMb.rotation (.., 3, 3)
 
     @classmethod

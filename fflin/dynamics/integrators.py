@@ -15,8 +15,13 @@ Acceleration: TypeAlias = Callable[[float, Array, Array], Array]
 _integrate = pin.integrate
 
 
+def integrate_rows(model: pin.Model, q: Array, way: Array) -> Array:
+    """Return configurations (N, nq) that are displaced by tangent vectors (N, nv)."""
+    return np.array([_integrate(model, *each) for each in zip(q, way, strict=True)])
+
+
 class Integrator:
-    """Integrator with one step size for one model."""
+    """Integrator with one step size for one model, of one point or of N rows of points."""
 
     # Times of the stages in a step of length 1.
     nodes: ClassVar[tuple[float, ...]]
@@ -30,10 +35,12 @@ class Integrator:
     # step, 1 for the one of the second stage.
     origins: ClassVar[tuple[int, ...]]
 
-    def __init__(self, model: pin.Model, dt: float) -> None:
+    def __init__(self, model: pin.Model, dt: float, rows: int | None = None) -> None:
         self.model, self.dt = model, dt
         self._displacement, self._speed = self.step_weights(dt)
-        self._stages = np.zeros((1 + len(self.nodes), model.nv))  # v, l1, l2, ...
+        self._integrate = _integrate if rows is None else integrate_rows
+        # v, l1, l2, ...
+        self._stages = np.zeros((*(() if rows is None else (rows,)), 1 + len(self.nodes), model.nv))
 
     @classmethod
     def step_weights(cls, dt: float) -> tuple[Array, Array]:
@@ -43,16 +50,17 @@ class Integrator:
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v one step later."""
         model, stages, begins = self.model, self._stages, list[Array]()
-        stages[0] = v
+        integrate = self._integrate
+        stages[..., 0, :] = v
         for k, node in enumerate(self.nodes, start=1):
-            stages[k] = f(t + node * self.dt, q, v)
-            done = stages[: k + 1]
+            stages[..., k, :] = f(t + node * self.dt, q, v)
+            done = stages[..., : k + 1, :]
             begins.append(q)
-            q = _integrate(
+            q = integrate(
                 model, begins[self.origins[k - 1]], self._displacement[k - 1, : k + 1].dot(done)
             )
             v = self._speed[k - 1, : k + 1].dot(done)
-        return _integrate(model, q, self._displacement[-1].dot(stages)), v
+        return integrate(model, q, self._displacement[-1].dot(stages)), v
 
 
 class CommutatorFree4(Integrator):

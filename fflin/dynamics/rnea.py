@@ -67,10 +67,15 @@ class Inertia:
         self._still = pin.neutral(robot.model)
         self.least_coupling = 0.999 * (6 + robot.n)
 
+    def centred(self, q: Array) -> Array:
+        """Return q with the base at the origin, in an array that the next call overwrites."""
+        if q is not self._still:
+            self._still[7:] = q[7:]
+        return self._still
+
     def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
-        still = self._still
-        still[7:] = q[7:]
+        still = self.centred(q)
         # Articulated bodies are used only if `quick`: their small rounding errors would appear in
         # entries of M^-1 K that are exactly zero. The rounding of a Cholesky factor does not
         # depend on the scaling of M.
@@ -101,7 +106,7 @@ class Inertia:
         """Raise an error for a singular M, or warn of an ill-conditioned M, naming coordinates."""
         name, scale = self._state.robot.name, np.sqrt(np.maximum(M.diagonal(), 0.0))
         scale[scale == 0.0] = 1.0
-        lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # or NaN
+        lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # true for NaN as well
         mode = np.linalg.eigh(M / scale / scale[:, None])[1][:, 0]
         names = coordinate_names(self._state.robot)
         involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
@@ -208,43 +213,46 @@ class Accelerations:
         self._inertia = Inertia(state, data)
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
-        # Derivatives of M a + b - B u - springs over the displacements of the state. The first six
-        # columns, for attitude and position of the base, are zero without an orbit.
-        self._force_slopes = np.zeros((self._nv, 2 * self._nv))
-        self._by_turn, self._by_q_m = self._force_slopes[:, :3], self._force_slopes[:, 6 : self._nv]
-        self._by_nu = self._force_slopes[:, self._nv :]
+        # Derivatives of M a + b - B u - springs over the displacements of the state, transposed so
+        # that the parts are contiguous. The first six rows, for attitude and position of the base,
+        # are zero without an orbit.
+        rows = np.zeros((2 * self._nv, self._nv))
+        self._force_slopes = rows.T
+        self._by_turn, self._by_q_m, self._by_nu = rows[:3], rows[6 : self._nv], rows[self._nv :]
+        self._by_linear = self._by_nu[LINEAR]
         # Views of the diagonals to which stiffness and damping are added.
-        self._of_stiffness = np.einsum("ii->i", self._by_q_m[6:])
+        self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
+        self._minus_inverse = np.empty((self._nv, self._nv))
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
         self._field = state.field
-        self._still = np.zeros(robot.nq), np.zeros(robot.nv)
+        self._still = np.zeros(robot.nv)
 
     def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
         self._inertia.invert(q, out, quick=True)
 
     def rates(
-        self, q: Array, v: Array, nu: Array, q_m: Array, u: Array, slopes: Array, by_u: Array
+        self, q: Array, v: Array, nu: Array, u: Array, slopes: Array, by_u: Array
     ) -> AccelerationDerivatives:
         """Return the accelerations and their derivatives at q, v and u in base axes.
 
-        `nu` and `q_m` are v and the joint positions in state order. The derivatives are written
-        into the C-contiguous arrays `slopes` and `by_u`.
+        `nu` is v in state order. The derivatives are written into the C-contiguous arrays `slopes`
+        and `by_u`.
         """
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
-        # The base's position and linear velocity are left out: c does not depend on them, and
-        # Pinocchio's derivatives would lose digits to large values. Gravity is left out as well,
-        # because it accelerates all parts of the robot alike (equivalence principle).
-        q_still, v_still = self._still
-        q_still[3:], v_still[3:] = q[3:], v[3:]
+        # The base's placement and linear velocity are left out: in base axes c does not depend on
+        # them, and Pinocchio's derivatives would lose digits to large values. Gravity is left out
+        # as well, because it accelerates all parts of the robot alike (equivalence principle).
+        q_still, v_still = self._inertia.centred(q), self._still
+        v_still[3:] = v[3:]
         if tide:
             v_still[PIN_ANGULAR] += tide.spin
             pull = tide.force(model, data, q_still)
             pull_by_q, pull_by_turn = tide.slopes(model, data, q_still)
         inverse = by_u if actuation.default else np.empty((self._nv, self._nv))
-        self._inertia.invert(q_still, inverse)
+        self._inertia.invert(q_still, inverse, quick=not self._resists)
         columns = actuation.columns(data, q_still)
         bias = pin.nonLinearEffects(model, data, q_still, v_still)
         gyroscopic = self._gyroscopic(q_still, v_still, u) if self._stored else None
@@ -254,7 +262,7 @@ class Accelerations:
             bias = bias - pull
         force = (u if actuation.default else columns.dot(u)) - state.forces(bias)
         if self._resists:
-            force[6:] += self._springs.force(q_m, nu[6:])
+            force[6:] += self._springs.force(state.joint_positions(q), nu[6:])
         c = inverse.dot(force)
 
         # Derivatives of M a + b - B u - springs (3.3), (7.1). The wrenches are constant in the
@@ -268,17 +276,18 @@ class Accelerations:
             by_q, by_v = by_q - gyroscopic.by_q, by_v - gyroscopic.by_v
         if tide:
             by_q = by_q - pull_by_q
-        self._by_q_m[:], self._by_nu[:] = state.project(by_q)[:, 6:], state.project(by_v)
-        self._by_nu[:, LINEAR] = 0.0
+        state.project_transposed(by_q, self._by_q_m)
+        state.project_transposed(by_v, self._by_nu)
+        self._by_linear[:] = 0.0
         if self._resists:
             self._of_stiffness += self._springs.stiffness
             self._of_damping += self._springs.damping
         if tide:
-            by_spin = self._by_nu[:, ANGULAR].dot(skew(tide.spin))
-            self._by_turn[:] = by_spin - state.forces(pull_by_turn)
-        np.dot(-inverse, self._force_slopes, out=slopes)
+            by_spin = self._by_nu[ANGULAR].T.dot(skew(tide.spin))
+            self._by_turn[:] = (by_spin - state.forces(pull_by_turn)).T
+        np.negative(inverse, self._minus_inverse).dot(self._force_slopes, slopes)
         if not actuation.default:
-            np.dot(inverse, columns, out=by_u)
+            inverse.dot(columns, by_u)
         return AccelerationDerivatives(c, slopes, by_u, tide.fall if tide else state.gravity(q))
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:

@@ -118,6 +118,7 @@ class StateMap:
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
+        self._flat_transposed = np.ascontiguousarray(self._flat.T)
         # Pinocchio's v per unit of each velocity of the state: 1 except for modal amplitudes.
         self._scale = np.array([1.0] * 6 + [joint.scale for joint in joints])
         self._scaled = bool((self._scale != 1.0).any())
@@ -335,6 +336,13 @@ class StateMap:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
         return matrix.take(self._flat, out=out, mode="clip")
+
+    def project_transposed(self, matrix: Array, out: Array) -> None:
+        """Write the last rows of ``(S.T @ matrix @ S).T`` into a C-contiguous array (.., 6 + n)."""
+        if self.S is None:
+            matrix.take(self._flat_transposed[out.shape[1] - len(out) :], out=out, mode="clip")
+        else:
+            out[:] = (self.S.T @ matrix @ self.S).T[out.shape[1] - len(out) :]
 
     def to_frame(self, chart: Chart, vectors: Array) -> Array:
         """Transform velocities or wrenches (.., 6 + n, k) from base axes to the axes of `frame`.

@@ -28,7 +28,7 @@ from fflin.export.writing import digest_of
 from fflin.linear.fit import require_same, require_turns, sensed
 from fflin.robot.robot import Robot
 
-_INVALID = 2  # status of a step
+_INVALID = 2  # status of a step with invalid arguments
 
 
 class CLaw:

@@ -139,7 +139,7 @@ def _between_processes(path: Path) -> Iterator[None]:
         yield
         return
     lock = FileLock(path)
-    with suppress(OSError, NotImplementedError):  # `Timeout` is an OSError too
+    with suppress(OSError, NotImplementedError):  # includes the `Timeout` of the second wait
         try:
             lock.acquire(timeout=_SILENCE)
         except Timeout:

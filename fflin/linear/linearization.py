@@ -322,13 +322,14 @@ class Linearizer:
         chart, r_b = _STANDING, _STANDING.q_b
         if not ready.own_reference:
             chart, r_b = state.chart(q), state.positions(q)
-        nu, q_m = state.velocities(v), state.joint_positions(q)
+        nu = state.velocities(v)
         u_base = actuation.in_base_axes(chart, u)
         A, B = ready.rest["A"].copy(), np.zeros(self._shape_B)
-        rates = self._accelerations.rates(q, v, nu, q_m, u_base, A[lower], B[lower])
+        rates = self._accelerations.rates(q, v, nu, u_base, A[lower], B[lower])
         seen: dict[str, Array] = {}
         if ready.sensing is not None:
-            x0, point = state.compose(chart, r_b, q_m, nu), (q, v, nu, u_base)
+            x0 = state.compose(chart, r_b, state.joint_positions(q), nu)
+            point = q, v, nu, u_base
             seen = output_equations(ready.sensing, actuation, self._data, chart, rates, x0, point)
             _require_finite(*seen.values())
         rate = assemble(state, actuation, chart, nu, u_base, rates, A, moving=ready.moving)
@@ -359,7 +360,7 @@ class Linearizer:
         with self._lock:
             for k in range(count):
                 slopes, by_u = A[k, lower], B[k, lower]
-                rates = self._accelerations.rates(q[k], v[k], nu[k], q_m[k], u[k], slopes, by_u)
+                rates = self._accelerations.rates(q[k], v[k], nu[k], u[k], slopes, by_u)
                 c[k], gravity[k] = rates.c, rates.gravity
                 if sensing is not None:
                     point = (q[k], v[k], nu[k], u[k])

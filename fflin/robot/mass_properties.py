@@ -365,7 +365,7 @@ def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
     data = pin_joint.createData()
     pin_joint.calc(data, robot.neutral())
     linear, axis = np.split(np.asarray(data.S).ravel(), 2)
-    if linear.any():  # a screw
+    if linear.any():  # a screw joint, which also translates
         return False
     body, turn = robot.model.inertias[index], skew(axis)
     inertia = body.inertia

@@ -116,7 +116,7 @@ def draw_motion(motion: Motion, path: str | Path | None, show: Sequence[str] | N
     per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of states and of their errors below
     heights = per_row * math.ceil(len(states) / _ACROSS)
     above = len(heights)
-    heights += [3.0] * math.ceil((len(panels) + 1) / _ACROSS)  # with the drift
+    heights += [3.0] * math.ceil((len(panels) + 1) / _ACROSS)  # rows of panels, including the drift
     with drawing(path, 11.0, 0.3 + sum(heights)) as figure:
         grid = figure.add_gridspec(len(heights), _ACROSS, height_ratios=heights, hspace=0.06)
         joints: dict[str, Line2D] = {}
@@ -165,7 +165,7 @@ def _selected(motion: Motion, show: Any) -> tuple[dict[str, list[Curve]], dict[s
             states.setdefault(curve.group, []).append(curve)
         elif curve.key in keys:
             panels.setdefault(_panel_of(curve, wheels), []).append(curve)
-    for title in _WHEELS.values():  # come last
+    for title in _WHEELS.values():  # panels of wheels come last
         panels |= {title: panels.pop(title)} if title in panels else {}
     return states, panels
 

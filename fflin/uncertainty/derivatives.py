@@ -53,12 +53,11 @@ class ModelDerivatives:
         state, data = ready.map, robot.create_data()
         self._chart = Standing() if own else state.chart(lin.q)
         self._u = ready.actuation.in_base_axes(self._chart, lin.u0)
-        nu, q_m = state.velocities(lin.v), state.joint_positions(lin.q)
+        nu = state.velocities(lin.v)
         self._rates = Accelerations(state, ready.actuation, data).rates(
             lin.q,
             lin.v,
             nu,
-            q_m,
             self._u,
             slopes=np.empty((len(nu), state.nx)),
             by_u=np.empty((len(nu), len(self._u))),

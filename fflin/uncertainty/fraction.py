@@ -177,7 +177,7 @@ class _Form:
         D[:3, :3], D[3:, 3:] = piece.mass * np.eye(3), piece.inertia
         now = J @ self.unit[: self.sizes[0]]
         s = now.copy()
-        for at, left, right in shifts:  # v' = v + omega x d
+        for at, left, right in shifts:  # a centre of mass shifted by d: v' = v + omega x d
             s[:3] += left @ self.times(at, right @ now[3:])
         f = D @ s
         if "mass" in parts:

@@ -44,7 +44,7 @@ class Parameter:
     # the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
     spring: int = -1  # joint whose stiffness changes, in state order; -1 for none
-    damper: int = -1  # joint whose damping changes
+    damper: int = -1  # joint whose damping changes, in state order; -1 for none
     by_stiffness: float = 1.0  # change of the stiffness per unit
     by_damping: float = 1.0  # change of the damping per unit
     # (Pinocchio joint, index of the input, change (6,) of its unit wrench in the joint's frame)
@@ -187,7 +187,7 @@ class Variants:
         """Return why {parameter: value} are not physically realisable, or an empty string."""
         try:
             changed = self._changed(values)
-            if self._robot.wheels or self._robot.modes:  # the link below may be too light for them
+            if self._robot.wheels or self._robot.modes:  # a link may be too light for them
                 self._with(changed, values)
         except InputError as error:
             return str(error)
@@ -282,7 +282,7 @@ def _no_body(before: Piece, piece: Piece, name: str) -> str:
     """
     if not piece.mass > 0.0:
         return f"the mass of '{name}' is {piece.mass:.4g} kg, expected above 0"
-    if (piece.inertia == before.inertia).all():  # a point mass has none
+    if (piece.inertia == before.inertia).all():  # accepted, for example zero for a point mass
         return ""
     was, least = (
         float(np.linalg.eigvalsh(0.5 * np.trace(J) * np.eye(3) - J)[0] / (np.trace(J) or 1.0))

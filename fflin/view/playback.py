@@ -36,9 +36,9 @@ class Playback:
     poses: Array  # (N, njoints - 1, 7): x, y, z and quaternion of each joint's frame in the world
     com: Array  # (N, 3) [m]
     tool: Array  # (N, 3) origin of the tool [m]
-    force: Array  # (N, 3) on the base in world axes [N]
-    torque: Array  # (N, 3) [N m]
-    thrust: Array  # (N, k) of each thruster [N]
+    force: Array  # (N, 3) [N] on the base, in world axes
+    torque: Array  # (N, 3) [N m] on the base, in world axes
+    thrust: Array  # (N, k) [N] of k thrusters
 
 
 def frame_indices(t: Array, fps: float, speed: float) -> Array:

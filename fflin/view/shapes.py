@@ -88,7 +88,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
     for link in root.find_all("link"):
         frame_id = robot.model.getFrameId(link.attributes.get("name", ""), pin.FrameType.BODY)
         if frame_id >= robot.model.nframes:
-            continue  # cut off
+            continue  # the link is not in the model
         frame = robot.model.frames[frame_id]
         if frame.parentJoint < ROOT:
             continue

@@ -309,11 +309,12 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     h, nx = 1e-5, A.shape[1]
 
     def ends(z, du):
-        return shooting.missed(*shooting.moved(q, v, z), u + du)
+        knots = shooting.moved(q, v, z)
+        return shooting.missed(*knots, shooting.motions(*knots, u + du))
 
     def third(z):
         """Return the third quarter's end of the second interval."""
-        return tuple(each[1, 2] for each in shooting.parts(*shooting.moved(q, v, z), u, 4))
+        return tuple(each[1, 48] for each in shooting.motions(*shooting.moved(q, v, z), u)[:2])
 
     for i in range(nx):
         z = np.zeros((4, nx))
@@ -328,6 +329,35 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
             du[row, i] = 1e-3
             slope = (ends(np.zeros((4, nx)), du) - ends(np.zeros((4, nx)), -du))[1] / 2e-3
             assert slope == pytest.approx(maps[1][:, i], abs=1e-8)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_limited_values_between_knots_are_those_of_finer_motions(servicer, held):
+    """The cubics between the ends of two steps: their errors fall with the fourth power of both."""
+    robot, v, goal = servicer
+    t = np.linspace(0.0, 4.0, 5)
+    shooting = Shooting(robot, t, held)
+    q, v, u = shooting.guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
+    exact = shooting.limited_values(*(x[:, 8:-1:8] for x in shooting.motions(q, v, u, 128)[:2]))
+    size = np.abs(exact).max()
+    errors = [
+        np.abs(shooting.inside(shooting.motions(q, v, u, steps), 16) - exact).max() / size
+        for steps in (4, 8, 16)
+    ]
+    assert errors[0] < 1e-3 and errors[1] < errors[0] / 8.0 and errors[2] < errors[1] / 8.0
+
+
+def test_rows_of_motions_are_those_of_single_motions(servicer):
+    """The motion flown from a start and the motions of its intervals are the same."""
+    robot, v, goal = servicer
+    shooting = Shooting(robot, np.linspace(0.0, 4.0, 5), False)
+    q, v, u = shooting.guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
+    q, v = shooting.flown((q[0], v[0]), u)
+    assert np.abs(shooting.missed(q, v, shooting.motions(q, v, u))).max() < 1e-13
+    motion = fflin.Trajectory(robot, shooting.t, q, v, u)
+    for k in range(4):
+        end = motion.flow.end(k, 16, q[k], v[k])
+        assert np.abs(shooting.between((q[k + 1], v[k + 1]), end)).max() < 1e-13
 
 
 def test_a_plan_meets_the_conditions_of_optimality(cube):

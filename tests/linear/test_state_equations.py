@@ -38,7 +38,7 @@ def rows_of(robot, frame, own):
     u = actuation.in_base_axes(chart, u)
     rates = [
         source.rates(*point, np.empty((nv, 2 * nv)), np.empty((nv, u.shape[1])))
-        for point in zip(q, v, nu, state.joint_positions(q), u, strict=True)
+        for point in zip(q, v, nu, u, strict=True)
     ]
     charts = [Standing() if own else state.chart(row) for row in q]
     return state, actuation, (chart, nu, u, rates), list(zip(charts, nu, u, rates, strict=True))

@@ -1,147 +1,180 @@
 """Multiple shooting: the initial guess, the gaps between intervals, and their Jacobians."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
+from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
 from fflin.dynamics.state import StateMap
-from fflin.linear.flow import Flow
+from fflin.linear.flow import cubic
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
 
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
 
-# Jacobians are integrated by a quarter of these steps, but by no more than this number.
+# Least number of steps per interval in a trial, because limits also apply between the steps.
+_STEPS = 16
+
+# Jacobians are integrated in a quarter of the steps of the motion, but in at most this number.
 _MOST_OF_JACOBIANS = 16
 
 Point = tuple[Array, Array]
 
 
-class Shooting:
-    """Knots at times t (N + 1,): initial points of N motions with continuity constraints."""
+class Motions(NamedTuple):
+    """Motions of N intervals from the knots, with a row at the end of each step."""
 
-    # Steps between configurations and velocities are z = (theta_b, r_b, q_m, nu) (nx,) in base
-    # axes, those of the linear models with the rotation vector for twice q_b.
+    q: Array  # (N, steps + 1, nq)
+    v: Array  # (N, steps + 1, nv)
+    rates: Array  # dv/dt (N, steps + 1, nv)
+
+
+class Shooting:
+    """Multiple shooting from equally spaced knots at times t (N + 1,), the starts of N motions."""
+
+    # A step from one point to another is z = (theta_b, r_b, q_m, nu) (nx,) in base axes. It has
+    # the states of the linear models, but the rotation vector theta_b replaces 2 q_b.
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
         self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
         self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
-        # Of one engine, so that a plan is the same to the last bit whatever ran before.
+        self._aba = Aba(self.state)
+        # The engine is fixed, so that a plan is the same bit for bit whatever ran before.
         self._linearizer = Linearizer(robot, moving=True)
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
     def between(self, start: Point, end: Point) -> Array:
-        """Return the step z (nx,) from a point to another; wheels may be at any angle."""
+        """Return the step z (nx,) from one point to another, in which wheel angles are zero."""
         state = self.state
-        way = pin.difference(state.robot.model, start[0], end[0])
-        z = np.concatenate((state.velocities(way), state.velocities(end[1] - start[1])))
+        difference = pin.difference(state.robot.model, start[0], end[0])
+        z = np.concatenate((state.velocities(difference), state.velocities(end[1] - start[1])))
         z[self.wheels] = 0.0
         return z
 
     def moved(self, q: Array, v: Array, z: Array) -> Point:
-        """Return knots a step z (N + 1, nx) further."""
-        model, (way, rates) = self.state.robot.model, np.split(z, 2, axis=1)
-        ways = self.state.spread(way)
-        rows = [pin.integrate(model, *each) for each in zip(q, ways, strict=True)]
-        return np.array(rows), v + self.state.spread(rates)
+        """Return the knots after a step z (N + 1, nx)."""
+        model, (difference, rates) = self.state.robot.model, np.split(z, 2, axis=1)
+        return integrate_rows(model, q, self.state.spread(difference)), v + self.state.spread(rates)
 
-    def missed(self, q: Array, v: Array, u: Array) -> Array:
-        """Return how far the ends of the intervals are from the next knots (N, nx)."""
-        return self.apart(q, v, self.parts(q, v, u, 1))
+    def motions(self, q: Array, v: Array, u: Array, steps: int = 0) -> Motions:
+        """Return the motions of the intervals from knots q, v under inputs u (N + 1, ..).
 
-    def apart(self, q: Array, v: Array, parts: Point) -> Array:
-        """Return how far the last parts of the intervals are from the next knots (N, nx)."""
-        knots, ends = zip(q[1:], v[1:], strict=True), (each[:, -1] for each in parts)
-        return np.array(
-            [self.between(*pair) for pair in zip(knots, zip(*ends, strict=True), strict=True)]
-        )
+        By default, each interval has the number of steps that `refine` found, but at least _STEPS.
+        """
+        return self._fly(q[:-1], v[:-1], u[:-1], u[1:], steps or max(self.steps, _STEPS))
 
-    def parts(self, q: Array, v: Array, u: Array, count: int) -> Point:
-        """Return q and v (N, count, ..) at equal parts of the motion from each knot to its end."""
-        flow, knots = self._flow(q, v, u), list(zip(q, v, strict=True))[:-1]
-        rows = [self._interval(flow, k, knot, count) for k, knot in enumerate(knots)]
-        return np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    def _fly(self, q: Array, v: Array, first: Array, last: Array, steps: int) -> Motions:
+        """Return the motions of intervals whose inputs change from `first` to `last` (N, nu)."""
+        h, change = self.h[0], 0.0 * first if self.held else last - first
+        method = CommutatorFree4(self.state.robot.model, h / steps, len(q))
+        configurations, speeds, rates = [q], [v], list[Array]()
 
-    def flown(self, start: Point, u: Array, parts: int = 1) -> Point:
-        """Return q and v of the motion from a point under inputs, so many rows an interval."""
-        N, (q, v) = len(self.t) - 1, ([each] for each in start)
-        flow = self._flow(np.tile(q, (N + 1, 1)), np.tile(v, (N + 1, 1)), u)
-        for k in range(N):
-            rows = self._interval(flow, k, (q[-1], v[-1]), parts)
-            q.extend(rows[0])
-            v.extend(rows[1])
-        return np.array(q), np.array(v)
+        def rate(t: float, q: Array, v: Array) -> Array:
+            rates.append(self._aba.accelerations(q, v, first + t / h * change))
+            return rates[-1]
 
-    def _interval(self, flow: Flow, k: int, at: Point, parts: int) -> tuple[list[Array], ...]:
-        """Return q and v at the ends of equal parts of an interval."""
-        q, v, steps = list[Array](), list[Array](), max(1, self.steps // parts)
-        for part in range(parts):
-            at = flow.end(k, steps, *at, (part / parts, (part + 1) / parts))
-            q.append(at[0])
-            v.append(at[1])
-        return q, v
+        for step in range(steps):
+            q, v = method.step(rate, step * method.dt, q, v)
+            configurations.append(q)
+            speeds.append(v)
+        rate(h, q, v)
+        found = configurations, speeds, rates[:: len(method.nodes)]
+        return Motions(*(np.array(each).swapaxes(0, 1) for each in found))
+
+    def missed(self, q: Array, v: Array, motions: Motions) -> Array:
+        """Return the gaps (N, nx) between the ends of the intervals and the next knots."""
+        rows = zip(q[1:], v[1:], motions.q[:, -1], motions.v[:, -1], strict=True)
+        return np.array([self.between(row[:2], row[2:]) for row in rows])
+
+    def flown(self, start: Point, u: Array) -> Point:
+        """Return the knots of the motion from a point under inputs."""
+        rows = [(start[0][None], start[1][None])]
+        for k in range(len(u) - 1):
+            found = self._fly(*rows[-1], u[k : k + 1], u[k + 1 : k + 2], max(self.steps, _STEPS))
+            rows.append((found.q[:, -1], found.v[:, -1]))
+        q, v = zip(*rows, strict=True)
+        return np.concatenate(q), np.concatenate(v)
+
+    def limited_values(self, q: Array, v: Array) -> Array:
+        """Return the limited values (.., nx): positions and rates of joints, zero for the base."""
+        state = self.state
+        n, values = state.robot.n, np.zeros((*q.shape[:-1], state.nx))
+        values[..., 6 : 6 + n] = state.joint_positions(q)
+        values[..., state.nx - n :] = state.velocities(v)[..., 6:]
+        return values
+
+    def inside(self, motions: Motions, parts: int) -> Array:
+        """Return the limited values (N, parts - 1, nx) between equal parts of the intervals."""
+        # Between the ends of steps, rates are Hermite cubics and positions are their integrals.
+        n, steps = self.state.robot.n, motions.q.shape[1] - 1
+        at = np.arange(1, parts) * steps / parts
+        step = at.astype(int)
+        s, h = (at - step)[:, None], self.h[0] / steps
+        rates, changes = (self.state.velocities(x)[..., 6:] for x in (motions.v, motions.rates))
+        ends = (x[:, k] for x in (rates, h * changes) for k in (step, step + 1))
+        first, rate, late, bend = cubic(*ends).swapaxes(0, 1)
+        values = self.limited_values(motions.q[:, step], motions.v[:, step])
+        average = first + s * (rate / 2.0 + s * (late / 3.0 + s * bend / 4.0))
+        values[..., 6 : 6 + n] += h * s * average
+        values[..., values.shape[-1] - n :] = first + s * (rate + s * (late + s * bend))
+        return values
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
-        """Take so many steps that the ends of the intervals are this accurate in rad, m and s."""
+        """Increase the number of steps until interval ends have this accuracy [rad, m, s]."""
         self.steps = _FEWEST_STEPS
-        missed = self.missed(q, v, u)
+        missed = self.missed(q, v, self.motions(q, v, u, self.steps))
         while self.steps < _MOST_STEPS:
             self.steps *= 2
-            before, missed = missed, self.missed(q, v, u)
+            before, missed = missed, self.missed(q, v, self.motions(q, v, u, self.steps))
             if np.abs(missed - before).max() <= accuracy:
                 break
 
     def jacobians(
         self, q: Array, v: Array, u: Array, parts: int = 1
     ) -> tuple[Array, Array, Array, Array]:
-        """Return Jacobians of the intervals' ends over z, the input there and the next one.
+        """Return Jacobians of interval ends with respect to z and the inputs at both knots.
 
-        The last array (N, parts - 1, nx, nx + 2 nu) has the Jacobians, side by side, of the points
-        between equal parts of the intervals.
+        The last array (N, parts - 1, nx, nx + 2 nu) contains the Jacobians, side by side, of the
+        points between the equal parts of the intervals.
         """
-        # By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
-        flow, (nx, nu), steps = self._flow(q, v, u), (len(self._size), u.shape[1]), self.steps // 4
-        steps = min(steps, _MOST_OF_JACOBIANS)
-        h: Array = self.h[:, None, None] / steps
-        Z = np.tile(np.eye(nx, nx + 2 * nu), (len(q) - 1, 1, 1))
+        # Runge-Kutta steps of dZ/dt = A Z + B along the motions, for all intervals at once.
+        N, nx, nu = len(self.h), len(self._size), u.shape[1]
+        steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
+        motions = self.motions(q, v, u, 4 * steps)
+        late = np.arange(2 * steps + 1) / (2.0 * steps)
+        late = np.zeros_like(late) if self.held else late
+        q, v = (each[:, ::2] for each in motions[:2])
+        inputs = u[:-1, None] + late[:, None] * np.diff(u, axis=0)[:, None]
+        points = (each.reshape(-1, each.shape[-1]) for each in (q, v, inputs))
+        models = self._linearizer.along(*points)
+        A, B = (models[name].reshape(N, len(late), nx, -1) for name in "AB")
+        late = late[:, None, None]
+        A = self._size[:, None] * A / self._size
+        driven = np.concatenate((np.zeros_like(A), (1.0 - late) * B, late * B), axis=3)
+        h = self.h[0] / steps
+        Z = np.tile(np.eye(nx, nx + 2 * nu), (N, 1, 1))
         fractions, inside = np.arange(1, parts) / parts * steps, list[Array]()
-        at = list(zip(q, v, strict=True))[:-1]
-
-        def rates(half: int) -> tuple[Array, Array]:
-            late = half / (2.0 * steps)
-            if half:
-                part = (late - 0.5 / steps, late)
-                at[:] = [flow.end(k, 2, *x, part) for k, x in enumerate(at)]
-            late = 0.0 if self.held else late
-            new = u[:-1] + late * np.diff(u, axis=0)
-            models = [self._linearizer(*x, each) for x, each in zip(at, new, strict=True)]
-            A, B = (np.array([getattr(lin, name) for lin in models]) for name in "AB")
-            driven = np.concatenate((np.zeros_like(A), (1.0 - late) * B, late * B), axis=2)
-            return self._size[:, None] * A / self._size, driven
-
-        last = rates(0)
         for step in range(steps):
-            F = last, rates(2 * step + 1), rates(2 * step + 2)
+            F = [(A[:, k], driven[:, k]) for k in range(2 * step, 2 * step + 3)]
             total, rate, before = np.zeros_like(Z), np.zeros_like(Z), Z
-            last = F[2]
             for i, fraction, weight in ((0, 0.0, 1.0), (1, 0.5, 2.0), (1, 0.5, 2.0), (2, 1.0, 1.0)):
                 rate = F[i][0] @ (Z + fraction * h * rate) + F[i][1]
                 total = total + weight * rate
             Z = Z + h / 6.0 * total
-            begin, end = (h * (f[0] @ z + f[1]) for f, z in ((F[0], before), (last, Z)))
-            for s in (
-                fractions[(fractions >= step) & (fractions < step + 1)] - step
-            ):  # cubics of Hermite
-                bend = (
-                    s * (1.0 - s) * ((1.0 - s) * begin - s * end + (2.0 * s - 1.0) * (Z - before))
-                )
-                inside.append(before + s * (Z - before) + bend)
+            begin, end = (h * (f[0] @ z + f[1]) for f, z in ((F[0], before), (F[2], Z)))
+            coefficients = cubic(before, Z, begin, end)
+            within = (fractions >= step) & (fractions < step + 1)
+            powers = (fractions[within] - step)[:, None] ** np.arange(4)
+            inside.append(np.einsum("ij,kjlm->kilm", powers, coefficients))
         A, B, D = np.split(Z, (nx, nx + nu), axis=2)
-        return A, B, D, np.array(inside).reshape(parts - 1, *Z.shape).swapaxes(0, 1)
+        return A, B, D, np.concatenate(inside, axis=1)
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
         """Return knots on cubics between two points, and approximate inputs for them."""
@@ -149,32 +182,29 @@ class Shooting:
         s, rates = self.t[:, None] / T, np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))
         rates[:, PIN_LINEAR] = (turned @ rates[:, PIN_LINEAR, None])[..., 0]
-        way, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
-        way[PIN_LINEAR] = end[0][:3] - start[0][:3]
+        difference, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
+        difference[PIN_LINEAR] = end[0][:3] - start[0][:3]
         turn = pin.log3(turned[0].T @ turned[1])
         axis = turn if turn.any() else mean[PIN_ANGULAR]
         axis = axis / (np.linalg.norm(axis) or 1.0)
         rounds = np.round((mean[PIN_ANGULAR] - turn) @ axis / (2.0 * np.pi))
-        way[PIN_ANGULAR] = turn + 2.0 * np.pi * rounds * axis
-        # Of the rotation vector at the end; on whole turns about the axis there is no other.
-        jacobian = pin.Jexp3(way[PIN_ANGULAR])
+        difference[PIN_ANGULAR] = turn + 2.0 * np.pi * rounds * axis
+        # Final rate of the rotation vector. Its Jacobian is singular after whole turns about the
+        # axis.
+        jacobian = pin.Jexp3(difference[PIN_ANGULAR])
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(jacobian, rates[1, PIN_ANGULAR], rcond=1e-6)[0]
-        late, bend = 3 * way - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * way
-        places = s * (rates[0] + s * (late + s * bend))
+        late, bend = 3 * difference - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * difference
+        displacements = s * (rates[0] + s * (late + s * bend))
         v = (rates[0] + s * (2 * late + 3 * s * bend)) / T
-        q = np.array([pin.integrate(model, start[0], step) for step in places])
-        q[:, :3] = start[0][:3] + places[:, PIN_LINEAR]
-        for turn, rate in zip(places[:, PIN_ANGULAR], v[:, PIN_ANGULAR], strict=True):
+        q = np.array([pin.integrate(model, start[0], step) for step in displacements])
+        q[:, :3] = start[0][:3] + displacements[:, PIN_LINEAR]
+        for turn, rate in zip(displacements[:, PIN_ANGULAR], v[:, PIN_ANGULAR], strict=True):
             rate[:] = pin.Jexp3(turn) @ rate
         v[:, PIN_LINEAR] = (v[:, None, PIN_LINEAR] @ rotation_matrices(q[:, 3:7]))[:, 0]
         q[-1], v[-1] = end
         u = np.zeros((len(q), len(self._linearizer().u0)))
-        flow = self._flow(q, v, u)
-        for k, rate in enumerate(np.gradient(v, self.t, axis=0)):
-            wanted = self.state.velocities(rate - flow.rate(q[k], v[k], u[k]))
-            B = self._linearizer(q[k], v[k]).B[len(wanted) :]
-            u[k] = np.linalg.lstsq(B, wanted, rcond=1e-9)[0]
+        wanted = np.gradient(v, self.t, axis=0) - self._aba.accelerations(q, v, u)
+        by_u = self._linearizer.along(q, v, u)["B"][:, self.state.nx // 2 :]
+        for k, rate in enumerate(self.state.velocities(wanted)):
+            u[k] = np.linalg.lstsq(by_u[k], rate, rcond=1e-9)[0]
         return q, v, u
-
-    def _flow(self, q: Array, v: Array, u: Array) -> Flow:
-        return Flow(self.state, self.t, q, v, u, self.held)
