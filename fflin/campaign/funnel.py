@@ -413,7 +413,7 @@ def funnel(
 class Goal:
     """Judge of the runs of a funnel: bounds on final errors or level, and on errors at any time."""
 
-    FIELDS: ClassVar[tuple[str, ...]] = ("outcome",)  # as `Funnel.outcomes` has it
+    FIELDS: ClassVar[tuple[str, ...]] = ("outcome",)  # the codes of `Funnel.outcomes`
     over: ClassVar[None] = None
 
     final: Mapping[str, float]

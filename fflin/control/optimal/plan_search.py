@@ -75,9 +75,9 @@ class Search(NamedTuple):
     asked: Flags  # states whose value at the end is prescribed (nx,)
     bounds: Array  # limits of states (2, nx)
     limits: Array  # limits of inputs (2, nu)
-    cost: Array  # of squared inputs (N + 1, nu)
-    parts: int  # states are limited at the ends of so many equal parts of each interval
-    report: Callable[[str], None]  # is given a line of text in each iteration
+    cost: Array  # weights of squared inputs (N + 1, nu)
+    parts: int  # number of parts per interval, at whose ends states are limited
+    report: Callable[[str], None]  # receives a line of text in each iteration
 
     def best(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return q, v and u at the knots with least effort, or closest to the end.
