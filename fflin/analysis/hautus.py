@@ -46,7 +46,8 @@ _REFINEMENTS, _NEAR = 4, 0.1
 # shows may then be unobservable.
 _ALIASED = 1e-6
 
-# A slower decay may be a defective pair of zero poles, moved by the square root of rounding error.
+# A pole with a slower decay may belong to a defective pair at zero, which rounding moves by the
+# square root of the rounding error.
 _DECAY = 1e-7
 
 # A motion has died out if one sample reduces it below this fraction; the rest is rounding error.

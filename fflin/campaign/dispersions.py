@@ -361,8 +361,7 @@ class Dispersions:
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
                 old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
-                # The parameters are linear in the body's properties, so a difference keeps the
-                # wheels in the body.
+                # Only the change is added, because the parameters also contain wheels in the body.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(len(drawn), -1)
         runs |= {kind: self._springs(kind, drawn) for kind in self._springs_of}

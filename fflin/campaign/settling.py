@@ -173,7 +173,7 @@ def _transition(loop: Loop, dt: float, every: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Settling:
-    """Judge that finds whether runs settle, and how far they are from the linear loop.
+    """Evaluation of runs: whether they settle, and how far they are from the linear loop.
 
     `step` is the transition matrix of the linear loop from one history entry to the next. If it is
     given, runs are not ended early and are compared with the linear loop.

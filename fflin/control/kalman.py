@@ -316,8 +316,8 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     names = e.estimated or e.state_names
     if missing := [name for name in gain.regulated if name not in names]:
         raise InputError(
-            f"the gain feeds back {listed(missing)}, which the estimator does not estimate; use the "
-            "same wheel_speeds= for both designs"
+            f"the gain feeds back {listed(missing)}, which the estimator does not estimate; use "
+            "the same wheel_speeds= for both designs"
         )
     S = selection(names, e.state_names)
     return Compensator(

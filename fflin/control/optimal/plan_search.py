@@ -24,7 +24,7 @@ _LIMITED, _TIGHTER = 0.002, 0.005
 # Intervals with gaps of at most this size are integrated as one motion.
 _MEETS = 1e-10
 
-# The end of this one motion is not corrected if its error is larger.
+# If a single motion has a larger error at the end, the error is not corrected.
 _NEARLY = 1e-3
 
 # Integration accuracy of interval ends, during the search and at its end.
