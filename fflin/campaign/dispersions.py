@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -32,6 +32,9 @@ from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
+
+if TYPE_CHECKING:
+    from fflin.robot.equipment.appendages import Appendage
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
@@ -95,7 +98,7 @@ class Dispersions:
             known["frequency"] = modes
         # Indices of the joints of the modes, in the order of the names.
         self._modes = [plant.robot.joint_names.index(name) for name in modes]
-        by_kind: dict[str, dict[str, Any]] = {}
+        by_kind: dict[str, dict[str, object]] = {}
         self.columns: list[Column] = []
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
@@ -180,7 +183,7 @@ class Dispersions:
         self, kind: str, spreads: Mapping[str, object]
     ) -> tuple[dict[str, Any], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: name} if given without a pattern."""
-        robot, found, named = self._plant.robot, dict[str, Any](), dict[str, str]()
+        robot, found, named = self._plant.robot, dict[str, object](), dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
         for key in sorted(spreads, key=lambda key: key in alone):  # names go before patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
@@ -263,7 +266,9 @@ class Dispersions:
             if appendages := self._plant.robot.appendages:
                 self._require_realisable(appendages, drawn, start)
 
-    def _require_realisable(self, appendages: Any, drawn: Array, start: int) -> None:
+    def _require_realisable(
+        self, appendages: Sequence[Appendage], drawn: Array, start: int
+    ) -> None:
         """Raise `InputError` if a body's inertia is too small for its modes' participation."""
         refused = first_impossible(self._model, appendages, self.bodies(drawn))
         if refused is not None:

@@ -273,7 +273,9 @@ def _goals(given: object, until: object, shapes: Any, header: dict[str, Any]) ->
     return goals
 
 
-def _memory(path: Path | None, runs: int, size: int, shapes: Any) -> MemoryStore | None:
+def _memory(
+    path: Path | None, runs: int, size: int, shapes: Mapping[str, tuple[int, ...]]
+) -> MemoryStore | None:
     """Return a store in memory, or None for a .h5 file, which must fit on the disk."""
     if path is None or path.suffix == ".npz":
         return MemoryStore(runs, size, shapes)
@@ -282,7 +284,7 @@ def _memory(path: Path | None, runs: int, size: int, shapes: Any) -> MemoryStore
     return None
 
 
-def _complete(store: FileStore, done: int, shapes: Any) -> None:
+def _complete(store: FileStore, done: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Complete a file in which the runs from `done` on are not needed."""
     for start in range(done, store.count, store.chunk):
         stop = min(start + store.chunk, store.count)

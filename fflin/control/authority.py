@@ -31,7 +31,7 @@ _ROUNDING = 1e-9
 _AXES = "xyz"
 
 
-def point_properties(robot: Robot, q: Array, v: Array) -> dict[str, Any]:
+def point_properties(robot: Robot, q: Array, v: Array) -> dict[str, object]:
     """Return mass properties and properties of wheels and thrusters, by name, in base axes."""
     center, inertia = mass_properties(robot, q)
     return {
@@ -91,7 +91,7 @@ def wheel_momenta(robot: Robot, q: Array, v: Array) -> tuple[Array, Array, Array
     return np.array(axes).reshape(-1, 3).T, np.array(stored), np.array(largest)
 
 
-def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, Any]:
+def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, object]:
     """Return the total momentum [N m s] of the wheels, their least capacity, and their rank."""
     axes, stored, largest = wheel_momenta(robot, q, v)
     rank = int(np.linalg.matrix_rank(axes, tol=1e-6)) if stored.size else 0
@@ -122,7 +122,7 @@ def wheel_report(properties: Mapping[str, Any]) -> str:
     return folded([text])
 
 
-def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]:
+def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, object]:
     """Return the least force and torque that the thrusters alone produce in any direction.
 
     Both are None unless the thrusters push in every direction, all have limits, and there are at
@@ -130,7 +130,7 @@ def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]
     """
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust", ())
-    found = dict[str, Any](thrusters=len(thrusters), every_way=False, bounded=False)
+    found = dict[str, object](thrusters=len(thrusters), every_way=False, bounded=False)
     found |= {"least_force": None, "least_torque": None}
     if not len(thrusters):
         return found

@@ -217,7 +217,10 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
     beside = [name for name in outputs if name not in states]
     known = (*state_keys(robot.joint_names), *input_keys(of))
-    found, parts = dict[str, Any](), list(limits) if isinstance(limits, list | tuple) else [limits]
+    found, parts = (
+        dict[str, object](),
+        list(limits) if isinstance(limits, list | tuple) else [limits],
+    )
     for k, part in enumerate(parts):
         if isinstance(part, Mapping) and beside:
             own = [x for x in part if stands_for_any(x, beside) and not stands_for_any(x, known)]

@@ -22,7 +22,7 @@ _APART = 0.1
 
 def equipment(
     robot: Robot, drawings: list[Drawing], tool: str | None, size: float
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the marks of a page: axes at base and tool, nozzles, wheels and selectable links."""
     paths = body_paths(robot)
     found = [(paths[0], pin.SE3.Identity(), 0.3)]
