@@ -82,7 +82,7 @@ def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
-    """Raise `InputError` if a marginally stable mode is excited by no disturbance."""
+    """Raise `InputError` if no disturbance excites a marginally stable mode."""
     missed = (
         "W does not excite {}, whose motion does not decay by itself, so a steady-state filter "
         "would not correct its estimate; give the noise there a positive intensity"

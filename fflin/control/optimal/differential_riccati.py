@@ -80,7 +80,7 @@ def transition(early: Coefficients, late: Coefficients, h: Array) -> Transition:
 
 
 def _constant(coefficients: Coefficients, h: Array) -> Transition:
-    """Return fourth-order transitions (k,) over intervals, from coefficients at Gauss nodes."""
+    """Return transitions for constant coefficients, by a doubled short matrix exponential."""
     A, S, Q = coefficients
     n, unit = A.shape[-1], _units(*(np.abs(x).max(axis=0) for x in coefficients))
     A, S, Q = A * unit / unit[:, None], S / np.outer(unit, unit), Q * np.outer(unit, unit)
@@ -172,8 +172,7 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
                 # Value at the middle of the cubic that has these values and derivatives.
                 bend = interval.at_start.rate(double) - interval.at_end.rate(P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
-                # Half steps are sixteen times as accurate. A factor of four of this is kept in
-                # reserve.
+                # Half steps are sixteen times as accurate. The estimate assumes only four times.
                 error = 0.25 * max(_apart(double, single), _apart(half, between))
             if error <= _ACCURACY:
                 times += [middle, start]
