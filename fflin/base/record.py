@@ -332,7 +332,7 @@ def record_of(design: Design) -> Record:
     return record
 
 
-def _saved(cls: type[Design]) -> list[Field[Any]]:
+def _saved(cls: type[Design]) -> list[Field[object]]:
     """Return the fields that files contain."""
     own = (item for item in fields(cls) if item.name != "verified" and item.name[0] != "_")
     return [item for item in own if item.type != "Robot"]

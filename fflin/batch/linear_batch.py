@@ -319,7 +319,7 @@ class LinearBatch(FrozenArrays):
         return {"header": json.dumps({**header, "points": count, "columns": self.columns})}
 
     def _model(self, index: int) -> LinearModel:
-        common: dict[str, Any] = dict.fromkeys(_MODEL)  # None unless it is set below
+        common: dict[str, object] = dict.fromkeys(_MODEL)  # None unless it is set below
         common |= {key: getattr(self, key) for key in (*_TEXTS, "verified")}
         # The row is read from the file here, so that no model keeps the file open.
         rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}

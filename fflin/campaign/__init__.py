@@ -1,5 +1,5 @@
 """Monte Carlo campaigns: many runs of a closed loop with random robot, start and sensor errors.
 
-The package has the dispersions, the runs (eight at a time in the compiled loop, or one by one in
-Python), the record of each run, and the campaign with its statistics.
+The package contains the dispersions, the runs and their statistics, and the campaign with its
+report. Runs are computed eight at a time in compiled code, or one by one in Python.
 """

@@ -1,4 +1,4 @@
-"""The record of a campaign: the outcomes of its runs, and statistics with their intervals."""
+"""Campaign: the outcomes of its runs, and statistics with confidence intervals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fflin.base import intervals
 from fflin.base.errors import InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import reading
-from fflin.base.validation import Array, FrozenArrays, share, whole
+from fflin.base.validation import Array, FrozenArrays, Mask, share, whole
 from fflin.base.writing import as_path, check_ending, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
@@ -55,7 +55,7 @@ class Bound(NamedTuple):
 def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> list[Bound]:
     """Return the comparisons in a condition such as ``attitude < 1 deg and settle < 40 s``.
 
-    `figure` returns the values (N,) and the unit of a name.
+    `figure` returns the values (N,) and the unit of a quantity.
     """
     bounds = []
     for part in condition.split(" and "):
@@ -186,7 +186,7 @@ class Campaign(FrozenArrays):
         return campaign_report(self)
 
     @property
-    def stopped(self) -> Any:
+    def stopped(self) -> Mask:
         """Whether each run (N,) was stopped before its end."""
         return self.stop != 0.0
 
@@ -243,7 +243,7 @@ class Campaign(FrozenArrays):
     def _beyond(self, sizes: Array) -> Array:
         return np.where(self.stopped[:, None], np.inf, sizes)
 
-    def met(self, condition: object) -> Any:
+    def met(self, condition: object) -> Mask:
         """Return a mask (N,) of the runs that meet a condition.
 
         Parameters
@@ -383,7 +383,7 @@ class Campaign(FrozenArrays):
         write_atomically({path: content.getvalue()})
 
     def _save(self, path: Path, **texts: str) -> None:
-        """Write it with more texts, such as the request that `monte_carlo` knows its call by."""
+        """Write the campaign with further strings, such as the request that identifies its call."""
         arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in _ARRAYS}
         rest = {key: getattr(self, key) for key in _HEADER}
         texts["header"] = json.dumps({"kind": "Campaign", **rest})
@@ -409,7 +409,9 @@ class Campaign(FrozenArrays):
             return cls.of(arrays, header)
 
     @classmethod
-    def of(cls, arrays: Mapping[str, Array], header: Any, job: Any = None) -> Campaign:
+    def of(
+        cls, arrays: Mapping[str, Array], header: Mapping[str, Any], job: CampaignJob | None = None
+    ) -> Campaign:
         """Return a campaign from its header and arrays; rows of missing runs are left out."""
         run = np.asarray(arrays["stop"]) != NOT_RUN
         values: dict[str, Any] = {

@@ -1,13 +1,13 @@
-"""Dispersions: random draws by name, and the robots and initial states that they give."""
+"""Dispersions: random values by name, and the robots and initial states that follow from them."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -33,6 +33,9 @@ from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
 
+if TYPE_CHECKING:
+    from fflin.robot.equipment.appendages import Appendage
+
 _BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
 _AXES = _OF_BODIES | {"misalignment": "12"}
@@ -42,12 +45,12 @@ _FACTORS = ("mass", "inertia", "density", "frequency", *_OF_SPRINGS)
 
 
 class Column(NamedTuple):
-    """A number that is drawn for each run, and the quantities that it changes."""
+    """Number drawn for each run, and the quantities that this number changes."""
 
     name: str
     kind: str  # "state", "delay", "seed" of noise, or the ending of a name
     at: tuple[tuple[int, int], ...]  # index of each state, body, joint, input or sensor, and axis
-    inverse: Callable[[Array], Array]  # of the distribution function
+    inverse: Callable[[Array], Array]  # inverse distribution function
 
 
 class Draws(NamedTuple):
@@ -56,19 +59,19 @@ class Draws(NamedTuple):
     drawn: Array
 
     def part(self, start: int, stop: int) -> Draws:
-        """Return the runs from `start` up to `stop`."""
+        """Return runs start to stop - 1."""
         return Draws(self.drawn[start:stop])
 
 
 class Bound(NamedTuple):
-    """A policy that a function makes for a robot, with the model of its design if it has one."""
+    """Policy that a function creates for a robot, and the model of its design, if any."""
 
     bind: Callable[[Robot], Policy]
     lin: Any = None
 
 
 class Dispersions:
-    """Dispersions of `monte_carlo`: draws, and the robots and initial states that they give."""
+    """Dispersions of `monte_carlo`: random values, and the runs' robots and initial states."""
 
     def __init__(
         self, given: object, plant: Plant, policy: object, x0: Array, seed: int, times: Times
@@ -93,9 +96,9 @@ class Dispersions:
         modes = tuple(each.name for each in plant.robot.modes)
         if modes:
             known["frequency"] = modes
-        # Joints of the modes, in the order of the names.
+        # Indices of the joints of the modes, in the order of the names.
         self._modes = [plant.robot.joint_names.index(name) for name in modes]
-        by_kind: dict[str, dict[str, Any]] = {}
+        by_kind: dict[str, dict[str, object]] = {}
         self.columns: list[Column] = []
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
@@ -121,12 +124,12 @@ class Dispersions:
                 "dispersions is empty; give at least one dispersion, such as {'q_b': 0.05}"
             )
         self._kinds = {column.kind for column in self.columns}
-        # Draws of slow distributions, by name and block.
+        # Drawn values of slow distributions, by name and block.
         self._kept: dict[tuple[str, int], Array] = {}
         self._refuse_same_mass()
 
     def _refuse_same_mass(self) -> None:
-        """Refuse masses or densities of one link twice, or of a body and of a link in it."""
+        """Raise an error if the mass of a link is dispersed twice, also as part of a body."""
         pieces = [*self._plant.robot.pieces.values()]
         masses = [*self._changed("mass"), *self._changed("density")]
         for (column, at), (other, of) in combinations(masses, 2):
@@ -179,8 +182,8 @@ class Dispersions:
     def _by_piece(
         self, kind: str, spreads: Mapping[str, object]
     ) -> tuple[dict[str, Any], dict[str, str]]:
-        """Return {link or body: spread}, and {link or body: name} where it is named alone."""
-        robot, found, named = self._plant.robot, dict[str, Any](), dict[str, str]()
+        """Return {link or body: spread}, and {link or body: name} if given without a pattern."""
+        robot, found, named = self._plant.robot, dict[str, object](), dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
         for key in sorted(spreads, key=lambda key: key in alone):  # names go before patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
@@ -195,7 +198,7 @@ class Dispersions:
         return {name: x for name, x in found.items() if name in named or name not in links}, named
 
     def _changed(self, *kinds: str) -> list[tuple[int, int]]:
-        """Return (column, index of the state, body, joint, input or sensor) of these kinds."""
+        """Return (column, index) of these kinds, with the index of a state, body, joint, .."""
         columns = enumerate(self.columns)
         return [(i, at) for i, each in columns if each.kind in kinds for at, _ in each.at]
 
@@ -205,7 +208,7 @@ class Dispersions:
         return tuple(column.name for column in self.columns)
 
     def rows(self, start: int, stop: int) -> Draws:
-        """Return the draws of some runs, which depend on seed, name and run alone."""
+        """Return the draws of runs start to stop - 1; they depend only on seed, name and run."""
         drawn = np.empty((stop - start, len(self.columns)))
         for at, column in enumerate(self.columns):
             for first in range(start // _BLOCK * _BLOCK, stop, _BLOCK):
@@ -217,13 +220,13 @@ class Dispersions:
     def _uniform(self, column: Column, block: int) -> Array:
         key = (self._seed, zlib.crc32(column.name.encode()))
         stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
-        # At 0 and 1 the inverse may be infinite.
+        # The inverse may be infinite at 0 and 1.
         return np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
 
     def _drawn(self, column: Column, block: int, count: int) -> Array:
         """Return the first values of a block of runs.
 
-        Each is drawn once, since some distributions take long.
+        Values of slow distributions are drawn once and kept.
         """
         uniform = self._uniform(column, block)
         if is_closed_form(column.inverse):
@@ -232,7 +235,7 @@ class Dispersions:
         if len(kept) < count:
             try:
                 kept = np.asarray(column.inverse(uniform[:count]), dtype=float)
-            except Exception as error:  # each distribution has its own
+            except Exception as error:  # each distribution raises its own types
                 raise InputError(
                     f"no values can be drawn from the distribution of '{column.name}': "
                     f"{reason(error)}"
@@ -241,7 +244,7 @@ class Dispersions:
         return kept
 
     def require_possible(self, runs: int) -> None:
-        """Raise `InputError` if a draw gives an invalid robot or attitude."""
+        """Raise `InputError` if a drawn value gives an invalid robot or attitude."""
         for start in range(0, runs, _BLOCK):
             drawn = self.rows(start, min(start + _BLOCK, runs)).drawn
             for values, column in zip(drawn.T, self.columns, strict=True):
@@ -263,8 +266,10 @@ class Dispersions:
             if appendages := self._plant.robot.appendages:
                 self._require_realisable(appendages, drawn, start)
 
-    def _require_realisable(self, appendages: Any, drawn: Array, start: int) -> None:
-        """Raise `InputError` if a body cannot have the participation of its modes."""
+    def _require_realisable(
+        self, appendages: Sequence[Appendage], drawn: Array, start: int
+    ) -> None:
+        """Raise `InputError` if a body's inertia is too small for its modes' participation."""
         refused = first_impossible(self._model, appendages, self.bodies(drawn))
         if refused is not None:
             try:
@@ -274,7 +279,7 @@ class Dispersions:
                 raise InputError(f"{said}: {error}; use a smaller dispersion") from None
 
     def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
-        """Return the draws (N, size, axes) of a kind; zero if not dispersed."""
+        """Return the drawn values (N, size, axes) of a kind, or zeros if it is not dispersed."""
         found = np.zeros((len(drawn), size, axes))
         for values, column in zip(drawn.T, self.columns, strict=True):
             for at in column.at if column.kind == kind else ():
@@ -282,7 +287,7 @@ class Dispersions:
         return found
 
     def starts(self, drawn: Array) -> tuple[Array, Array]:
-        """Return the initial configurations and velocities (N, nq), (N, nv)."""
+        """Return the initial configurations (N, nq) and velocities (N, nv)."""
         x = self._x0 + self._of("state", drawn, len(self._x0))[..., 0]
         return self._plant.state.points(x)[1:]
 
@@ -310,20 +315,20 @@ class Dispersions:
     def _springs(self, kind: str, drawn: Array) -> Array:
         robot = self._plant.robot
         factor: Array = 1.0 + self._of(kind, drawn, robot.n)[..., 0]
-        # The damping ratio of a mode stays where its frequency changes.
+        # If the frequency of a mode changes, its damping ratio stays the same.
         frequency = 1.0 + self._of("frequency", drawn, len(self._modes))[..., 0]
         factor[:, self._modes] *= frequency ** (2 if kind == "stiffness" else 1)
         return factor * getattr(robot.springs, kind)
 
     @property
     def _springs_of(self) -> tuple[str, ...]:
-        """Dispersed properties among stiffness and damping."""
+        """Names of the dispersed properties: stiffness, damping, both or neither."""
         if "frequency" in self._kinds:
             return _OF_SPRINGS
         return tuple(kind for kind in _OF_SPRINGS if kind in self._kinds)
 
     def _faults(self, drawn: Array) -> ActuatorFaults | None:
-        """Return the faults of the inputs in each run (N,), or None if none is dispersed."""
+        """Return the faults of the inputs in each run (N,), or None if no fault is dispersed."""
         if not self._kinds & {*_OF_INPUTS, "misalignment"}:
             return None
         gain, bias, until = (
@@ -344,12 +349,12 @@ class Dispersions:
         return bias, noise, self._of("seed", drawn, 1)[:, 0, 0]
 
     def delays(self, drawn: Array) -> Array:
-        """Return the delays (N,) in steps."""
+        """Return the delays (N,) in integration steps."""
         late = self._of("delay", drawn, 1)[:, 0, 0] / self._times.dt
         return np.maximum(0.0, np.rint(self._times.delay + late))
 
     def in_lanes(self, drawn: Array, tree: Tree) -> dict[str, Array]:
-        """Return the arrays of the compiled loop that differ from run to run."""
+        """Return the arrays of the compiled loop that vary between runs."""
         plant, (q, v) = self._plant, self.starts(drawn)
         runs = {"q": q, "nu": plant.state.velocities(v)}
         if faults := self._faults(drawn):
@@ -357,11 +362,12 @@ class Dispersions:
         if self._kinds & {*_OF_BODIES}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (len(drawn), 1, 1))
             for at, body in self.bodies(drawn).items():
-                # In the tree wheels stand between the joints.
+                # In the tree, wheels are numbered together with the joints.
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
                 old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
-                # Linear in these, so that wheels in the body stay as they are.
+                # The parameters are linear in the body's properties, so a difference keeps the
+                # wheels in the body.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(len(drawn), -1)
         runs |= {kind: self._springs(kind, drawn) for kind in self._springs_of}
@@ -384,7 +390,7 @@ class Dispersions:
         return runs
 
     def one(self, drawn: Array) -> tuple[Plant, Any, Array, Array]:
-        """Return the robot of a run (k,) with its inputs, its policy, and the initial q and v."""
+        """Return a run's robot with its inputs, its policy, and its initial q and v."""
         plant, policy, rows = self._plant, self._policy, drawn[None]
         robot, (q, v) = plant.robot, self.starts(rows)
         if bodies := self.bodies(rows):
@@ -402,7 +408,7 @@ class Dispersions:
             policy = _with_sensor_errors(policy, *(each[0] for each in self._sensing(rows)))
         if "misalignment" in self._kinds:
             robot = misaligned(robot, self._angles(rows)[0])
-            if isinstance(policy, Allocation):  # it allocates to the nominal directions
+            if isinstance(policy, Allocation):  # allocates to the nominal directions
                 given = policy
                 policy = Bound(lambda _: bound(given, plant.robot))
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
@@ -412,7 +418,7 @@ class Dispersions:
 
 
 def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: float) -> Any:
-    """Return a policy that reads its states or outputs (ny,) with these errors."""
+    """Return a policy whose states or outputs (ny,) have these measurement errors."""
     if isinstance(policy, Allocation):
         return replace(policy, policy=_with_sensor_errors(policy.policy, bias, deviation, seed))
     generator, given = noise_generator(seed), getattr(policy, "noise", None)
@@ -433,7 +439,7 @@ def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: float)
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
-    """Return m, m c, and I about the origin (xx xy xz yy yz zz) of bodies in axes (N, 10)."""
+    """Return inertial parameters (N, 10) of bodies in axes: m, m c, and I (xx xy xz yy yz zz)."""
     square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
     rows, columns = np.triu_indices(3)

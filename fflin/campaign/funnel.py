@@ -45,7 +45,8 @@ _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance
 _MOST = 1_000_000
 _ROUNDING = 1e-12  # eigenvalues of P, relative to the largest, that count as zero
 
-# Number of starts tried at a level in the search for the largest one, and of its halvings.
+# Number of runs per trial level in the search for the largest level, and largest number of
+# halvings.
 _PILOTS, _HALVINGS = 16, 40
 # The largest attitude error [deg], joint error [rad] and position or sliding joint error [m] of a
 # start.
@@ -53,10 +54,11 @@ _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
 
 
 def ellipsoid_axes(P: Array) -> Array:
-    """Return W (nx, nx) whose W W' is the pseudoinverse of P, each error in its own scale.
+    """Return W (nx, nx) with W W' the pseudoinverse of P, for errors of different units.
 
-    W is the symmetric root in these scales. Eigenvectors alone are not unique, so errors drawn by
-    them would depend on the rounding of the processor.
+    P is scaled to a unit diagonal, and W contains the symmetric root of its pseudoinverse.
+    Eigenvectors are not unique, so errors drawn along them would depend on the processor's
+    rounding.
     """
     scale = np.sqrt(P.diagonal().clip(min=0.0))
     unit = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
@@ -268,7 +270,7 @@ class Funnel(Design):
 
 
 def _half_axes(W: Array) -> Array:
-    """Return the half-axes (3,) of the ellipsoid that W (3, nx) makes of the unit sphere."""
+    """Return the half-axes (3,) of the image of the unit sphere under W (3, nx)."""
     return np.linalg.svd(np.hstack((W, np.zeros((3, 3)))))[1]
 
 
@@ -409,7 +411,7 @@ def funnel(
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """Judge of the runs of a funnel: largest final errors or level, and largest errors before."""
+    """Judge of the runs of a funnel: bounds on final errors or level, and on errors at any time."""
 
     FIELDS: ClassVar[tuple[str, ...]] = ("outcome",)  # as `Funnel.outcomes` has it
     over: ClassVar[None] = None
@@ -431,7 +433,7 @@ class Goal:
 
 
 def _beyond(sizes: Mapping[str, Array], bounds: Mapping[str, float]) -> Array:
-    """Return the mask (N,) of the runs that exceed a bound."""
+    """Return the mask (N,) of runs that exceed a bound."""
     beyond: Array = ~np.all([sizes[key] <= bound for key, bound in bounds.items()], axis=0)
     return beyond
 
@@ -445,9 +447,9 @@ class Starts(NamedTuple):
     rng: np.random.Generator
 
     def drawn(self, roots: Array) -> Array:
-        """Return the deviations (N, nx) of random errors at roots (N,) of the levels."""
+        """Return random initial deviations (N, nx) whose levels have these square roots (N,)."""
         e = self.rng.normal(size=(len(roots), len(self.P))) @ self.axes.T
-        # Directions in which P is zero do not count.
+        # Directions in which P is zero do not contribute to the level.
         e *= (roots / np.sqrt(((e @ self.P) * e).sum(axis=1)))[:, None]
         return moved_by("local", np.tile(self.center, (len(e), 1)), e) - self.center
 
@@ -460,23 +462,24 @@ def runs_from(
     options: Mapping[str, Any],
     judge: Goal | None = None,
 ) -> CampaignJob:
-    """Return the runs from knot k of the trajectory, which is time `first` of the schedule."""
+    """Return the runs from knot k of the trajectory, which is knot `first` of the schedule."""
     motion, schedule = feedback.trajectory, feedback.schedule
     rest = {name: getattr(motion, name)[k:] for name in ("t", "q", "v", "u")}
     later = {name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")}
     policy = replace(
         feedback, trajectory=replace(motion, **rest), schedule=replace(schedule, **later)
     )
-    # The chart is centred at the knot, whose attitude may be any; histories are of both ends.
+    # The chart is centred at the knot, because its attitude may be any rotation. Histories have
+    # entries at the start and at the end.
     options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), "histories": 2, **options}
     return CampaignJob(robot, policy, None, 0, "python", options, judge)
 
 
 def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
-    """Return the root of the largest level to try, at which about one run in sixteen fails."""
+    """Return the root of the largest level to test, at which about one in sixteen runs fails."""
     root = widest
     if simulate(np.zeros(1)).any():
-        return root  # even without an error the goal is missed
+        return root  # the goal is missed even without an error
     for _ in range(_HALVINGS):
         if not simulate(np.full(_PILOTS, root)).any():
             break
@@ -486,7 +489,7 @@ def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
 
 
 def _bounds(name: str, given: Any, kinds: Iterable[str]) -> dict[str, float]:
-    """Return the checked bounds {kind: largest error}."""
+    """Return {kind: largest error}, or raise `InputError`."""
     given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
     for key in given:
         if key not in kinds:
@@ -530,7 +533,7 @@ def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int
 
 
 def _widest(W: Array, robot: Robot) -> float:
-    """Return the root of the level at which errors are as large as a start may have."""
+    """Return the root of the level at which errors reach the largest allowed start error."""
     largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in robot.joints]
     reach = [
         np.linalg.norm(W[:3], 2) / np.sin(np.radians(_LARGEST_ATTITUDE / 2.0)),

@@ -38,8 +38,9 @@ from fflin.robot.robot import Robot
 from fflin.simulation.plan import SimulationOptions
 from fflin.simulation.report import pushed
 
-# With `until`, the interval is first computed after this number of runs, and again whenever their
-# number has grown by this factor. Chunks divide it, so that they do not change the number of runs.
+# With `until`, the interval is first computed after _STAGE runs, and again when the number of runs
+# has grown by the factor _GROWTH. _STAGE is a multiple of the chunk size, so that chunks do not
+# affect the number of runs.
 _STAGE, _GROWTH = 256, 1.25
 
 _OPTIONS = {each.name for each in fields(SimulationOptions)} - {
@@ -258,7 +259,7 @@ def monte_carlo(
 
 
 def _goals(given: object, until: object, shapes: Any, header: dict[str, Any]) -> list[str]:
-    """Return the goals; an invalid goal is refused before any run."""
+    """Return the goals; raise an error for an invalid goal before any run begins."""
     goals = [given] if isinstance(given, str) else given
     if not isinstance(goals, list | tuple):
         said = f"goals has type {type(given).__name__}"
@@ -272,8 +273,10 @@ def _goals(given: object, until: object, shapes: Any, header: dict[str, Any]) ->
     return goals
 
 
-def _memory(path: Path | None, runs: int, size: int, shapes: Any) -> MemoryStore | None:
-    """Return memory for the runs, or None for a .h5 file, which must fit on the disk."""
+def _memory(
+    path: Path | None, runs: int, size: int, shapes: Mapping[str, tuple[int, ...]]
+) -> MemoryStore | None:
+    """Return a store in memory, or None for a .h5 file, which must fit on the disk."""
     if path is None or path.suffix == ".npz":
         return MemoryStore(runs, size, shapes)
     if not part_of(path).exists():
@@ -281,8 +284,8 @@ def _memory(path: Path | None, runs: int, size: int, shapes: Any) -> MemoryStore
     return None
 
 
-def _complete(store: FileStore, done: int, shapes: Any) -> None:
-    """Complete a file, whose runs from `done` on were not needed."""
+def _complete(store: FileStore, done: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Complete a file in which the runs from `done` on are not needed."""
     for start in range(done, store.count, store.chunk):
         stop = min(start + store.chunk, store.count)
         unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
@@ -291,7 +294,7 @@ def _complete(store: FileStore, done: int, shapes: Any) -> None:
 
 
 def _earlier(path: Path, request: str) -> Campaign | None:
-    """Return the campaign of a file that the same call made; another file is not replaced."""
+    """Return the campaign in a file that the same call wrote; raise an error for any other file."""
     if not path.is_file():
         return None
     with suppress(FileError), reading(path, "Campaign"):
@@ -306,7 +309,7 @@ def _earlier(path: Path, request: str) -> Campaign | None:
 def _require_sendable(job: CampaignJob) -> None:
     try:
         pickle.dumps(job)
-    except Exception as error:  # what is sent has its own
+    except Exception as error:  # each object raises its own types
         raise InputError(
             f"robot, policy or spreads cannot be sent to workers ({error}); define their classes "
             "and functions at the top level of a module, or leave workers and executor out"
@@ -326,7 +329,7 @@ def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
 
 
 def _header(job: CampaignJob) -> dict[str, Any]:
-    """Return the header of a campaign: all that is not an array."""
+    """Return the header of a campaign: everything that is not an array."""
     plan, plant = job.plan, job.plant
     robot = plant.robot
     others = {f"q_m.{name}" for name in (*robot.wheels, *(mode.name for mode in robot.modes))}
@@ -352,7 +355,7 @@ def _header(job: CampaignJob) -> dict[str, Any]:
 
 
 def _request(job: CampaignJob, header: dict[str, Any]) -> str:
-    """Return a hash of everything that the result depends on."""
+    """Return a digest of everything on which the result depends."""
     draws = job.dispersions.rows(0, min(header["asked"], _STAGE))
     kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
     call = repr((kept, __version__, pin.__version__))

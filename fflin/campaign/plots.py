@@ -1,4 +1,4 @@
-"""Figures of a campaign, of the validity of a linear model, and of a funnel."""
+"""Figures of campaigns, of the validity of a linear model, and of funnels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Tail of the runs outside each band, from the widest band to the narrowest, name and opacity.
+# For each band: fraction of runs outside it on each side, name and opacity; widest band first.
 _BANDS = (
     (0.0, "all runs", 0.13),
     (0.05, "90 % of runs", 0.22),
@@ -124,7 +124,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
         left, right = figure.subplots(1, 2)
         measured = np.isfinite(validity.prediction_error)
         levels, errors = (each[measured] for each in (validity.levels, validity.prediction_error))
-        # Drawn is the error relative to the displacement, of an order less than the error's own.
+        # The figure shows the error relative to the displacement, so its order is one less than
+        # the order of the error.
         order = "relative error"
         if np.isfinite(validity.slope):
             order += f", ~ displacement^{validity.slope - 1.0:.2f}"
@@ -214,8 +215,8 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
 def _bands(
     axes: Axes, campaign: Campaign, values: Array, runs: list[int], of: Any = slice(None)
 ) -> None:
-    """Draw bands of values (N, M) of the runs `of` over time, and the lines of chosen `runs`."""
-    # Each bound is the value of a run, since interpolation with infinite values is not finite.
+    """Draw bands of the values (N, M) of runs `of` over time, and one line for each of `runs`."""
+    # Interpolation between infinite values is not finite, so each bound is the value of one run.
     most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
     shown, t = np.minimum(values[of], most), campaign.times
     for tail, name, dark in _BANDS:
@@ -234,21 +235,21 @@ def _error(axes: Axes, campaign: Campaign, kind: str, runs: list[int]) -> None:
     _bands(axes, campaign, history, runs)
     ends = np.quantile(history, 0.05, axis=0, method="inverted_cdf")
     most, least = axes.get_ylim()[1], float(ends[ends > 0.0].min(initial=np.inf))
-    if least < 0.05 * most:  # so that the ends are told apart
+    if least < 0.05 * most:  # so that small final values are visible
         axes.set(yscale="log", ylim=(max(0.5 * least, most * 10.0**-_DECADES), 1.5 * most))
     _goals(axes.axhline, campaign, kind)
     axes.set(title=f"{kind} error", ylabel=f"[{KINDS[kind]}]")
 
 
 def _goals(draw: Any, campaign: Campaign, *names: str) -> None:
-    """Draw the bounds of the goals on these figures."""
+    """Draw the bounds that the goals set on these quantities."""
     for bound in campaign.bounds:
         if bound.name in names:
             draw(bound.limit, ls="--", lw=1.0, color=_GOAL, label="goal or limit")
 
 
 def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
-    """Draw histograms of the final and the worst error of the completed runs."""
+    """Draw histograms of the final and the largest error of the completed runs."""
     names = {kind: ("final", _INK), f"worst {kind}": ("worst of run", COLORS[1])}
     of = {name: campaign.values(name)[~campaign.stopped] for name in names}
     values = np.append(list(of.values()), 0.0)
@@ -272,7 +273,7 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
 def _inputs(
     axes: Axes, campaign: Campaign, group: str, columns: list[int], runs: list[int]
 ) -> None:
-    """Draw the largest input of a group in the completed runs, and its limit."""
+    """Draw the largest input of a group over time in the completed runs, and its limit."""
     largest = np.abs(campaign.input_history[..., columns]).max(axis=2)
     if not campaign.stopped.all():
         _bands(axes, campaign, largest, runs, ~campaign.stopped)
@@ -285,7 +286,7 @@ def _inputs(
 
 
 def _correlations(axes: Axes, campaign: Campaign) -> None:
-    """Draw rank correlations with the default figure, and the band of chance correlations."""
+    """Draw rank correlations with the default quantity, and the range that chance explains."""
     found = list(campaign.sensitivity().items())[:_BARS][::-1]
     doubt = min(1.0, 3.0 / math.sqrt(len(campaign)))
     axes.axvspan(-doubt, doubt, color="#999999", alpha=0.18, lw=0)

@@ -1,4 +1,4 @@
-"""Misaligned inputs: the actual directions of thrusters, wheels, torques and forces."""
+"""Misaligned inputs: actual directions of thrusters, wheels, torques and forces."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ALONG: dict[type[Any], str] = {Thruster: "direction", ReactionWheel: "axis"}
 
 
 def turned(direction: object, angles: Array) -> Array:
-    """Rotate a direction (3,) by angles (N, 2) [rad] about two perpendicular axes; (N, 3)."""
+    """Return a direction rotated by angles (N, 2) [rad] about two perpendicular axes, (N, 3)."""
     first, second, along = turned_to(np.array(direction, dtype=float)).T
     size = np.linalg.norm(angles, axis=1)[:, None]
     side = angles[:, 1:] * first - angles[:, :1] * second
@@ -41,7 +41,7 @@ def require_direction(robot: Robot, at: int) -> None:
 
 
 def columns_of(robot: Robot, angles: Array) -> Array:
-    """Return the axes of tau_b and F_b in each run (N, 9 vectors), see `ActuatorFaults`."""
+    """Return the actual axes of tau_b and F_b in each run, as in `ActuatorFaults`."""
     found: list[Array] = [np.zeros((len(angles), 0))]
     for item, names, first in _indexed(robot):
         if len(item.ENTRIES) == len(names) == 3:
@@ -60,7 +60,7 @@ def misaligned(robot: Robot, angles: Array) -> Robot:
 
 
 def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str, Array]:
-    """Return wrenches, stored momenta, joints and changes of the bodies in each run (N,)."""
+    """Return wrenches, stored momenta, joint placements and inertia changes of each run (N,)."""
     model, count, names = robot._bare.model, len(angles), list(robot.model.names)
     wrench, stored, fixed, bodies = (
         np.tile(each, (count, 1)).reshape(count, -1, size)
@@ -99,7 +99,7 @@ def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str,
 
 
 def _indexed(robot: Robot) -> Iterator[tuple[Input, tuple[str, ...], int]]:
-    """Yield each input with the names of its entries and the index of the first in u."""
+    """Yield each input with the names of its entries and the index of the first entry in u."""
     first = 0
     for item, names in named_inputs(robot.inputs):
         yield item, names, first

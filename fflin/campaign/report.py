@@ -17,7 +17,7 @@ _SHARES = (0.5, 0.95, 0.99)
 
 
 def campaign_report(campaign: Campaign) -> str:
-    """Return the report: error quantiles, success rates of goals, and rank correlations."""
+    """Return the report: success rates of goals, error quantiles and rank correlations."""
     count, quantile = len(campaign), campaign.quantile
     by = ", compiled" if campaign.engine == "compiled" else ""
     few = f" of {campaign.asked:,} requested" if count < campaign.asked else ""
@@ -41,22 +41,23 @@ def campaign_report(campaign: Campaign) -> str:
 
 
 def ended_of(campaign: Campaign) -> str:
-    """Return how many runs completed, and how the others ended."""
+    """Return the number of completed runs, and the numbers of stopped runs by reason."""
     said = ", ".join(f"{number:,} {word}" for word, number in _stops(campaign).items())
     return f"{int((campaign.stop == 0.0).sum()):,} completed; {said or 'none stopped early'}"
 
 
 def goal_met(campaign: Campaign, goal: str) -> str:
-    """Return the success rate of a goal, with its interval."""
+    """Return the success rate of a goal, with its confidence interval."""
     met = campaign.fraction(goal, confidence=campaign.confidence)
     value, low, high = (f"{100.0 * x:.4g}" for x in met)
     return f"{goal}: {value} % ({low} to {high} % at {100.0 * campaign.confidence:g} % confidence)"
 
 
 def influences(campaign: Campaign) -> dict[str, dict[str, float]]:
-    """Return the significant rank correlations of the drawn values with the figures of interest.
+    """Return the significant rank correlations of the drawn values with each quantity of interest.
 
-    These are the figures in the goals, then the worst errors and the settling time, at most five.
+    At most five quantities are included: first the quantities in the goals, then the worst errors,
+    then the settling time.
     """
     about, doubt = (
         [campaign.about, *(x.name for x in campaign.bounds)],
@@ -70,14 +71,15 @@ def influences(campaign: Campaign) -> dict[str, dict[str, float]]:
 
 
 def worst_runs(campaign: Campaign, k: int) -> list[str]:
-    """Show the k worst runs, and the influential value that each drew farthest from the median."""
+    """Return a table of the k worst runs, with the most influential draw of each run."""
     if not k:
         return []
     about, (values, unit) = campaign.about, campaign.figure(campaign.about)
     rows = [["run", about, "unit", "settling [s]", "end [s]", "most influential draw"]]
     ranks = campaign.drawn.argsort(axis=0).argsort(axis=0)
     weights = {key.strip("|"): abs(x) for key, x in campaign.sensitivity().items()}
-    # The seed of a run's noise has no weight.
+    # A draw is influential if it is far from the median and its correlation is large. The seed of
+    # the noise has no correlation.
     out = abs(ranks - ranks.mean()) * [weights.get(name, 0.0) for name in campaign.names]
     for run in campaign.worst(k):
         far = int(out[run].argmax())
@@ -90,12 +92,12 @@ def worst_runs(campaign: Campaign, k: int) -> list[str]:
 
 
 def _when(time: float, unit: str = "") -> str:
-    """Show a settling time as the report of a motion does."""
+    """Format a settling time as in the report of a motion."""
     return f"{time:.3g}{unit}" if math.isfinite(time) else "not yet"
 
 
 def campaign_record(campaign: Campaign, worst: int) -> dict[str, Any]:
-    """Return the report as JSON values: [value, low, high] of each, null if one is infinite."""
+    """Return the report as JSON values: [value, low, high], with null for infinite values."""
 
     def plain(values: Iterable[float]) -> list[float | None]:
         return [x if math.isfinite(x) else None for x in values]

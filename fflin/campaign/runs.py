@@ -42,16 +42,16 @@ from fflin.simulation.plant import Plant, conserved_by
 from fflin.simulation.run import Recording, go
 from fflin.simulation.simulate import motion_of
 
-ARRAYS = Outcome._fields[:-1]  # of the record of a campaign
+ARRAYS = Outcome._fields[:-1]  # arrays in the record of a campaign
 _LARGEST_CHUNK = 256
-_FEW_STEPS, _SOME_STEPS = 4, 64  # that are measured to estimate the time of runs
+_FEW_STEPS, _SOME_STEPS = 4, 64  # steps timed to estimate the duration of runs
 
 
 class CampaignJob:
     """Runs of one plan, each with its own drawn values; see `batch.run.Job`.
 
-    Without dispersions the drawn values are the deviations of the initial state. The figures of a
-    `judge`, which may end the runs early, replace the record of a campaign.
+    Without dispersions, the drawn values are the deviations of the initial state. A `judge` may end
+    runs early, and its results replace the record of a campaign.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class CampaignJob:
         options: Any,
         judge: Judge | None = None,
     ) -> None:
-        self._arguments: tuple[Any, ...] = (robot, policy, given, seed, engine, options, judge)
+        self._arguments: tuple[object, ...] = (robot, policy, given, seed, engine, options, judge)
         self.judge, options = judge, dict(options)
         # A judge compares with the start.
         histories = options.pop("histories", 0 if judge is None else 1)
@@ -76,7 +76,7 @@ class CampaignJob:
             self.plan = replace(self.plan, limits=Saturation(-most, most))
         self.engine, state, times = engine, self.plant.state, self.plan.times
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
-        # Errors are deviations from a state (nx,), or from a moving one (steps + 1, nx).
+        # Errors are deviations from a fixed state (nx,) or a moving state (steps + 1, nx).
         self.target, self._path = self.x0 if self.plan.target is None else self.plan.target, []
         if reference := self.plan.reference:
             t = times.dt * np.arange(times.steps + 1)
@@ -88,20 +88,21 @@ class CampaignJob:
             self.dispersions = Dispersions(
                 given, self.plant, self.plan.policy, self.x0, seed, times
             )
-        # Steps at which histories are kept.
+        # Steps at which the histories have entries.
         self.steps = np.unique(np.linspace(0.0, times.steps, histories).round().astype(int))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A worker repeats the construction, since functions bound to a robot cannot be sent.
+        # A worker constructs the job again, because functions that are bound to a robot cannot be
+        # pickled.
         return _remade, (self._arguments, self.engine)
 
     def choose(self, engine: object) -> None:
-        """Set the engine of the runs: the requested one, or the faster one that supports them."""
+        """Set the engine of the runs: the requested one, or the fastest that supports the plan."""
         self.engine = engine_of(engine, self.plan, self.plant, many=True)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of each array that is kept of a run."""
+        """Shape per run of each array of the result."""
         if self.judge:
             return dict.fromkeys(self.judge.FIELDS, ())
         return {key: self._shapes[key] for key in ARRAYS}
@@ -114,10 +115,10 @@ class CampaignJob:
         return dict(zip(Outcome._fields, [*sizes, *histories, (), (), states], strict=True))
 
     def digest(self, first: Draws) -> str:
-        """Return a hash of the robot, the policy, the options and the first run.
+        """Return a digest of the robot, the policy, the options and the first run.
 
-        It needs nothing to be compiled: the arrays of the compiled loop contain all of these. In
-        Python a policy may be any function, which the outcome of the first run represents.
+        Nothing is compiled for it, because the arrays of the compiled loop contain all of these. In
+        Python, a policy may be any function, so the outcome of the first run represents it.
         """
         if self.engine == "python":
             return content_digest(self.run(first, 0).arrays)
@@ -127,7 +128,7 @@ class CampaignJob:
         )
 
     def run(self, rows: Draws, start: int, out: Mapping[str, Array] | None = None) -> ChunkResult:
-        """Simulate the runs of some rows."""
+        """Simulate runs with the given drawn values."""
         drawn, shapes = np.asarray(rows.drawn), self._shapes if self.judge else self.shapes
         found: dict[str, Array] = {
             key: np.empty((len(drawn), *shape)) for key, shape in shapes.items()
@@ -161,7 +162,7 @@ class CampaignJob:
         return self.dispersions.in_lanes(drawn, tree)
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
-        """Return the plan of a run (k,), and its robot."""
+        """Return the plan of a run (k,), and its plant."""
         plan, (plant, policy, q, v) = self.plan, self.dispersions.one(drawn)
         law = law_of(policy, plant, plan.limits, plan.times)
         times = plan.times._replace(delay=int(self.dispersions.delays(drawn[None])[0]))
@@ -176,7 +177,7 @@ class CampaignJob:
         return outcome_of(plan, self.plant.state, self.target, self.steps, run)
 
     def _event(self, over: Over, plan: Plan) -> Event:
-        """Return the event of a stop condition for a run in Python."""
+        """Return the stop condition as an event of a run in Python."""
 
         def errors(q: Array, v: Array) -> Array:
             return errors_of(self.plant.state, self.target, q[None], v[None])[1]
@@ -190,7 +191,7 @@ class CampaignJob:
         return stops
 
     def seconds(self, first: Draws, count: int) -> float:
-        """Return the estimated time [s] of runs on one core, from a few steps of the first runs."""
+        """Estimate the time [s] of runs on one core from a few steps of the first runs."""
         few, plan = _remade(self._arguments, self.engine), self.plan
         compiled, steps = self.engine == "compiled", plan.times.steps
         lanes = LANES if compiled else 1
@@ -203,13 +204,13 @@ class CampaignJob:
             return perf_counter() - began
 
         short, long = (min(each, steps) for each in (_FEW_STEPS, _SOME_STEPS))
-        measured(1)  # compiles what is not compiled yet
+        measured(1)  # compiles the loop if needed
         begin = measured(short)
         step = (measured(long) - begin) / (long - short) if long > short else 0.0
         return (begin + max(step, 0.0) * (steps - short)) * math.ceil(count / lanes)
 
     def replay(self, drawn: Array) -> Motion:
-        """Simulate a run (k,) again with the same arithmetic, and return its motion."""
+        """Repeat a run (k,) with the same arithmetic, and return its motion."""
         plan, plant = self.plan_of(drawn)
         if self.engine == "python":
             run = _recorded(plan, plant, plan.times.every)
@@ -220,7 +221,7 @@ class CampaignJob:
 
 
 def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:
-    """Simulate a run in Python, and keep a row of every so many steps."""
+    """Simulate a run in Python, and record a row every `every` steps."""
     plan = replace(plan, times=plan.times._replace(every=every))
     run = go(plan, plant, conserved_by(plant.robot, plan.q, plant.field))
     if run.stopped.startswith("interrupted"):
@@ -228,15 +229,15 @@ def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:
     return run
 
 
-def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, Any]:
-    """Return the arrays and numbers by which the compiled loop knows a plan, without compiling it.
+def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, object]:
+    """Return all arrays and numbers that the compiled loop reads for a plan, without compiling it.
 
-    Two plans with the same arrays have the same runs.
+    Two plans with equal arrays have equal runs.
     """
     parts = packed(plan, plant)
     last = min(plan.times.steps, SLOTS * plan.times.sample)
     samples = noises(plan, len(parts.law.y), 0, last)[1] if noise_of(plan) else np.zeros(0)
-    found: dict[str, Any] = {"noise": samples}
+    found: dict[str, object] = {"noise": samples}
 
     def collect(name: str, value: object) -> None:
         if isinstance(value, tuple):
@@ -255,9 +256,10 @@ def expect(
     executor: Executor | None,
     threads: int | None,
 ) -> None:
-    """Tell a progress bar the estimated time of jobs, each with its first runs and their number.
+    """Report the estimated time of jobs to a progress bar.
 
-    Only the bar of the command line has the method `expect`; a function is only called.
+    Each job comes with the draws of its first runs and its number of runs. Only the progress bar of
+    the command line has the method `expect`; other functions do not receive the estimate.
     """
     tell = getattr(progress, "expect", None)
     if tell is None:
@@ -270,12 +272,12 @@ def expect(
     try:
         seconds = sum(job.seconds(first, count) for job, first, count in work)
     except FflinError:
-        return  # of a run, which the work itself reports
+        return  # the run itself reports this error
     tell(seconds / cores, cores)
 
 
 def _remade(arguments: tuple[Any, ...], engine: str) -> CampaignJob:
-    """Make a job in a worker, with warnings suppressed."""
+    """Create a job in a worker, without repeating its warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         job = CampaignJob(*arguments)
@@ -284,7 +286,7 @@ def _remade(arguments: tuple[Any, ...], engine: str) -> CampaignJob:
 
 
 def chunk_size(count: int, workers: int, least: int = LANES) -> int:
-    """Return the number of runs per chunk with which each worker has several chunks."""
+    """Return the number of runs per chunk that gives each worker several chunks."""
     size = _LARGEST_CHUNK
     while size > least and 4 * workers * size > count:
         size //= 2

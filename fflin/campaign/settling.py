@@ -1,6 +1,7 @@
 """Settling of a regulated robot: error norm, random displacements, and runs from them.
 
-The norm belongs to the Lyapunov function of the linear loop that decays as the robot's energy does.
+The norm is the square root of a Lyapunov function of the linear loop. The rate of this function is
+minus a quadratic form in units of energy.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.run import STOPS
 
-# Ratio of a run's error to its initial error at which it has settled, and has diverged.
+# A run has settled or diverged if its error, relative to the initial error, reaches these values.
 SETTLED, DIVERGED = 1e-3, 1e3
-# Duration of a comparison with the prediction in time constants of the slowest pole, and of a
-# random run in times that this pole needs to settle.
+# Duration of a run that is compared with the prediction, in time constants of the slowest pole.
+# Duration of a random run, in settling times of this pole.
 _CONSTANTS, _PATIENCE = 3.0, 3.0
 _STEP = 0.25  # time step times the fastest pole
 _WIDEST = 10.0  # displacement of a joint [rad] up to which steps shorten in proportion
@@ -45,7 +46,7 @@ OUTCOMES = ("slow", "settled", "chart", "diverged")
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A robot, its linear model, and the feedback ``u = u0 - K (z - z0)`` on the model's states."""
+    """Robot, its linear model, and the feedback ``u = u0 - K (z - z0)`` of the model's states z."""
 
     robot: Robot
     lin: LinearModel  # whole or reduced; sampled if its input is held
@@ -53,17 +54,17 @@ class Loop:
 
     @cached_property
     def state(self) -> StateMap:
-        """The whole state of the robot, in the model's axes."""
+        """Map of the full state of the robot, in the axes of the model."""
         return StateMap(self.robot, reference=self.lin.reference, frame=self.lin.frame)
 
     @cached_property
     def start(self) -> Array:
-        """The state (nx,) of the operating point."""
+        """State (nx,) at the operating point."""
         return self.state.to_state(self.lin.q, self.lin.v)
 
     @cached_property
     def watched(self) -> Array:
-        """Mask of the entries of the whole state that are states of the model."""
+        """Indices of the model's states in the full state."""
         names = self.state.names
         return np.array([names.index(name) for name in self.lin.state_names], dtype=np.intp)
 
@@ -75,7 +76,7 @@ class Loop:
 
     @cached_property
     def decay(self) -> float:
-        """The slowest decay of the linear loop [1/s]; not positive where it is unstable."""
+        """Slowest decay rate [1/s] of the linear loop; not positive if the loop is unstable."""
         poles = np.linalg.eigvals(self.rate)
         if self.lin.dt:
             return -math.log(max(float(np.abs(poles).max()), 1e-300)) / self.lin.dt
@@ -83,12 +84,13 @@ class Loop:
 
     @cached_property
     def weight(self) -> Array:
-        """P of the Lyapunov function of the linear loop."""
+        """Matrix P of the Lyapunov function of the linear loop."""
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
         names = self.lin.state_names
         of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
-        # A coordinate as its rate; a rate may stand without one.
+        # A coordinate is weighted like its rate, multiplied by the decay. A rate may have no
+        # coordinate.
         size = [self.decay * of[rate_of(name)] for name in names if name not in of]
         Q = np.diag(np.array([*size, *of.values()]) ** 2)
         solve = solve_discrete_lyapunov if self.lin.dt else solve_continuous_lyapunov
@@ -103,7 +105,7 @@ class Loop:
     def displaced(
         self, rng: np.random.Generator, attitude: float, position: float, joint: float
     ) -> Array:
-        """Return a state (nx,) displaced by [deg], [m] and [rad|m], the model's states alone."""
+        """Return a state (nx,) whose model states have random displacements [deg], [m], [rad|m]."""
         g, x = self.state.groups, self.start.copy()
         axis, along = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
         turn = np.radians(attitude) / 2.0
@@ -122,13 +124,14 @@ class Loop:
 def settling_runs(
     loop: Loop, predicts: bool, limits: object, joint: float, fine: int = 0
 ) -> CampaignJob:
-    """Return runs of a loop from displaced states, until they settle or up to a horizon.
+    """Return runs of a loop from displaced states that end when they settle, or at a horizon.
 
-    With `predicts`, they last three time constants and are compared with the linear loop. `joint`
-    is the largest displacement of a joint, and `fine` is how often the steps have been shortened.
+    With `predicts`, runs last three time constants and are compared with the linear loop. `joint`
+    is the largest displacement of a joint. `fine` counts how often the steps have been shortened.
     """
     lin, decay = loop.lin, loop.decay
-    # Between samples, and where an input saturates, the robot moves without its loop.
+    # The open loop also limits the step, because inputs are constant between samples and at
+    # saturation.
     free = linearize(loop.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
     rates = [2.0 * free.A] if lin.dt else [free.A, loop.rate]
     fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
@@ -148,7 +151,7 @@ def settling_runs(
     dt, every = dt / finer, every * finer
     options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
     options |= {"limits": limits, "project": not predicts}
-    # Without limits no input saturates, and thrusters may pull.
+    # Without limits, inputs do not saturate and thrusters may pull.
     options |= {"unlimited": limits is None}
     options |= {"histories": checks + 1} if predicts else {}
     judge = Settling(loop, _transition(loop, dt, every) if predicts else None)
@@ -156,10 +159,10 @@ def settling_runs(
 
 
 def _transition(loop: Loop, dt: float, every: int) -> Array:
-    """Return the transition matrix of the linear loop from check to check.
+    """Return the transition matrix of the linear loop from one check to the next.
 
-    For a linear system CF4 is the classical method of order four, which multiplies by its stability
-    polynomial in each step. The two loops then differ by their nonlinear terms alone.
+    For a linear system, CF4 is the classical fourth-order method: each step multiplies the state by
+    the stability polynomial. The two loops therefore differ only by nonlinear terms.
     """
     if loop.lin.dt:
         return loop.rate
@@ -170,13 +173,13 @@ def _transition(loop: Loop, dt: float, every: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Settling:
-    """Judge of the runs of a loop: whether they settle, and how far they are from the linear loop.
+    """Judge that finds whether runs settle, and how far they are from the linear loop.
 
-    With the transition matrix `step` of the linear loop from history to history, runs go on to
-    their end and are compared with that loop.
+    `step` is the transition matrix of the linear loop from one history entry to the next. If it is
+    given, runs are not ended early and are compared with the linear loop.
     """
 
-    # Index into OUTCOMES, and largest relative prediction error.
+    # Names of the results: index into OUTCOMES, and largest relative prediction error.
     FIELDS: ClassVar[tuple[str, ...]] = ("outcome", "error")
 
     loop: Loop
@@ -184,7 +187,7 @@ class Settling:
 
     @property
     def over(self) -> Over | None:
-        """Stop condition of the runs: settled or diverged; None if they are compared."""
+        """Stop condition: settled or diverged; None if runs are compared with the linear loop."""
         return self._is_over if self.step is None else None
 
     def _is_over(self, first: Array, e: Array) -> Mask:
@@ -204,7 +207,7 @@ class Settling:
         return {"outcome": code, "error": np.where(code > 1, np.nan, apart / first)}
 
     def _apart(self, e: Array, step: Array) -> Array:
-        """Return the largest distances (N,) from the linear loop."""
+        """Return the largest distance (N,) of each run from the linear loop."""
         worst, predicted = np.zeros(len(e)), e[:, 0]
         for now in e.swapaxes(0, 1):
             worst = np.maximum(worst, self.loop.size(now - predicted))
@@ -219,10 +222,10 @@ def settle(
     engine: str | None = None,
     **how: Any,
 ) -> dict[str, Array]:
-    """Return the figures of runs; those that diverge are repeated in shorter steps.
+    """Return the results of runs; diverging runs are repeated with shorter steps.
 
-    `runs_of` makes the runs in steps that have been shortened so many times, and `starts` returns
-    the deviations (N, nx) from which runs (N,) start.
+    `runs_of` creates the runs after a number of step reductions. `starts` returns the initial
+    deviations (N, nx) of runs (N,).
     """
     arrays, left = dict[str, Array](), np.arange(count)
     for fine in range(_FINEST + 1):
@@ -243,14 +246,14 @@ def settle(
 
 
 def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
-    """Return the loop of a gain, or raise `InputError` where it cannot settle at the point."""
+    """Return the loop of a gain; raise `InputError` if it cannot settle at the operating point."""
     if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
         given = f"robot has type {type(robot).__name__}, lin has type {type(lin).__name__}"
         raise InputError(f"{given}; expected a fflin.Robot and its fflin.LinearModel")
     K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
     kept = getattr(gain, "regulated", ())
     part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
-    if part.state_names == kept:  # the others, which are left to themselves, do not settle
+    if part.state_names == kept:  # states that are not fed back do not settle
         K, lin = K @ selection(kept, lin.state_names).T, part
     loop = Loop(robot, lin, K)
     require_fit(lin, robot, loop.state)

@@ -1,4 +1,4 @@
-"""Spreads of dispersed values: from Python or a TOML file, as inverse distribution functions."""
+"""Spreads of random values, from Python or a TOML file, as inverse distribution functions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _EXPECTED = (
 
 
 class DispersionFile(dict[str, Any]):
-    """{name, group or pattern: spread} of a file, and their line numbers."""
+    """{name, group or pattern: spread} from a file, with the file's line numbers."""
 
     def __init__(self, document: TomlFile) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class DispersionFile(dict[str, Any]):
 
 
 def placed(dispersions: object) -> AbstractContextManager[None]:
-    """Put file and line of the spread that an error names in front of its message."""
+    """Add the file and the line of a spread to errors that name the spread."""
     if isinstance(dispersions, DispersionFile):
         return dispersions.document.located(_TABLE)
     return nullcontext()
@@ -109,7 +109,7 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
 
 
 def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield (name, spread); ``base.mass = 0.1`` is the name "base.mass"."""
+    """Yield (name, spread); the key path ``base.mass = 0.1`` becomes the name "base.mass"."""
     for key, value in table.items():
         if isinstance(value, dict) and value and not {*value} & {*_FORMS}:
             yield from _names(value, f"{before}{key}.")
@@ -191,7 +191,7 @@ def inverse_of(name: str, spread: object) -> Callable[[Array], Array]:
 
 
 def is_closed_form(inverse: Callable[[Array], Array]) -> bool:
-    """Return whether an inverse is from this module; inverses of SciPy may be slow."""
+    """Return whether this module defines an inverse function; SciPy's functions may be slow."""
     return isinstance(inverse, partial) or inverse is whole_number
 
 
@@ -211,12 +211,12 @@ def _normal(deviation: float, u: Array) -> Array:
 
 
 def whole_number(u: Array) -> Array:
-    """Return seeds of noise: whole numbers that are all different doubles."""
+    """Return whole numbers, all different and exact as doubles, that serve as seeds of noise."""
     return np.floor(u * 2.0**53)
 
 
 def deviation_of(name: str, spread: Any) -> Callable[[Array], Array]:
-    """Return the inverse for the standard deviation of noise; a number is this deviation itself."""
+    """Return the inverse for the deviation of noise; a number stands for the deviation itself."""
     inverse = inverse_of(name, spread)
     fixed = getattr(inverse, "func", None) is _normal
     return partial(_choice, np.array([float(spread)])) if fixed else inverse

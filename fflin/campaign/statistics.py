@@ -1,6 +1,6 @@
 """Statistics of a run: final and largest errors, settling times, and histories at a few times.
 
-Their size does not depend on how long the run is.
+Their size does not depend on the duration of the run.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from fflin.simulation.plan import Plan
 from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
 from fflin.simulation.run import Recording, stop_of
 
-# Kinds of errors with their units; the error of a kind is its largest entry. Wheels and modes are
-# no joints.
+# Kinds of errors with their units. The error of a kind is its largest entry; wheels and modes do
+# not count as joints.
 KINDS = {
     "attitude": "deg",
     "position": "m",
@@ -36,25 +36,25 @@ KINDS = {
 }
 # Attitude error [deg] at which a run is close to the end of the chart.
 EDGE = 176.0
-# Steps between checks of a stop condition, and where there is none.
+# Steps between checks of a stop condition, and steps per call without a stop condition.
 LOOK, _LONG = 64, 2**20
 
-# Returns a mask (N,) of the runs that end, from the state errors (N, nx) at the start and now.
+# Function of the state errors (N, nx) at the start and now; returns the mask (N,) of ended runs.
 Over: TypeAlias = Callable[[Array, Array], Mask]
 
-# Former names of kinds, which conditions and goals may still use.
+# Former names of kinds, which conditions and goals still accept.
 _FORMER = {"turning": "omega_b", "moving": "v_b", "rates": "joint rates"}
 
 
 def kind_named(name: str) -> str:
-    """Return a name of a kind of error, such as ``worst turning``, with its present words."""
+    """Replace the former name of a kind of error, as in ``worst turning``, by its present name."""
     of, _, kind = name.rpartition(" ")
     kind = _FORMER.get(kind, kind) if of in ("", "worst", "settle") else kind
     return f"{of} {kind}".strip()
 
 
 class Outcome(NamedTuple):
-    """Outcomes of runs, one row of each array per run."""
+    """Outcomes of runs; each array has one row per run."""
 
     q: Array  # (N, nq), final
     v: Array  # (N, nv)
@@ -73,22 +73,23 @@ class Outcome(NamedTuple):
 
 
 class Judge(Protocol):
-    """Judgement of runs that replaces the record of a campaign, and may end them early."""
+    """Evaluation of runs that replaces the record of a campaign, and may end runs early."""
 
     FIELDS: ClassVar[tuple[str, ...]]
 
     @property
     def over(self) -> Over | None:
-        """Stop condition, checked every `LOOK` steps; None if every run goes on to its end."""
+        """Stop condition, checked every `LOOK` steps; None if no run is ended early."""
 
     def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
-        """Return the FIELDS (N,) of runs from their `Outcome`, whose first history is the start."""
+        """Return the FIELDS (N,) from the runs' `Outcome`; the first history entry is the start."""
 
 
 def kinds_of(state: StateMap) -> Indices:
     """Return the index into KINDS of each state (nx,).
 
-    It is 0 for the attitude and for states without a kind, such as modes, and -1 for wheels.
+    The index is 0 for the attitude and for states without a kind, such as modes. The index is -1
+    for wheels.
     """
     kind = np.zeros(state.nx, dtype=np.intp)
     groups, wheels = state.groups, state.robot.wheels
@@ -114,10 +115,10 @@ def errors_of(state: StateMap, target: Array, q: Array, v: Array) -> tuple[Array
 def outcome_of(
     plan: Plan, state: StateMap, target: Array, steps: Array, run: Recording
 ) -> dict[str, Array]:
-    """Return the outcome, a row of each array of `Outcome`, of a run with a row for every step.
+    """Return a run's outcome, one row of each array of `Outcome`, from its recorded steps.
 
-    Errors are those from the state `target` (nx,), or from a moving one (steps + 1, nx). Histories
-    are kept at `steps`.
+    Errors are relative to the state `target` (nx,), or to a moving state (steps + 1, nx). Histories
+    have entries at `steps`.
     """
     count, kind = len(run.q), kinds_of(state)
     target = target[:count] if target.ndim == 2 else target
@@ -154,10 +155,10 @@ def outcome_of(
 def marks_of(
     plan: Plan, state: StateMap, target: Array, steps: Array, path: Sequence[Array]
 ) -> loop.RunStatistics:
-    """Return what the kernel's statistics of a run read and write.
+    """Return the arrays that the kernel's run statistics read and write.
 
-    Errors are those from the state `target` (nx,), or from a moving one (steps + 1, nx) whose q and
-    nu are the arrays of `path`. Histories are kept at `steps`.
+    Errors are relative to the state `target` (nx,), or to a moving state (steps + 1, nx) whose q
+    and nu are the arrays of `path`. Histories have entries at `steps`.
     """
     robot, kinds, nu = state.robot, len(KINDS), len(plan.initial)
     first = target if target.ndim == 1 else target[0]
@@ -217,7 +218,7 @@ class RunStatistics:
         self._words = words_of(self._marks, loop.RUN_STATISTICS)
 
     def reset(self) -> None:
-        """Begin with eight other runs."""
+        """Prepare for eight new runs."""
         for lanes, initial in self._fresh:
             lanes[:] = initial
 
@@ -229,13 +230,13 @@ class RunStatistics:
         return self._over(first, errors_of(self._state, self._target, q, v)[1])
 
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
-        """Add the rows (steps, count, ..) of q, nu, u, .. from step `first` on, also as `raw`."""
+        """Add rows (steps, count, ..) of q, nu, u, .. from step `first` on; `raw` has them too."""
         take = kernel("loop", "take", "the run statistics")
         take(self._words, raw, first, len(rows[0]))
         self._last = [each[-1] for each in rows[:3]]
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the outcomes of the runs after so many steps; `stop` are indices into STOPS."""
+        """Return the outcomes of the runs after `done` steps; `stop` has indices into STOPS."""
         (q, nu, u), marks, times = self._last, self._marks, len(self._steps)
         settled = _by_run(marks.outside) + 1.0
         late = (stop != 0.0)[:, None] | is_late(settled, done + 1)
@@ -258,6 +259,6 @@ class RunStatistics:
 
 
 def _by_run(values: Any, *shape: int) -> Array:
-    """Return values (.., LANES) of runs in lanes as rows (LANES, *shape)."""
+    """Convert values (.., LANES) with one lane per run to rows (LANES, *shape)."""
     shape = shape or (len(values),)
     return np.moveaxis(np.reshape(values, (*shape, LANES)), -1, 0)

@@ -1,4 +1,4 @@
-"""Validity of a linear model: its prediction error, and the settling of its loop."""
+"""Validity of a linear model: its prediction error, and settling of its closed loop."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections import Counter
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -22,15 +21,16 @@ from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
-# The prediction is measured at these shares of the largest displacement, in so many directions.
+# The prediction error is measured at these fractions of the largest displacement, in this number
+# of directions.
 _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
 _MOST = 1_000_000  # random runs
-_ROUNDING = 1e-7  # prediction errors below it are those of the integration
-TRUSTED = 0.1  # relative prediction error up to which the linear model is called so
+_ROUNDING = 1e-7  # smaller prediction errors are integration errors
+TRUSTED = 0.1  # largest accepted relative prediction error
 
-# The largest displacement [m], [rad].
+# Largest displacement that may be given, in [m] and [rad].
 _FARTHEST = 1e6
 
 
@@ -235,7 +235,7 @@ def validity(
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
     sets, work = [], []
-    # Level and random stream of each run that predicts, and of each random run.
+    # Level and random stream of each run for the prediction error, and of each random run.
     for predicts, at, streams in (
         (True, np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
         (False, levels, _DIRECTIONS + np.arange(samples)),
@@ -248,7 +248,7 @@ def validity(
         work.append((job, Draws(starts(np.arange(min(LANES, len(at))))), len(at)))
     total, done, found = sum(count for *_, count in sets), 0, []
     with executor_of(executor, workers) as others:
-        how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
+        how: dict[str, object] = {"executor": others, "workers": workers, "threads": threads}
         expect(progress, work, others, threads)
         for runs_of, starts, count in sets:
             how["progress"] = progress and partial(_report, progress, done, total)
@@ -286,7 +286,7 @@ def _starts(
     streams: Indices,
     runs: Indices,
 ) -> Array:
-    """Return deviations of the initial states of some runs, each from its own random stream."""
+    """Return the initial deviations of some runs, each from its own random stream."""
     x = []
     for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
@@ -299,20 +299,20 @@ def _report(progress: Progress, before: int, total: int, done: int, _: int) -> N
 
 
 def _slope(errors: Array) -> float:
-    """Return the order of the absolute error, one more than the order of the relative error."""
+    """Return the order of the absolute error: one more than the order of the relative error."""
     if not errors[:4].min() > _ROUNDING:
         return np.nan
     return 1.0 + float(np.polyfit(np.log(_LEVELS[:4]), np.log(errors[:4]), 1)[0])
 
 
 def _crossing(errors: Array) -> float:
-    """Return the level at which the relative error reaches what is trusted, between levels."""
+    """Return the level at which the relative error reaches TRUSTED, interpolated between levels."""
     beyond = np.flatnonzero(~(errors <= TRUSTED))
     if not len(beyond):
         return 1.0
     first = int(beyond[0])
     if first == 0 or not np.isfinite(errors[first]):
-        # Below the first level the error is proportional to it.
+        # Below the first level, the error is proportional to the level.
         at = max(first - 1, 0)
         near = float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
         return near if np.isfinite(errors[0]) else 0.0
@@ -323,7 +323,7 @@ def _crossing(errors: Array) -> float:
 def _checked_displacement(
     lin: LinearModel, attitude: float, position: float, joint: float
 ) -> dict[str, float]:
-    """Return the largest displacement; zero of what is not among the states."""
+    """Return the largest displacement, with zeros for quantities that are not model states."""
     given = {"attitude": attitude, "position": position, "joint": joint}
     given = {key: number(key, value) for key, value in given.items()}
     if not 0.0 <= given["attitude"] < 175.0 or min(given.values()) < 0.0:
@@ -347,19 +347,19 @@ def _checked_displacement(
 
 
 def _scaled(largest: dict[str, float], level: float) -> dict[str, float]:
-    """Return a share of a displacement."""
+    """Return a fraction `level` of a displacement."""
     return {key: level * value for key, value in largest.items()}
 
 
 def joint_unit(lin: LinearModel) -> str:
-    """Return the unit of the joints, "rad|m" where some turn and others slide."""
+    """Return the unit of the joints: "rad|m" if there are revolute and prismatic joints."""
     pairs = zip(lin.state_names, lin.state_units, strict=True)
     of = {unit for name, unit in pairs if name.startswith("q_m.")}
     return of.pop() if len(of) == 1 else "rad|m"
 
 
 def shown(displacement: dict[str, float], of_joints: str = "rad|m") -> str:
-    """Say in words what of a displacement is not zero."""
+    """Describe the nonzero parts of a displacement."""
     units = {"attitude": "deg", "position": "m", "joint": of_joints}
     words = [f"{displacement[key]:.3g} {unit}" for key, unit in units.items() if displacement[key]]
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:]))) or "0"

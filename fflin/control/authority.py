@@ -1,4 +1,4 @@
-"""Mass properties of a robot at a point, and what its wheels and thrusters can do there."""
+"""Mass properties of a robot at an operating point, and authority of its wheels and thrusters."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     pass
 
-_FACETS = 20_000  # normals that are computed at once
+_FACETS = 20_000  # normals computed together
 _MANY = 36  # thrusters, which have 400 000 facets
 
 # A force or torque that is smaller, relative to the sum of all thrusts, is rounding error.
@@ -31,8 +31,8 @@ _ROUNDING = 1e-9
 _AXES = "xyz"
 
 
-def point_properties(robot: Robot, q: Array, v: Array) -> dict[str, Any]:
-    """Return mass properties, wheels and thrusters at a point, in base axes, by name."""
+def point_properties(robot: Robot, q: Array, v: Array) -> dict[str, object]:
+    """Return mass properties and properties of wheels and thrusters, by name, in base axes."""
     center, inertia = mass_properties(robot, q)
     return {
         "center_of_mass": center,
@@ -44,7 +44,7 @@ def point_properties(robot: Robot, q: Array, v: Array) -> dict[str, Any]:
 
 
 def point_report(properties: Mapping[str, Any]) -> str:
-    """Show the properties of a robot at a point."""
+    """Format the properties of a robot at an operating point."""
     inertia = properties["inertia"]
     moments, axes = np.linalg.eigh(inertia)
     axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), range(3)])
@@ -91,8 +91,8 @@ def wheel_momenta(robot: Robot, q: Array, v: Array) -> tuple[Array, Array, Array
     return np.array(axes).reshape(-1, 3).T, np.array(stored), np.array(largest)
 
 
-def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, Any]:
-    """Return total and least momentum [N m s] of the wheels, and how many axes they span."""
+def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, object]:
+    """Return the total momentum [N m s] of the wheels, their least capacity, and their rank."""
     axes, stored, largest = wheel_momenta(robot, q, v)
     rank = int(np.linalg.matrix_rank(axes, tol=1e-6)) if stored.size else 0
     bounded = rank == 3 and np.isfinite(largest).all()
@@ -105,7 +105,7 @@ def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, Any]:
 
 
 def wheel_report(properties: Mapping[str, Any]) -> str:
-    """Show the total momentum of the wheels, and whether they span three axes."""
+    """Format the momentum of the wheels, and the number of axes that they span."""
     if not properties["wheels"]:
         return ""
     total, least = properties["total"], properties["least"]
@@ -122,14 +122,15 @@ def wheel_report(properties: Mapping[str, Any]) -> str:
     return folded([text])
 
 
-def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]:
-    """Return what the thrusters alone reach: every wrench or not, least force and torque.
+def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, object]:
+    """Return the least force and torque that the thrusters alone produce in any direction.
 
-    These are None unless the thrusters push every way, all have limits and are not too many.
+    Both are None unless the thrusters push in every direction, all have limits, and there are at
+    most _MANY.
     """
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust", ())
-    found = dict[str, Any](thrusters=len(thrusters), every_way=False, bounded=False)
+    found = dict[str, object](thrusters=len(thrusters), every_way=False, bounded=False)
     found |= {"least_force": None, "least_torque": None}
     if not len(thrusters):
         return found
@@ -165,7 +166,7 @@ def thruster_report(properties: Mapping[str, Any]) -> str:
 
 
 def gives_every_wrench(W: Array, pushing: Mask) -> bool:
-    """Return whether columns W (6, k), some of them only positive, produce every wrench."""
+    """Return whether inputs with columns W (6, k), `pushing` or not, produce every wrench."""
     from scipy.optimize import nnls
 
     both = np.hstack((W, -W[:, ~pushing]))
@@ -186,7 +187,7 @@ def thrusters_give_every_wrench(robot: Robot) -> bool:
 
 
 def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
-    r"""Return the largest r such that some inputs give W u = r kept d for every unit vector d.
+    r"""Return the largest r for which inputs reach W u = r kept d for every unit vector d.
 
     The values W u of inputs between `low` and `high` form a zonotope
     :math:`\{w : n^T w \le h(n)\}` with :math:`h(n) = \sum_i \max(low_i n^T W_i, high_i n^T W_i)`.

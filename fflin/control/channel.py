@@ -46,9 +46,10 @@ def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Arra
 def saturation(
     robot: Robot, limits: Mapping[str, Range], q: Array, dt: float, sample: int, *, pulsed: bool
 ) -> Saturation:
-    """Return the saturation of commands at q, in steps of dt [s], `sample` steps a sample or 0.
+    """Return the saturation of commands at q, for steps of dt [s] and `sample` steps per sample.
 
-    `pulsed` says whether there are commands that pulsed thrusters must realise.
+    `sample` is 0 for continuous commands. `pulsed` is True if pulsed thrusters must realise the
+    commands.
     """
     low, high = input_limits(robot, limits)
     within = Saturation(low, high)
@@ -85,9 +86,10 @@ def _pulsed(robot: Robot) -> dict[int, tuple[str, Thruster]]:
 def _pulses(
     thrusters: Mapping[int, tuple[str, Thruster]], high: Array, time: float, dt: float
 ) -> Pulses:
-    """Return pulsed thrusters {input: (name, thruster)} with samples of `time` [s], 0 without.
+    """Return the pulses of thrusters {input: (name, thruster)} for samples of `time` [s].
 
-    Where the limit `high` (nu,) of the inputs is infinite, an on-off thruster gives its own `max`.
+    `time` is 0 for continuous commands. If the limit in `high` (nu,) is infinite, an on-off
+    thruster uses its own `max`.
     """
     at, zero = list(thrusters), np.zeros(len(thrusters))
     on_off = np.array([item.on_off for _, item in thrusters.values()])
@@ -125,7 +127,7 @@ def warn_beyond(
     low: Array,
     high: Array,
 ) -> None:
-    """Warn of inputs whose commands in rows (N, nu) exceed their limits."""
+    """Warn about inputs whose commands (N, nu) exceed their limits."""
     bounds = np.where(asked > 0.0, high, low)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
@@ -141,7 +143,7 @@ def warn_beyond(
 
 
 class Law:
-    """A policy whose commands (nu,) are checked; it gets copies of q and v."""
+    """Policy whose commands (nu,) are checked; the policy gets copies of q and v."""
 
     def __init__(
         self,
@@ -150,10 +152,11 @@ class Law:
         limits: tuple[Array, Array],
         slow: float,
     ) -> None:
-        # Beyond `slow`, a square of the velocity, a motion diverges and may make commands infinite.
+        # If the squared velocity exceeds `slow`, the motion diverges and commands may become
+        # infinite.
         self.policy, self._names, self._limits, self._slow = policy, names, limits, slow
         self._shape = (len(names),)
-        # Of what integrates a state of its own along.
+        # Only policies that integrate their own state have `advance`.
         self.advance: Any = getattr(policy, "advance", None)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
@@ -179,7 +182,7 @@ class Law:
 
 
 def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> rules.Channel:
-    """Return what the kernel reads of the limits, the sample time and the delay in steps.
+    """Return the kernel's channel for limits, and a sample time and a delay in steps.
 
     `initial` (nu,) acts until the first command arrives.
     """
@@ -201,10 +204,10 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
 
 
 class Channel:
-    """Channel from the commands of `law` to the inputs, by the rules of the kernel.
+    """Channel from the commands of `law` to the applied inputs, computed by the kernel's functions.
 
-    `law` is called with the arguments of `begin` or `ask`. `speeds` (k,) of these arguments are
-    the speeds of the wheels whose speed is limited.
+    `law` and `speeds` are called with the arguments of `begin` or `ask`. `speeds` returns the
+    speeds (k,) of the wheels whose speed is limited.
     """
 
     def __init__(
@@ -228,7 +231,7 @@ class Channel:
 
     @property
     def continuous(self) -> bool:
-        """Whether the law is evaluated at every stage."""
+        """Whether the law is evaluated at every stage of the integrator."""
         return not self._rules.sample
 
     @property
@@ -247,5 +250,5 @@ class Channel:
         return self._u.copy()
 
     def ask(self, *point: object) -> Array:
-        """Return the applied inputs of the law's present command, if there is no sample time."""
+        """Return the applied inputs for the present command of a law without a sample time."""
         return self.begin(0, *point)

@@ -1,4 +1,4 @@
-"""Weights of a regulator by a rule: from the limits of the URDF, or by name."""
+"""Default weights of a regulator, derived from the limits of the URDF."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -14,46 +14,50 @@ from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.linear.model import LinearModel
 
-# The bandwidth [rad/s] of a loop that no limit slows: it settles in about thirty seconds. With
-# inputs held for h, the bandwidth is at most _HELD / h.
+# Bandwidth [rad/s] of a loop that no limit slows; the loop settles in about 30 s. With inputs held
+# for h, the bandwidth is at most _HELD / h.
 BANDWIDTH, _HELD = 0.2, 0.3
 
-# Displacements from which the robot must return within its limits: a rotation of the base [deg], an
-# offset of the base in radii of gyration, and a joint's [rad], [m], or this fraction of its range.
+# Displacements from which the robot must return within its limits: a rotation of the base [deg],
+# an offset of the base in radii of gyration, and a joint displacement [rad] or [m]. A joint
+# displacement is at most the fraction TRAVEL of the joint's range.
 ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
-# What grows is held by a loop of at least this fraction of its rate of growth, and of the second
-# fraction where the efforts have less. A slower one lets light joints swing by radians.
+# The bandwidth is at least this fraction of the growth rate of an unstable mode, or at least the
+# second fraction if efforts are limited. With a lower bandwidth, light joints would swing by
+# radians.
 _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
-# The inputs reach each mode by at least this fraction of the effort that holds it at rest. A mode
-# that they reach less keeps its own decay.
+# The effect of the inputs on a mode counts as at least this fraction of the effort that holds the
+# mode at rest. A mode on which the inputs have less effect keeps its own decay.
 _LEAST_REACH = 1e-3
 
-# No input acts on a coordinate if the inputs' effect, relative to its inertia, is below this.
+# An input has no effect on a coordinate if its effect, relative to the inertia, is below this.
 _IDLE = 1e-12
 
-# Iterations for the bandwidth of a robot with dampers, whose effect depends on the bandwidth.
+# Number of iterations for the bandwidth of a robot with dampers, because the effect of a damper
+# depends on the bandwidth.
 _PASSES = 4
 
-# A loop with springs or gravity is slowed at most this many times. The fastest loop is taken that
-# leaves the efforts at least this fraction of the best.
+# Largest number of trials with a lower bandwidth for a loop with springs or gravity. The fastest
+# trial is chosen whose effort factor is at least the fraction _IN_VAIN of the best one.
 _TRIALS, _IN_VAIN = 8, 0.9
 
-# The report names a mode whose decay is below this fraction of the decay at rest.
+# The report names a mode whose decay is below this fraction of the nominal decay, which is
+# sqrt(1/2) times the bandwidth.
 _AS_SLOW = 0.9
 
 _NOT_ENOUGH = "is too small for all displacements"
 
 
 class Weights(NamedTuple):
-    """Weights of a continuous cost (nx, nx) and (nu, nu), the rule that made them, and w."""
+    """Weights Q (nx, nx) and R (nu, nu) of a continuous cost, their rule and the bandwidth."""
 
     Q: Array
     R: Array
     rule: str
     bandwidth: float
-    terms: tuple[Array, Array]  # what the largest of each coordinate (m,) and input (nu,) costs
+    terms: tuple[Array, Array]  # costs of the largest coordinates (m,) and inputs (nu,)
 
 
 class Pace(NamedTuple):
@@ -61,8 +65,8 @@ class Pace(NamedTuple):
 
     bandwidth: float = BANDWIDTH  # [rad/s]
     fraction: float = 1.0
-    hold: float = 0.0  # [s] that the inputs of a continuous model will be held for
-    held: float = _HELD  # what the fastest of the loop may do within a hold [rad]
+    hold: float = 0.0  # [s], hold time of the inputs of a continuous model
+    held: float = _HELD  # [rad], largest rate of a mode times the hold
 
 
 class Limit(NamedTuple):
@@ -78,7 +82,7 @@ AT_A_POINT = Pace()
 def default_weights(
     lin: LinearModel, pace: Pace = AT_A_POINT, momenta: Mapping[str, float] | None = None
 ) -> Weights:
-    """Return weights with which a displaced robot comes back within the URDF's limits (10.7)."""
+    """Return weights with which a displaced robot returns within its limits (10.7)."""
     m = len(lin.M)
     N = rate_matrix(lin)[:m, m:]
     if N.shape != lin.M.shape or not np.linalg.cond(N) < 1e8:
@@ -96,13 +100,14 @@ def default_weights(
 
 
 def _damping(lin: LinearModel) -> Array:
-    """Return B (m, m) of viscous dampers, 0 where there are none."""
+    """Return the damping matrix B (m, m) of viscous dampers, zero if there are none."""
     m = len(lin.M)
     if lin.dt or not lin.A[m:, m:].any():  # samples show springs as damping too
         return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
-    # Coupling by motion moves energy between coordinates, and an orbit rotates them: no damping.
+    # Coupling by motion only moves energy between coordinates, and an orbit rotates them. Neither
+    # is damping.
     size = np.sqrt(lin.M.diagonal())
     whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
     damped = bool(rates.sum() > 1e-9 * whole)
@@ -113,7 +118,7 @@ def _damping(lin: LinearModel) -> Array:
 def _of_inertia(
     lin: LinearModel, M: Array, inverse: Array, pace: Pace, momenta: Mapping[str, float]
 ) -> Weights:
-    """Return the weights of an inertia M (m, m) that damping adds to; N^-1 is `inverse`."""
+    """Return the weights for an inertia M (m, m) that includes damping / w; `inverse` is N^-1."""
     h, m, size = lin.dt or 1.0, len(M), displacements(lin, pace.fraction)
     theta = np.abs(inverse) @ size
     D = np.abs(M) @ theta / theta
@@ -127,18 +132,18 @@ def _of_inertia(
     reach = _reach(S, cost, D)
     ratios, T = eigh(reach, M)
     back = T.T @ M  # T^-1
-    # The slowest is to have the bandwidth w.
+    # Scale the cost so that the slowest mode has the bandwidth w.
     unit = ratios[0]
     cost, reach, ratios = cost * unit, reach / unit, ratios / unit
     to_modes = back @ inverse
     on_positions = to_modes.T @ (np.sqrt(ratios)[:, None] * to_modes)
     on_positions = 0.5 * (on_positions + on_positions.T)
-    # At w = 1, before anything slows it.
+    # Gain at w = 1, before any limit reduces the bandwidth.
     stiffness = back.T @ (ratios[:, None] ** 0.75 * to_modes)
     gain = (S / cost).T @ np.linalg.solve(reach, stiffness)
     rates = ratios**0.375
     mass = np.ones(m) if (lin.M == M).all() else np.diag(T.T @ lin.M @ T)
-    # The speeds of the coordinates, and the momenta of wheels, as the inputs add them up.
+    # Limits of the coordinates' speeds, and of the momenta that the inputs add to wheels.
     room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]}
     room |= momenta
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
@@ -183,7 +188,7 @@ def _of_inertia(
 def _on_velocities(
     lin: LinearModel, S: Array, cost: Array, least: Array, damped: bool
 ) -> Callable[[float], Array]:
-    """Return the weight (m, m) on velocities of (10.8), for a bandwidth."""
+    """Return a function of the bandwidth that gives the weight (m, m) on velocities (10.8)."""
     m, X = len(lin.M), rate_matrix(lin)
     size = np.sqrt(least)
     values, directions = np.linalg.eigh((S / cost) @ S.T / np.outer(size, size))
@@ -204,7 +209,7 @@ def _on_velocities(
 
 
 def displacements(lin: LinearModel, fraction: float) -> Array:
-    """Return what each coordinate (m,) is displaced by, a fraction of what it may be."""
+    """Return the design displacement of each coordinate (m,), scaled by `fraction`."""
     m = len(lin.M)
     names, units = lin.state_names[:m], lin.state_units[:m]
     radius = _radius_of_gyration(lin.M) if names[:6] == _BASE else 1.0
@@ -224,7 +229,7 @@ _BASE = tuple(f"{group}.{axis}" for group in ("q_b", "r_b") for axis in "xyz")
 
 
 def _radius_of_gyration(M: Array) -> float:
-    """Return the radius [m] at which a sphere would have the mass to have such moments."""
+    """Return the radius [m] of a spherical shell with the same mass and trace of the inertia."""
     mass = M[3, 3]
     center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
     moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
@@ -232,7 +237,7 @@ def _radius_of_gyration(M: Array) -> float:
 
 
 def _reach(S: Array, cost: Array, D: Array) -> Array:
-    """Return S R^-1 S' (m, m), and D where no input acts."""
+    """Return S R^-1 S' (m, m), with D for coordinates on which no input acts."""
     reach = (S / cost) @ S.T
     idle = reach.diagonal() <= _IDLE * D
     reach[idle, idle] = D[idle]
@@ -244,8 +249,8 @@ def _reach(S: Array, cost: Array, D: Array) -> Array:
 def _fastest(
     T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel, mass: Array
 ) -> Array:
-    """Return the largest of speeds (k,), T over the modes', on the way back at w = 1."""
-    # Modes are of mass (m,), 1 where nothing damps them: what is left is their damping.
+    """Return the largest of the speeds (k,), T times the mode rates, on the return at w = 1."""
+    # The mass (m,) of a mode is 1 without damping. The difference 1 - mass is the mode's damping.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
     if not any(name.startswith("qdot_m.") for name in lin.limits):
@@ -283,7 +288,7 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
 
 
 def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
-    """Return the largest K d of all displacements d: the base's in any direction, joints' signs."""
+    """Return the largest K d over base displacements in any direction and joint signs."""
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
     scaled = K[..., : len(size)] * size
     total: Array = np.abs(scaled[..., ~np.isin(groups, ("q_b", "r_b"))]).sum(axis=-1)
@@ -293,7 +298,7 @@ def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
 
 
 def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
-    """Return the factors of the bandwidth at which the inputs reach their limits."""
+    """Return the bandwidth factors at which signals reach their limits."""
     return [
         Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
         for (name, most), size in zip(room.items(), used.tolist(), strict=True)
@@ -308,7 +313,7 @@ def _efforts_left(lin: LinearModel) -> dict[str, float]:
 
 
 def _growth(lin: LinearModel) -> Limit:
-    """Return the largest rate of growth [1/s] of the model, and which mode has it."""
+    """Return the largest growth rate [1/s] of the model, and the mode that has it."""
     poles, modes = np.linalg.eig(lin.A)
     rates = rates_of(poles, lin.dt).real
     fastest, k = float(rates.max()), int(rates.argmax())
@@ -317,11 +322,11 @@ def _growth(lin: LinearModel) -> Limit:
 
 
 class _Trial(NamedTuple):
-    """A loop that was tried: its limit and modes, and what its inputs require."""
+    """Trial loop: its limit, its modes, and the inputs that it requires."""
 
     limit: Limit
-    left: float  # factor on the bandwidth that the efforts allow, as far as it is below 1
-    effort: str  # the input that allows the least
+    left: float  # bandwidth factor that the efforts allow
+    effort: str  # input that allows the smallest factor
     rates: Values  # of the modes (nx,) [1/s]
     modes: Complex
     required: Array  # largest inputs (nu,)
@@ -335,11 +340,11 @@ def _slowed(
     limit: Limit,
     least: Limit,
 ) -> tuple[Limit, str]:
-    """Slow a loop with springs or gravity until it respects the limits; report what it achieves.
+    """Reduce the bandwidth of a loop with springs or gravity until it respects the limits.
 
-    The loop is slowed down to `least` and no further. Displacements `size` (m,) require efforts at
-    the start, and displacements `driven` also on the way back. The latter omit joints without a
-    motor, which springs or gravity move.
+    The bandwidth is not reduced below `least`. Displacements `size` (m,) require efforts at the
+    start, and displacements `driven` also on the way back. `driven` omits joints without a motor,
+    which springs or gravity move. The result also reports what the loop achieves.
     """
     trials = list[_Trial]()
     for _ in range(_TRIALS):
@@ -363,7 +368,7 @@ def _slowed(
             return limit, _achieved(lin, trials[-1])
         if limit.bandwidth <= least.bandwidth:
             break
-        # What springs and gravity require remains, however slow the loop is.
+        # Springs and gravity require efforts even if the loop is very slow.
         slower = Limit(min(max(left, 0.3), 0.8) * limit.bandwidth, what)
         limit = max(slower, least)
     if not trials:
@@ -381,7 +386,7 @@ def _slowed(
 
 
 def _achieved(lin: LinearModel, trial: _Trial) -> str:
-    """Return a report of a loop's bandwidth and decay, and of modes slower than at rest."""
+    """Return a report of a loop's bandwidth and decay, and of modes that decay more slowly."""
     decay, fast = -trial.rates.real, np.abs(trial.rates)
     said = f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} 1/s, "
     said += f"damping ratio at least {(decay / fast).min():.2g}"
@@ -392,19 +397,20 @@ def _achieved(lin: LinearModel, trial: _Trial) -> str:
 
 
 def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
-    """Return the coordinates that modes (nx, k) move most, weighed by inertia."""
+    """Return the names of the coordinates that modes (nx, k) move most, weighted by inertia."""
     m = len(lin.M)
     large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
     among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
     return [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]
 
 
-# Along a trajectory the displacements are a tenth as large. They must decay within its duration:
-# this many time constants fit in, of a loop no slower than at a point and no faster than _FASTEST.
-# With held inputs the loop may be faster than at a point, since the sampled regulator is exact.
+# Along a trajectory, displacements are a tenth as large. They must decay within the duration, so
+# the duration has at least _CONSTANTS time constants. The loop is at least as fast as at a point,
+# but not faster than _FASTEST. With held inputs, a bandwidth above the limit at a point is
+# allowed, because the sampled regulator is exact.
 _BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
 
 
 def pace_along(duration: float, hold: float) -> Pace:
-    """Return the pace of a loop along a trajectory of that duration [s]."""
+    """Return the pace of a loop along a trajectory of `duration` [s]."""
     return Pace(min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold, _HELD_ALONG)

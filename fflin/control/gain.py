@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from fflin.control.optimal.riccati import Solution
     from fflin.linear.exchange import ToolGain
 
-# A larger gain, of more than three joints, is not shown.
+# Larger gains, of robots with more than three joints, are not shown.
 _LARGE = 9 * 18
 
 # Relative accuracy of the largest gain over frequency.
 ACCURACY = 1e-5
 
-# A disk margin below which a loop is called fragile.
+# A loop with a smaller disk margin is called fragile.
 _FRAGILE = 0.3
 
 
@@ -218,7 +218,7 @@ def make_gain(
     N: Array | None,
     weights: str = "as given",
 ) -> Gain:
-    """Return a gain of a solution and weights of a part of a model, with the rest not fed back."""
+    """Return the gain of a Riccati solution for a part of a model; no other state is fed back."""
     S = selection(part.state_names, lin.state_names)
     poles, margin = solution.ordered(lin.dt)
     return Gain(
@@ -246,7 +246,7 @@ _FROM_MODEL = (
 
 
 def fragility(gain: Gain) -> str:
-    """Return a warning if the disk margin at the inputs is small, else an empty string."""
+    """Return a warning if the disk margin at the inputs is small, or an empty string."""
     margins = gain.margins
     if margins.disk >= _FRAGILE:
         return ""
@@ -263,7 +263,7 @@ def fragility(gain: Gain) -> str:
 
 
 def one_sided(gain: Gain) -> str:
-    """Return a warning if a gain commands negative thrust, else an empty string."""
+    """Return a warning if a gain commands negative thrust, or an empty string."""
     keys = zip(input_keys(gain), gain.input_names, gain.K, gain.u0, strict=True)
     thrusters = [
         name for key, name, row, at in keys if group_of(key) == "thrust" and row.any() and at <= 0.0
@@ -290,7 +290,7 @@ def _unregulated(gain: Gain) -> str:
 
 
 def _poles(gain: Gain) -> str:
-    """Return a table of the poles, complex pairs and repeated poles once, the slowest first."""
+    """Return a table of the poles, slowest first; pairs and repeated poles appear once."""
     poles = gain.poles[gain.poles.imag >= 0.0]
     rates = rates_of(poles, gain.dt)
     heads = ["pole" if gain.dt else "pole [1/s]", "frequency [rad/s]", "damping"]
@@ -328,10 +328,11 @@ class Margins(NamedTuple):
 
 
 def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
-    """Return the margins at the inputs of a stable loop u = -K x, to five digits."""
-    # Seiler, Packard and Gahinet, IEEE Control Systems 40(5), 2020: 1/|(S - T)/2| at the inputs,
-    # each counted in sqrt(R_ii). Bruinsma and Steinbuch, Systems and Control Letters 14(4), 1990:
-    # the norm by eigenvalues of Hamiltonian matrices, not from a grid of frequencies.
+    """Return the margins at the inputs of a stable loop u = -K x, accurate to five digits."""
+    # The disk margin is 1/|(S - T)/2| at the inputs, each in units of sqrt(R_ii): Seiler, Packard
+    # and Gahinet, IEEE Control Systems 40(5), 2020. The norm follows from eigenvalues of
+    # Hamiltonian matrices instead of a grid of frequencies: Bruinsma and Steinbuch, Systems and
+    # Control Letters 14(4), 1990.
     scale = np.sqrt(R.diagonal())
     F, G, H, D = A - B @ K, B / scale, -scale[:, None] * K, 0.5 * np.eye(len(K))
     if dt:
@@ -345,7 +346,7 @@ def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
 
 
 def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
-    """Return the largest gain of a stable system, to five digits, and the frequency of it."""
+    """Return the largest gain of a stable system, accurate to five digits, and its frequency."""
 
     def gain(frequency: float) -> tuple[float, float]:
         response = D + C @ np.linalg.solve(1j * frequency * np.eye(len(A)) - A, B)
@@ -365,9 +366,10 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
 
 
 def gain_crossings(A: Array, B: Array, C: Array, D: Array, bound: float) -> tuple[Values, Mask]:
-    """Return eigenvalues (.., 2 nx), and which are imaginary: there the gain crosses the bound.
+    """Return Hamiltonian eigenvalues (.., 2 nx), and which of them are imaginary.
 
-    A superfluous crossing costs only one more evaluation of the response.
+    The gain crosses the bound at the imaginary eigenvalues. A spurious crossing only costs one more
+    evaluation of the response.
     """
     inverse = np.linalg.inv(bound**2 * np.eye(D.shape[1]) - D.T @ D)
     F = A + B @ inverse @ D.T @ C

@@ -1,4 +1,4 @@
-"""Time-varying gains of feedback and filter along a trajectory."""
+"""Time-varying gains of feedback and filters along a trajectory."""
 
 from __future__ import annotations
 
@@ -230,15 +230,16 @@ class FilterSchedule(Schedule):
 
 
 class Interpolant:
-    """Cost P (nx, nx) and gain K = R^-1 B' P over time."""
+    """Cost P (nx, nx) and gain K = R^-1 B' P as functions of time."""
 
-    # Between knots P is a cubic and B a spline. A sampled schedule keeps the last sample's values.
+    # Between knots, P is a cubic and B is a spline. A sampled schedule keeps the values of the
+    # last sample.
 
     def __init__(self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float) -> None:
         self.first, self.last = float(t[0]), float(t[-1])
         self._t, self._P, self.K, self._dt = t, P, K, dt
         if dt:
-            # A little early, since clocks are rounded.
+            # Samples start slightly early, because times are rounded.
             self.starts = [self.first, *(t[1:] - 1e-9 * dt).tolist()]
             return
         self.starts = t[:-1].tolist()
@@ -246,12 +247,12 @@ class Interpolant:
         drift, spent = P @ A, K.mT @ self._R @ K
         rate = spent - drift - drift.mT - Q
         h = np.diff(t)[:, None, None]
-        # Powers of the fraction of the interval that is over.
+        # Coefficients for powers of the elapsed fraction of an interval.
         self._cubics = cubic(P[:-1], P[1:], h * rate[:-1], h * rate[1:])
 
     @cached_property
     def pieces(self) -> Array:
-        """Coefficients (M - 1, 7, nu nx) of K between knots, of powers of the time since a knot."""
+        """Coefficients (M - 1, 7, nu nx) of K, for powers of the time since the last knot."""
         from scipy.interpolate import CubicSpline
 
         powers = self._cubics / np.diff(self._t)[:, None, None, None] ** np.arange(4)[:, None, None]
@@ -262,7 +263,7 @@ class Interpolant:
         return pieces.swapaxes(0, 1).reshape(len(self._t) - 1, 7, -1)
 
     def gain(self, t: float) -> Array:
-        """Return R^-1 B' P (nu, nx), of B and P at a time within the knots."""
+        """Return K = R^-1 B' P (nu, nx) at a time within the knots."""
         k = bisect_right(self.starts, t) - 1
         if self._dt:
             return self.K[k]
@@ -282,7 +283,7 @@ class Interpolant:
         return P
 
     def residual(self, at: Callable[[Array], Coefficients]) -> float:
-        """Return the largest relative residual of the differential equation midway."""
+        """Return the largest relative residual of the differential equation between knots."""
         h, (first, second, third, fourth) = np.diff(self._t), self._cubics.swapaxes(0, 1)
         P = first + 0.5 * second + 0.25 * third + 0.125 * fourth
         rate = (second + third + 0.75 * fourth) / h[:, None, None]

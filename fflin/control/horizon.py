@@ -1,4 +1,4 @@
-"""Receding horizon: the quadratic program of each sample, and its solution by DAQP."""
+"""Receding horizon: the quadratic program at each sample, and its solution by DAQP."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,19 +12,20 @@ from fflin.base.errors import FflinWarning, MissingPackageError
 from fflin.base.validation import Array, Indices, Mask, number, vector
 from fflin.control.policies import Clock
 
-# Settings of DAQP for rows of length 1, relative to the typical width of the limits: tolerance,
-# weight and regularisation of soft limits, and the smallest violation that is reported.
+# Settings of DAQP for rows scaled to length 1, relative to the typical width of the limits:
+# tolerance, weight and regularisation of soft limits, and smallest violation to report.
 _EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
 
-# Violations by the robot below this fraction of a limit's width are not reported.
+# Violations by the robot below this fraction of the width between limits are not reported.
 _OVER = 1e-3
 
-# DAQP's infinity, its code of a soft limit, its exit flag of a softened plan, and most iterations.
+# DAQP's infinity, its code of a soft limit, its exit flag for a plan that exceeds a soft limit,
+# and the largest number of iterations.
 _OPEN, _SOFT, _SOFTENED, _MOST = 1e30, 8, 2, 10_000
 
 
 class Stage(NamedTuple):
-    """Stage e' = A e + B d with d = u - u*, and limits on E e' + D d, input limits first."""
+    """Stage e' = A e + B d with d = u - u*, and limits of E e' + D d; input limits come first."""
 
     A: Array  # (nx, nx)
     B: Array  # (nx, nu)
@@ -37,7 +38,7 @@ class Stage(NamedTuple):
 
 
 class Matrices(NamedTuple):
-    """Quadratic program over the d = u - u* of N samples: min d'H d / 2 + g'd, low <= G d <= high.
+    """Quadratic program over d = u - u* of N samples: min d'H d / 2 + g'd, low <= G d <= high.
 
     Attributes
     ----------
@@ -68,9 +69,10 @@ class Matrices(NamedTuple):
 
 
 def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
-    """Return the errors, z and the limited values as linear functions of z, or of d, and e_0.
+    """Return errors, z and limited values as linear functions of e_0 and of z or d.
 
-    The matrices have N nu + nx columns: those of d if `planned` is False and of z if it is True.
+    The matrices have N nu + nx columns. The first N nu columns multiply z if `planned` is True and
+    d otherwise. The last nx columns multiply e_0.
     """
     (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
     e = np.eye(nx, size + nx, size)
@@ -87,7 +89,7 @@ def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Arr
 
 @dataclass(frozen=True, eq=False)
 class Horizon:
-    """Samples of a run for the receding horizon; after them, the last N samples repeat."""
+    """Samples of a run; a horizon that reaches past the end repeats the last N samples."""
 
     stages: tuple[Stage, ...]
     samples: int  # N
@@ -103,13 +105,13 @@ class Horizon:
         return self.stages[k : k + self.samples]
 
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
-        """Return the lower and upper limits (m,) of samples, and which limits are soft."""
+        """Return the lower and upper limits (m,) of stages, and which of these limits are soft."""
         soft = np.tile(np.arange(len(self.limited)) >= len(self.acting), len(stages))
         low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
         return low, high, soft
 
     def matrices(self, e: ArrayLike | None, t: float) -> Matrices:
-        """Return the program of a sample [s] at the deviation e (nx,) of the state."""
+        """Return the quadratic program at time t [s] for the deviation e (nx,) of the state."""
         stages = self.window(max(number("t", t), 0.0))
         nx, size = len(stages[0].A), len(self.inputs) * self.samples
         start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
@@ -137,7 +139,7 @@ class Receding:
         self.solves = self.softened = self.unfinished = self.exceeded = 0
         self._worst, self._said, self._over, self._met = 0.0, "", _OVER, ""
         self._due: tuple[Stage, Array] | None = None  # the last sample and its input
-        if horizon.limited:  # prepared here, so that the first sample takes no longer than others
+        if horizon.limited:  # here, so that the first sample takes no longer than others
             self._change(horizon.window(0.0))
 
     @property
@@ -160,14 +162,14 @@ class Receding:
         return (said,) if self.solves else ()
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
-        """Return the command (nu,) of a sample."""
+        """Return the command (nu,) at a sample."""
         self._clock.tick(t)
         u, e = self._at(t, q, v)
         command: Array = u + self.step(t, e)
         return command
 
     def step(self, t: float, e: Array) -> Array:
-        """Return the command (nu,) as a deviation from u*, for the error e (nx,)."""
+        """Return the command (nu,) relative to u* for the error e (nx,)."""
         stages, acting = self.of.window(t), self.of.acting
         now, d = stages[0], -stages[0].K @ e
         if not self.of.limited:
@@ -200,7 +202,7 @@ class Receding:
         return d
 
     def _judge(self, t: float, e: Array) -> None:
-        """Record violations of soft limits by the robot, which differs from the linear model."""
+        """Record soft limits that the robot exceeds because it differs from the model."""
         first = len(self.of.acting)
         if self._due is None or first == len(self.of.limited):
             return
@@ -215,7 +217,7 @@ class Receding:
             self._met = f"{self.of.limited[first + at]} by {excess[at]:.2g} at {t:.4g} s"
 
     def _count(self, t: float, reached: Array) -> None:
-        """Record how far a plan violates the soft limits."""
+        """Record by how much a plan exceeds the soft limits."""
         excess = np.maximum(self._low - reached, reached - self._high) * self._soft
         row = int((fractions := excess * self._unit).argmax())
         self.softened += bool(fractions[row] > _VIOLATED * self._size)
@@ -230,7 +232,7 @@ class Receding:
         low, high, self._soft = self.of.bounds(stages)
         self._G, self._free = rows[:, :size], rows[:, size:]
         length = np.linalg.norm(self._G, axis=1)
-        moved = length > 1e-12 * length.max()  # what no input moves within the horizon is let go
+        moved = length > 1e-12 * length.max()  # drops limits that no input affects
         self._low, self._high = np.where(moved, low, -np.inf), np.where(moved, high, np.inf)
         self._unit = 1.0 / np.where(moved, length, 1.0)
         width = (self._high - self._low) * self._unit

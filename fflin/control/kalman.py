@@ -345,7 +345,7 @@ _FROM_MODEL = (
 def disturbance(
     of: LinearModel | LinearTrajectory, W: Weight, G: ArrayLike | None
 ) -> tuple[Array, Array]:
-    """Return W (nw, nw) and the columns (.., nx, nw) that it acts through."""
+    """Return W (nw, nw), and the columns (.., nx, nw) through which the disturbance acts."""
     nx = len(of.state_names)
     if G is None:
         return weight("W", W, of.state_names), np.eye(nx)

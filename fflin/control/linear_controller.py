@@ -25,14 +25,14 @@ from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
-_NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # the names that signals have of themselves
+_NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default names of signals
 
 # A pole counts as unstable if it grows faster than this fraction of the fastest pole.
 _ROUNDING = 1e-6
 
 
 class System(NamedTuple):
-    """A, B, C, D, dt and names; dt [s] is 0 if continuous, -1 if unknown, None if not given."""
+    """State space A, B, C, D; dt [s] is 0 if continuous, -1 if unknown, None if not given."""
 
     A: Array
     B: Array
@@ -280,7 +280,7 @@ class OutputFeedback(LinearController):
 
 
 def _system_of(given: Any) -> System:
-    """Return the system that is given in any form of `LinearController`."""
+    """Return the system from any form that `LinearController` accepts."""
     if isinstance(given, System):
         return given
     if isinstance(given, str | Path):
@@ -300,7 +300,7 @@ def _system_of(given: Any) -> System:
         for kind in ("input", "output")
     )
     dt = getattr(given, "dt", None)
-    # SciPy's continuous systems have no names, and None for dt.
+    # SciPy's continuous systems have no signal names, and dt is None.
     dt = 0.0 if dt is None and not inputs else dt
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
@@ -312,7 +312,7 @@ def _realised(given: object) -> Any:
         import control
 
         return control.ss(given)
-    except Exception as error:  # each of the tools has its own
+    except Exception as error:  # each tool raises its own types
         raise InputError(
             f"the {type(given).__name__} cannot be converted to a state space: {reason(error)}; a "
             "transfer function must be proper, with no more zeros than poles"
@@ -322,7 +322,7 @@ def _realised(given: object) -> Any:
 def _checked(
     A: Any, B: Any, C: Any, D: Any, dt: Any = None, inputs: Any = (), outputs: Any = ()
 ) -> System:
-    """Return a system whose sizes belong together; of D alone where A is empty."""
+    """Return a system with consistent sizes; if A is empty, the system consists of D alone."""
     of = dict(zip("ABCD", (A, B, C, 0.0 if D is None else D), strict=True))
     A, B, C, D = (np.atleast_2d(as_double(f"controller's {x}", of[x])) for x in of)
     nz = len(A) if A.size else 0
@@ -339,7 +339,8 @@ def _checked(
                 f"entries, for {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
             )
     if dt is not None:
-        # True is of a system that is sampled nobody knows how, -1 MATLAB's word for it.
+        # A sampled system with unknown sample time has dt = True in python-control and -1 in
+        # MATLAB.
         dt = -1.0 if dt is True else number("controller's dt", dt)
     return System(A, B, C, D, dt, tuple(map(str, inputs)), tuple(map(str, outputs)))
 
@@ -349,7 +350,7 @@ def _read(path: Path) -> System:
     with reading(path, "controller"):
         found, _ = read_record(path)
         if len(found) == 1 and isinstance(struct := next(iter(found.values())), dict):
-            found = struct  # of MATLAB
+            found = struct  # a MATLAB struct
         dt = found.get("dt", found.get("Ts"))
         dt = None if dt is None else float(np.asarray(dt).item())
         inputs, outputs = (
@@ -371,7 +372,7 @@ def _read(path: Path) -> System:
 
 
 def _fitted(system: System, lin: LinearModel) -> System:
-    """Return a system over all outputs and inputs of a model, in their order, by its names."""
+    """Return a system expanded to all outputs and inputs of a model, matched by names."""
     columns = _indices("input", system.inputs, system.D.shape[1], "output", lin.output_names)
     rows = _indices("output", system.outputs, len(system.D), "input", lin.input_names)
     nz, ny, nu = len(system.A), len(lin.output_names), len(lin.input_names)

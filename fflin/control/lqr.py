@@ -1,4 +1,4 @@
-"""Linear quadratic regulators: by a Riccati equation, and in closed form on accelerations."""
+"""Linear quadratic regulators, by a Riccati equation or in closed form for accelerations."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve
 from fflin.control.weights import Weight, cost_weights, rule_weights, weight
 from fflin.linear.model import LinearModel
 
-# A relative residual above _COARSE is worth a warning; above _USELESS the gain is wrong.
+# A relative residual above _COARSE gives a warning; above _USELESS, the gain is wrong.
 _COARSE, _USELESS = 1e-8, 1e-3
 
-# A pole that is closer to the boundary of stability, relative to the others, may lie on it:
-# rounding moves a mode that Q does not weight.
+# A pole may lie on the stability boundary if its distance, relative to the largest pole, is below
+# this. Rounding moves the pole of a mode that Q does not weight.
 _NEAR_BOUNDARY = 1e-6
 
 
@@ -257,7 +257,7 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
 def _diagonal(
     what: str, value: Weight, names: Sequence[str], kept: Sequence[str], *, definite: bool
 ) -> Array:
-    """Return the diagonal of a weight on `kept`, given by values or names for all `names`."""
+    """Return the diagonal of a weight on `kept`, from values or names for all `names`."""
     if not isinstance(value, Mapping) and dimension(what, value) == 2:
         raise InputError(
             f"{what} is a matrix, expected the diagonal of a weight; for a full weight matrix use "
@@ -268,7 +268,7 @@ def _diagonal(
 
 
 def require_fixed_point(lin: LinearModel) -> None:
-    """Raise `EquilibriumError` if f0 is not zero, `ModelError` if the robot has changed."""
+    """Raise `EquilibriumError` if f0 is not zero, or `ModelError` if the robot has changed."""
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     if lin.is_equilibrium():
         return
@@ -286,14 +286,14 @@ def require_fixed_point(lin: LinearModel) -> None:
 
 
 def _difference(a: Array, b: Array, c: Array) -> Array:
-    """Return a - b c, with zeros where the difference is rounding."""
+    """Return a - b c, with zeros for entries that are rounding errors."""
     rounding = 1e3 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
     difference = a - b @ c
     return np.where(np.abs(difference) > rounding, difference, 0.0)
 
 
 def near_boundary(poles: Values, dt: float) -> bool:
-    """Whether a pole of a stable loop is close to the boundary of stability."""
+    """Return whether a pole of a stable loop is close to the stability boundary."""
     decay = 1.0 - np.abs(poles) if dt else -poles.real
     return decay.min() < _NEAR_BOUNDARY * np.abs(poles - 1.0 if dt else poles).max()
 
@@ -302,7 +302,7 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
     structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
     if structured is not None and not near_boundary(structured.poles, lin.dt):
         return structured
-    # A general solver would fail without saying which mode is to blame.
+    # A general solver would fail without naming the mode that causes the failure.
     require_stabilizable(lin)
     free, A = Q, lin.A
     if N is not None:

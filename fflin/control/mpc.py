@@ -28,7 +28,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, range_of
 from fflin.robot.robot import Robot
 
-# Most entries of the matrices that map inputs to states and limits: 160 MB.
+# Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
 _MOST = 20_000_000
 
 
@@ -191,7 +191,7 @@ class Mpc(_Shown, Feedback):
 class TrajectoryMpc(_Shown, TrajectoryFeedback):
     """Model predictive controller along a trajectory and about its end.
 
-    The attributes of `TrajectoryFeedback` hold the trajectory and the regulator's schedule.
+    The inherited attributes contain the trajectory and the regulator's schedule.
     """
 
     horizon: Horizon
@@ -206,17 +206,20 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
 
 
 def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any]]:
-    """Return the names of limited signals, their indices, and a function for a stage.
+    """Return the names of limited signals, their indices, and a function that limits a stage.
 
-    The indices are among inputs, states and outputs. The function returns a stage's E, D, low and
-    high for its output matrices and target.
+    The indices count inputs, then states, then outputs. The function returns E, D, low and high of
+    a stage from its output matrices and its target values.
     """
     if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
         raise InputError("lin was loaded from a file, which contains no robot; linearise again")
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
     beside = [name for name in outputs if name not in states]
     known = (*state_keys(robot.joint_names), *input_keys(of))
-    found, parts = dict[str, Any](), list(limits) if isinstance(limits, list | tuple) else [limits]
+    found, parts = (
+        dict[str, object](),
+        list(limits) if isinstance(limits, list | tuple) else [limits],
+    )
     for k, part in enumerate(parts):
         if isinstance(part, Mapping) and beside:
             own = [x for x in part if stands_for_any(x, beside) and not stands_for_any(x, known)]
@@ -247,7 +250,7 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
 def _about(
     lin: LinearModel, cost: Any, Qf: Any, samples: int, dt: float, names: Any, rows: Any
 ) -> tuple[Callable[[Horizon], Mpc], list[Stage]]:
-    """Return a function that makes the controller about a point, and its stages."""
+    """Return a function that creates the controller about a point, and the stages."""
     (Q, R, weights), sampled = cost, lin.discretize(dt)
     given = (Q, R) if Q is None or R is None else sampled_cost(lin, dt, Q, R)
     gain = lqr(sampled, *given, weights=weights)
@@ -271,13 +274,13 @@ def _about(
 def _along(
     traj: LinearTrajectory, cost: Any, Qf: Any, samples: int, dt: float, _: Any, rows: Any
 ) -> tuple[Callable[[Horizon], TrajectoryMpc], list[Stage]]:
-    """Return a function that makes the controller along a trajectory, and its stages."""
+    """Return a function that creates the controller along a trajectory, and the stages."""
     schedule = tvlqr(traj, cost[0], cost[1], Qf, dt, weights=cost[2])
     follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
     Q, R, models, end = schedule.Q, schedule.R, along(traj.resampled(dt)), follows.end
 
     def about(of: Any, u: Array) -> Any:
-        # For the pose of the base, the error is limited.
+        # Limits on the base pose apply to its error relative to the trajectory.
         x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
         return rows(of.C, of.D, u, x, of.y0)
 
@@ -293,7 +296,7 @@ def _along(
 
 
 def _stage(total: Array, whole: Array, K: Array, P: Array, limited: tuple[Array, ...]) -> Stage:
-    """Return the stage of a sample from its cost, transition and gain, and the later cost P."""
+    """Return the stage of a sample from its cost, transition, gain, and the next sample's P."""
     A, B = np.split(whole, [len(P)], axis=1)
     L = np.linalg.inv(np.linalg.cholesky(total[len(P) :, len(P) :] + B.T @ P @ B)).T
     return Stage(A, B, K, L, *limited)

@@ -29,11 +29,11 @@ from fflin.robot.fields import chosen_limits
 from fflin.robot.inputs import JointTorque, ReactionWheel
 from fflin.robot.robot import Robot
 
-# What may be missed of the goal and of limits of states at knots in rad, m and s.
+# Tolerance [rad, m, s] of the goal, and of the limits of states at knots.
 _REACHED = 1e-7
 
-# Between knots, limits may be exceeded by this fraction of them. Each interval is checked at the
-# ends of so many parts.
+# Between knots, limits may be exceeded by this fraction. The ends of _PARTS equal parts of each
+# interval are checked.
 _BETWEEN, _PARTS = 0.01, 16
 
 
@@ -165,7 +165,8 @@ def plan(
     size[size == 0.0] = 1.0
     for name, point, which in (("start", start, slice(None)), ("goal", end, asked)):
         _require_within(shooting, bounds, name, point, which)
-    # What leads nowhere may diverge, which is said.
+    # A search without a solution may diverge; this is reported as an error instead of NumPy
+    # warnings.
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
         guess = shooting.guess(start, end)
         cost = cost_of_inputs(shooting, weights, guess[2])
@@ -186,26 +187,26 @@ def plan(
 
 
 class _Made(NamedTuple):
-    """A plan, and what its integrated motion misses and exceeds."""
+    """Plan, with the end error and the limit violations of its integrated motion."""
 
     q: Array
     v: Array
     u: Array
-    missed: Array  # of the goal (nx,)
-    at_knots: Array  # what knots exceed of limits of states (nx,)
-    beyond: Array  # what the ends of _PARTS equal parts of the intervals exceed (N, parts, nx)
-    most: float  # the largest fraction of a limit in it
+    missed: Array  # error at the goal (nx,)
+    at_knots: Array  # largest limit violations at the knots (nx,)
+    beyond: Array  # limit violations at the ends of all parts (N, parts, nx)
+    most: float  # largest entry of `beyond` as a fraction of the limit
 
     @property
     def reached(self) -> bool:
-        """Whether the goal is met, within the limits at the knots."""
+        """Whether the motion meets the goal, and its knots are within the limits."""
         return max(self.missed.max(), self.at_knots.max()) <= _REACHED
 
 
 def _least(search: Search, guess: tuple[Array, Array, Array], size: Array) -> _Made:
-    """Return the plan of least effort, or the plan that is nearest to the goal and the limits."""
+    """Return the plan of least effort, or the plan that is closest to the goal and the limits."""
     shooting, bounds, best = search.shooting, search.bounds, None
-    # Limits that cannot be kept between knots are kept at knots.
+    # If limits cannot be respected between knots, they are respected at knots only.
     for parts in (_PARTS, 1) if np.isfinite(bounds).any() else (1,):
         q, v, u = search._replace(parts=parts).best(*guess)
         missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked
@@ -241,7 +242,7 @@ def _require_within(
 
 
 def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> InputError:
-    """Return the error of a search that failed, with what its last trial misses and exceeds."""
+    """Return the error for a failed search, with the errors and violations of its last trial."""
     robot, state = shooting.state.robot, shooting.state
     units = ["rad"] * 3 + [*state.units[3:]]
     by = [
@@ -268,7 +269,7 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
 
 
 def _note(shooting: Shooting, made: _Made, size: Array) -> str:
-    """Say which limit of a state (nx,) the integrated motion exceeds most, by what and when."""
+    """Describe the largest violation of a state limit (nx,) by the integrated motion."""
     most = "exceeds no state limit"
     if made.most > 0.0:
         k, part, i = np.unravel_index((made.beyond / size).argmax(), made.beyond.shape)

@@ -23,7 +23,7 @@ _LINE = "#888888"
 
 _POINTS = 400
 
-# A smaller gain factor counts as zero: with an integrator, the gain is infinite at rest.
+# A smaller gain factor counts as zero, because an integrator has infinite gain at zero frequency.
 _NOTHING = 1e-6
 
 
@@ -110,7 +110,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
             loc="outside right upper",
             fontsize=letters_of(1.3 * len(loops), 72.0 * (tall - 1.5)),
         )
-        # Those of a step lie close to one, and their rates apart.
+        # Discrete-time poles crowd near 1, so their rates ln(z)/dt are drawn.
         rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt if gain.dt else gain.poles
         _pole_map(poles, {"": rates}, 0.0)
         poles.set_title("poles of A - B K as ln(z)/dt" if gain.dt else "poles of A - B K")
@@ -128,8 +128,8 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
 
 def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     """Return frequencies (k,) [rad/s], the loop gains (k, nu) of the inputs, and their margins."""
-    # With T = K (s E - A + B K)^-1 B the loop of input i is T_ii / (1 - T_ii), of a sampled model
-    # at s = e^(j w h).
+    # With T = K (s I - A + B K)^-1 B, the loop gain of input i is T_ii / (1 - T_ii). For a sampled
+    # model, s is e^(j w dt).
     fed = [gain.state_names.index(name) for name in gain.regulated or gain.state_names]
     F, B, K, dt = gain.closed_loop[np.ix_(fed, fed)], gain.B[fed], gain.K[:, fed], gain.dt
 
@@ -145,7 +145,7 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     values = np.array([response(w) for w in grid])
 
     def changes(value: Callable[[Values], Array], i: int, among: Mask) -> list[complex]:
-        """Return the responses of loop i where a function of them changes its sign."""
+        """Return the responses of loop i at which the function `value` changes its sign."""
         from scipy.optimize import brentq
 
         signs = np.signbit(value(values[:, i]))
@@ -154,7 +154,7 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
         return [complex(response(w)[i]) for w in found]
 
     loops = []
-    # At the ends of the axis a loop is real, and its phase may be -180 deg there.
+    # At both ends of the frequency axis, the loop gain is real and its phase may be -180 deg.
     ends = [response(0.0)] + [values[-1]] * bool(dt)
     for i in range(len(K)):
         crossed = changes(lambda L: np.log(np.abs(L)), i, values[:, i] != 0.0)

@@ -29,7 +29,7 @@ Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
 @runtime_checkable
 class Gridded(Protocol):
-    """A state feedback whose gain is interpolated between the points of a grid."""
+    """State feedback whose gain is interpolated between the points of a grid."""
 
     lin: LinearModel
 
@@ -39,12 +39,12 @@ class Gridded(Protocol):
 
 
 class Feedback:
-    """Law of states or outputs about the point of a model; subclasses follow grids and motions."""
+    """Feedback of states or outputs about the operating point of a model, or along a motion."""
 
     lin: LinearModel
 
     def state_map(self, robot: Robot) -> StateMap:
-        """Return the robot's states in the law's axes; `InputError` if the law does not fit."""
+        """Return the robot's states in the model's axes; raise `InputError` if they do not fit."""
         state = StateMap(robot, reference=self.lin.reference, frame=self.lin.frame)
         require_fit(self.lin, robot, state)
         return state
@@ -195,7 +195,7 @@ class AllocatedPolicy:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on a motion: which inputs are commanded, and which inputs act instead."""
+        """Notes on a motion: which inputs are commanded, and which inputs realise the commands."""
         asked, given = (
             list(dict.fromkeys(group_of(key) for key in input_keys(each)))
             for each in (self._design, self._robot)
@@ -220,13 +220,13 @@ class AllocatedPolicy:
 
 
 class Clock:
-    """Samples of a controller with an internal state, every `dt` [s]."""
+    """Sampling clock of a controller with an internal state; the sample time is `dt` [s]."""
 
     def __init__(self, dt: float) -> None:
         self._dt, self._last = dt, -np.inf
 
     def tick(self, t: float) -> None:
-        """Raise `InputError` where a sample comes at another time."""
+        """Raise `InputError` if t is not one sample time after the last sample."""
         apart = t - self._last
         if self._last >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
             raise InputError(
@@ -237,9 +237,9 @@ class Clock:
 
 
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
-    """Return the state index of each output, and the gyroscopes, which are numbered after states.
+    """Return the state index of each output, and the gyroscopes, whose indices follow the states.
 
-    Other sensors raise `InputError`.
+    For other sensors, `InputError` is raised.
     """
     found, gyros = list[int](), list[Gyroscope]()
     for output in state.robot.outputs:
@@ -270,7 +270,7 @@ class Sample(NamedTuple):
 
 
 class Compensation:
-    """Control law with a state z, advanced from sample to sample, or per stage if dt is 0."""
+    """Control law with a state z that advances at each sample, or at each stage if dt is 0."""
 
     def __init__(self, size: int, at: Callable[[float], Sample], dt: float = 1.0) -> None:
         self.at, self.dt = at, dt
@@ -293,7 +293,7 @@ class Compensation:
         return u
 
     def advance(self, weights: Array, last: bool) -> None:
-        """Integrate z to the next stage from weights of z at the step's start and of its rates."""
+        """Integrate z to the next stage; `weights` apply to the step's first z and to its rates."""
         if not self.dt:
             self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:
@@ -319,12 +319,12 @@ class Loop(Compensation):
         self._aba, self._clock = Aba(state) if felt else None, Clock(dt)
 
     def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
-        """Return the law of a sample, and the chart and state relative to which y is measured."""
+        """Return the law at a sample, and the chart and state relative to which y is measured."""
         measure, near = self._there(t)
         return self.at(t), measure.state, near
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
-        """Return the command at a sample or a stage."""
+        """Return the command at a sample or at a stage of the integrator."""
         if self.dt:
             self._clock.tick(t)
         elif len(self.estimate) and len(self.rates) != self.stages + 1:
@@ -355,7 +355,7 @@ def decider(policy: object) -> object:
 
 
 def axes_of(policy: object) -> tuple[Frame | None, pin.SE3 | None]:
-    """Return the frame and reference that a policy's state and inputs are in, if they are known."""
+    """Return the frame and reference of a policy's state and inputs, or None if unknown."""
     lin, _ = feedback_of(policy)
     if lin is not None:
         return lin.frame, lin.reference
@@ -364,7 +364,7 @@ def axes_of(policy: object) -> tuple[Frame | None, pin.SE3 | None]:
 
 
 def bound(policy: object, robot: Robot) -> Policy:
-    """Return a policy for a robot, or raise `InputError` if the object is not a policy."""
+    """Return a policy bound to a robot, or raise `InputError` if the object is not a policy."""
     result = policy.bind(robot) if hasattr(policy, "bind") else policy
     if not callable(result):
         raise InputError(
@@ -375,13 +375,13 @@ def bound(policy: object, robot: Robot) -> Policy:
 
 
 def feedback_of(policy: object) -> tuple[LinearModel | None, Array | None]:
-    """Return the model that a policy was made for, and its K, where it has them."""
+    """Return the model and the gain K of a policy; each is None if the policy has none."""
     lin = getattr(policy, "lin", None)
     return (lin if isinstance(lin, LinearModel) else None), getattr(decider(policy), "K", None)
 
 
 def fed_back(policy: object) -> tuple[str, ...]:
-    """Return the names of the states that a policy feeds back, as far as that is known."""
+    """Return the names of the states that a policy feeds back, or () if unknown."""
     (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
     if schedule is not None:
         K = np.abs(schedule.K).max(axis=0)  # the largest over time

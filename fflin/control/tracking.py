@@ -28,10 +28,10 @@ from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
-# Sums of many time steps are rounded, so the end is reached within this factor.
+# Sums of many time steps are rounded, so times within this factor of the end count as the end.
 AT_THE_END = 1.0 + 1e-9
 
-# Returns q, v and u in the policy's axes at a time of the run.
+# Function that returns q, v and u, in the policy's axes, at a time of the run.
 Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
 
 
@@ -148,7 +148,7 @@ class TrajectoryFeedback(Feedback):
             If a state does not exist.
         """
         robot, (q, v, _) = self.trajectory.robot, self.reference(0.0)
-        # The chart is centred at the start, whose attitude may be any rotation.
+        # The chart is centred at the start, because the attitude there may be any rotation.
         chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame=self.frame)
         values = by_name("state", offset, (*chart.names, "roll", "pitch", "yaw"))
         given = np.zeros(chart.nx + 3)
@@ -209,9 +209,9 @@ class TrajectoryFeedback(Feedback):
 
 
 def followed(policy: object, robot: Robot, held: float = 0.0) -> Any:
-    """Return a policy as it is simulated, with commands held for `held` [s].
+    """Return the policy to simulate, with commands held for `held` [s].
 
-    A gain schedule becomes the feedback along its trajectory.
+    A gain schedule is replaced by the feedback along its trajectory.
     """
     if isinstance(policy, Allocation):
         return replace(policy, policy=followed(policy.policy, policy.design, held))
@@ -225,21 +225,22 @@ def followed(policy: object, robot: Robot, held: float = 0.0) -> Any:
 
 
 def reference_of(policy: object) -> Reference | None:
-    """Return the reference of a policy that follows a motion, else None."""
+    """Return the reference of a policy that follows a motion, or None."""
     found = getattr(decider(policy), "reference", None)
     return found if callable(found) else None
 
 
 def tracking_of(policy: object) -> TrajectoryFeedback | None:
-    """Return the feedback along a trajectory that a policy is or allocates."""
+    """Return the trajectory feedback in a policy or in its allocation, or None."""
     decides = decider(policy)
     return decides if isinstance(decides, TrajectoryFeedback) else None
 
 
-@lru_cache(maxsize=2)  # half of a short run's time
+@lru_cache(maxsize=2)  # saves half the time of a short run
 def largest_rate(schedule: GainSchedule) -> float:
     """Return the 95th percentile over time of the largest pole magnitude [1/s]; 0 if sampled."""
-    # A large weight at the end makes K large only briefly, which a larger step may miss.
+    # The percentile excludes the short time in which a large final weight makes K large. A larger
+    # step may skip this time.
     if schedule.dt:
         return 0.0
     rates = np.abs(np.linalg.eigvals(schedule.A - schedule.B @ schedule.K)).max(axis=1)
@@ -325,7 +326,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
 
     @cached_property
     def _rest(self) -> tuple[LinearModel, Array]:
-        """The model after the end, and the gain of its steady filter."""
+        """Model at rest after the end, and the gain of its steady-state filter."""
         lin, seen = self.end.discretize(self.filter.dt), self.filter
         return lin, kalman(lin, seen.W[-1], seen.V).L
 
@@ -334,14 +335,15 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         k, jump = round(t / dt), np.zeros(self._size)
         if k < len(seen.A):
             A, B, K, L, C, D = (x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D))
-            # A held input is closest to a changing one at the middle of the sample.
+            # A held input approximates a changing input best with its value at the middle of the
+            # sample.
             u = self.reference(t + 0.5 * dt * (self.trajectory.hold == "linear"))[2]
             y = seen.y[k]
         else:
             (lin, L), K = self._rest, self.end_gain
             A, B, C, D, u, y = lin.A, lin.B, lin.C, lin.D, lin.u0, lin.y0
             if k == len(seen.A):
-                # From here on the error is relative to the robot at rest.
+                # From this sample on, the error is relative to the robot at rest.
                 stop = self.reference(self.duration)[1] - lin.v
                 jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(stop)
         return Sample(A - B @ K - L @ (C - D @ K), L, -K, 0.0 * D.T, u, y, jump)

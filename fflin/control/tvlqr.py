@@ -168,13 +168,13 @@ def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool
 def held_stages(
     traj: LinearTrajectory, dt: float, Q: Array, R: Array
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield the samples for `samples_back`, from first to last."""
+    """Yield the cost and the transition of each sample, from first to last."""
     nx, W = len(Q), block_diag(Q, R)
     for steps, whole in transitions(traj, dt):
-        total, way = np.zeros_like(W), np.eye(len(W))
+        total, transition = np.zeros_like(W), np.eye(len(W))
         for cost, step in zip(held_cost(steps.F, W, steps.h), steps.maps, strict=True):
-            total += way.T @ cost @ way
-            way[:nx] = step @ way
+            total += transition.T @ cost @ transition
+            transition[:nx] = step @ transition
         yield total, whole
 
 
@@ -190,7 +190,7 @@ def require_continuous(traj: LinearTrajectory) -> None:
 
 
 def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
-    """Return the model at the last knot, or the first (0), if steady, else at rest there."""
+    """Return the model at the last knot, or the first (0), at rest if the knot is not steady."""
     lin = traj[end]
     if lin.is_equilibrium():
         return lin
@@ -204,7 +204,7 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
 
 
 def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
-    """Return the model at rest in the last configuration, in base axes; rotors spin on there."""
+    """Return the model at rest in the last configuration, in base axes; rotors keep spinning."""
     robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
     rotors = rotor_names(robot)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
@@ -354,7 +354,7 @@ def _steady_filter(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Arr
 
 
 def _disturbed(steps: Steps, intensity: Callable[[float], Array]) -> Array:
-    """Return the covariance (nx, nx) that a disturbance adds within a sample."""
+    """Return the covariance (nx, nx) that a disturbance adds during a sample."""
     nx = len(steps.maps[0])
     first, second = (np.array([intensity(t) for t in times]) for times in steps.nodes.T.tolist())
     added = held_cost(steps.F[:, :nx, :nx].mT, HEAVY * first + LIGHT * second, steps.h)

@@ -1,4 +1,4 @@
-"""Weights of a quadratic cost: given as matrices, diagonals, numbers or names, or by a rule."""
+"""Weights of a quadratic cost from matrices, diagonals, numbers or names, or by a rule."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -25,10 +25,10 @@ from fflin.linear.model import LinearModel
 
 Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 
-# What rounding may leave of symmetry and of semidefiniteness, relative to the largest entry.
+# Relative asymmetry and negative eigenvalues below this are rounding errors.
 _ROUNDING = 1e-9
 
-# The speeds of wheels come back at this fraction of the bandwidth.
+# Wheel speeds are regulated with this fraction of the bandwidth.
 _SPEEDS = 0.1
 
 
@@ -103,7 +103,7 @@ def inverse_square(what: str, size: float) -> float:
 
 
 def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = False) -> Array:
-    """Return a weight (k, k) of a matrix, a diagonal, a number, or {name or pattern: number}."""
+    """Return a weight (k, k) from a matrix, a diagonal, a number, or {name or pattern: number}."""
     size = len(names)
     if isinstance(value, Mapping):
         diagonal = _diagonal(what, value, names, complete=definite)
@@ -120,7 +120,7 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
 
 
 def columns(what: str, value: ArrayLike, rows: int) -> Array:
-    """Return a matrix (rows, k) with k >= 1."""
+    """Return a checked matrix (rows, k) with k >= 1."""
     shape = np.shape(value) if dimension(what, value) == 2 else ()
     if not shape or not shape[1]:
         raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, k) with k >= 1")
@@ -140,7 +140,7 @@ def require_semidefinite(
 def cost_weights(
     of: LinearModel | LinearTrajectory, Q: Weight, R: Weight, N: ArrayLike | None
 ) -> tuple[Array, Array, Array | None]:
-    """Return the weights as matrices, checked."""
+    """Return the checked weights as matrices."""
     Q = weight("Q", Q, of.state_names)
     R = weight("R", R, input_keys(of), definite=True)
     if N is None:
@@ -273,9 +273,9 @@ def rule_weights(
     wheel_speeds: bool | None = None,
     pace: Pace = AT_A_POINT,
 ) -> tuple[Array, Array, Array | None, str]:
-    """Return Q, R and N of a model by a rule, changed by `given` weights, and the rule in words."""
-    # The cost of a sampled model is the continuous one under the hold, where it is known what it
-    # was sampled from. The rule is by default what the robot has in its `weights`, else "urdf".
+    """Return Q, R and N by a rule, changed by `given` weights, and the rule in words."""
+    # If the continuous model is known, the cost of a sampled model is the continuous cost with
+    # held inputs. The rule is set by the robot's `weights`; by default it is "urdf".
     source = lin.generator or lin
     layers = [(given, False)] if given else []
     if name is None and lin.weights:
@@ -308,10 +308,10 @@ def rule_weights(
 def _of_regulated(
     lin: LinearModel, pace: Pace, wheel_speeds: bool | None
 ) -> tuple[Array, Array, str, Array]:
-    """Return Q (nx, nx), R, the rule and costs, for a model that may have wheels.
+    """Return Q (nx, nx), R, the rule and the costs, for a model that may have wheels.
 
-    The costs (nx + nu,) are those of the largest value of each state and input, 0 if the rule has
-    none.
+    The costs (nx + nu,) are the contributions of the largest value of each state and input. They
+    are 0 if the rule has no largest values.
     """
     part = regulated_part(lin, wheel_speeds)
     if part is lin:
@@ -322,7 +322,7 @@ def _of_regulated(
     at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
     names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
     most = np.array([lin.limits[name] for name in names])
-    # A wheel that is at its limit already is counted as one at rest, and named in the report.
+    # A wheel that is already at its limit counts as a wheel at rest, and the report names it.
     room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
     found = default_weights(body, pace, dict(zip(names, room, strict=True)))
     Q, R, rule, bandwidth, (of_positions, of_inputs) = found
@@ -336,7 +336,7 @@ def _of_regulated(
     terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
     if speeds := [name for name in part.state_names if name not in body.state_names]:
         S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
-        # Inputs R^-1/2 Z n that turn no body change the speeds at X n.
+        # The inputs R^-1/2 Z n rotate no body, and change the wheel speeds at the rates X n.
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
         X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
@@ -354,14 +354,14 @@ class _Given(NamedTuple):
 def _weights_of(
     lin: LinearModel, given: Mapping[str, Any], of_robot: bool
 ) -> tuple[dict[int, _Given], list[str]]:
-    """Return what is given by index among the states and then the inputs, and the names."""
+    """Return {index: given weight}, with states before inputs, and the names that were given."""
     states, inputs = lin.state_names, input_keys(lin)
     found, named = dict[int, _Given](), list[str]()
     every = (*states, *inputs)
     kinds = ("q", "state", states), ("r", "input", inputs), ("bryson", "state or input", every)
     for part, kind, known in kinds:
         values = given.get(part, {})
-        if of_robot:  # a reduced model has not all that a robot's weights name
+        if of_robot:  # a reduced model may lack states that the robot's weights name
             values = {key: x for key, x in values.items() if stands_for_any(key, known)}
         values = {key: number(f"{part} of '{key}'", x) for key, x in values.items()}
         if part == "bryson":
@@ -382,7 +382,7 @@ def _weights_of(
 def _reweighed(
     lin: LinearModel, Q: Array, R: Array, terms: Array, given: Mapping[int, _Given]
 ) -> tuple[Array, Array]:
-    """Return Q and R, scaled to the largest values that are given, with what is given in them.
+    """Return Q and R with the `given` weights, and all others scaled to match them.
 
     A common factor of Q and R does not change the gain. The rule's weights are scaled so that the
     largest values of the named states and inputs cost 1, as in Bryson's rule.

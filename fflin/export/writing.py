@@ -174,7 +174,7 @@ class _Texts:
         law, lin = self.law, self.law.lin
         follows = isinstance(law, StateLaw) and law.follows
         header, source = self._filled("header.h"), self._filled(f"{self.kind}_law.c")
-        about: dict[str, Any] = {
+        about: dict[str, object] = {
             **{"title": self.title, "real": self.real, "frame": law.frame, "dt": law.dt},
             "kind": "samples" if follows else self.kind,
             "signals": {

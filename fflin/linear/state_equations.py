@@ -59,7 +59,8 @@ def assemble(
     else:
         by_q_b = chart.rate_over_q_b(w, W)
         if omega_in_reference:
-            by_q_b += chart.over_q_b(product(chart.N, W))
+            # N W J, where N is I/2 and J is 2 I at the reference.
+            by_q_b += W if chart.standing else chart.over_q_b(product(chart.N, W))
         A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
     if not chart.standing:
         # Q R^T = Q^T.
@@ -104,14 +105,16 @@ def _over_rotations(
 ) -> Array:
     """Return the derivatives Theta (.., 6 + n, 3) of `rates` over base rotations (4.4)."""
     omega_in_reference, v_in_reference = state.axes
-    # `by_turn`, the derivative in base axes, is zero without an orbit; it is converted in place.
+    # `by_turn`, the derivative in base axes, is zero without an orbit, so whenever omega is in
+    # reference axes; it is converted in place.
     theta, c = rates.by_turn, rates.c
+    if omega_in_reference:
+        theta = product(rates.by_nu[..., ANGULAR], W)
     for columns in actuation.held if np.count_nonzero(u) else ():
-        theta += product(rates.by_u[..., columns], skew(u[..., columns]))
+        theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
     # A name for each part, because `x[part] -= y` would copy the part onto itself.
     turning, shifting = theta[..., ANGULAR, :], theta[..., LINEAR, :]
     if omega_in_reference:
-        theta += product(rates.by_nu[..., ANGULAR], W)
         turning -= skew(c[..., ANGULAR])
     if v_in_reference:
         shifting -= skew(c[..., LINEAR])

@@ -187,7 +187,7 @@ def stage_info(
     low, high = points.min(axis=0), points.max(axis=0)
     centre = (low + high) / 2.0
     size = max(float(np.linalg.norm(points - centre, axis=1).max()), 1e-3)
-    sun, direction, orbit = np.array(SUN), np.array(VIEWS[scene]), dict[str, Any]()
+    sun, direction, orbit = np.array(SUN), np.array(VIEWS[scene]), dict[str, object]()
     field = field_of(robot, frame_of(robot, frame)) if scene == "space" else None
     if field and robot.orbit:
         # z is away from the central body, and x along the orbit.
@@ -219,7 +219,7 @@ _APART = 0.1
 
 def equipment(
     robot: Robot, drawings: list[Drawing], tool: str | None, size: float
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the marks of a page: axes at base and tool, nozzles, wheels and selectable links."""
     paths = body_paths(robot)
     found = [(paths[0], pin.SE3.Identity(), 0.3)]

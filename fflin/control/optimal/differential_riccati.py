@@ -14,16 +14,17 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT
 
-# Between two knots P is a cubic; knots are added until it is this accurate, relative to P.
+# Between two knots, P is a cubic. Knots are added until the cubic has this relative accuracy.
 _ACCURACY = 1e-7
 _KNOTS_LIMIT = 100_000
 
-# Batches of intervals: one call of NumPy for many small matrices costs little more than for one.
+# Number of intervals per batch; a NumPy call for many small matrices takes little longer than for
+# one.
 _BATCH = 64
 
 
 class Coefficients(NamedTuple):
-    """A, S = B R^-1 B' and Q (.., nx, nx) of -dP/dt = A' P + P A - P S P + Q."""
+    """Coefficients A, S = B R^-1 B' and Q (.., nx, nx) of -dP/dt = A' P + P A - P S P + Q."""
 
     A: Array
     S: Array
@@ -36,9 +37,10 @@ class Coefficients(NamedTuple):
 
 
 class Passage(NamedTuple):
-    r"""Intervals (..): x1 = T x0 - G l1 and l0 = W x0 + T' l1, with G and W positive semidefinite.
+    r"""Solution of the Hamiltonian system over intervals: x1 = T x0 - G l1, l0 = W x0 + T' l1.
 
-    x is the state and l the costate at the start (0) and at the end (1) of the interval.
+    G and W are positive semidefinite. x is the state and l the costate at the start (0) and at the
+    end (1) of an interval.
     """
 
     T: Array
@@ -46,7 +48,7 @@ class Passage(NamedTuple):
     W: Array
 
     def then(self, late: Passage) -> Passage:
-        """Return the passage through these intervals, and after them through `late` ones."""
+        """Return the passage through these intervals followed by the `late` intervals."""
         T, G, W = self
         n = T.shape[-1]
         right = np.concatenate((T, G @ late.T.mT), axis=-1)
@@ -62,12 +64,12 @@ class Passage(NamedTuple):
         """Return P at the start, W + T' P (I + G P)^-1 T, from P at the end."""
         forward = np.linalg.solve(np.eye(len(P)) + self.G @ P, self.T)
         costate = P @ forward
-        # A sum of squares, which stays positive.
+        # This form is a sum of squares, so P stays positive semidefinite.
         return _symmetric(self.W + forward.T @ costate + costate.T @ self.G @ costate)
 
 
 def passage(early: Coefficients, late: Coefficients, h: Array) -> Passage:
-    """Return passages (k,) through intervals, of order four, from coefficients at Gauss nodes."""
+    """Return fourth-order passages (k,) through intervals, from coefficients at the Gauss nodes."""
     pairs = zip(early, late, strict=True)
     mixed = [np.concatenate((HEAVY * a + LIGHT * b, LIGHT * a + HEAVY * b)) for a, b in pairs]
     both = _constant(Coefficients(*mixed), 0.5 * np.concatenate((h, h)))
@@ -76,7 +78,7 @@ def passage(early: Coefficients, late: Coefficients, h: Array) -> Passage:
 
 
 def _constant(coefficients: Coefficients, h: Array) -> Passage:
-    """Return passages of constant coefficients: a short exponential, doubled."""
+    """Return passages with constant coefficients: a matrix exponential of a short time, doubled."""
     A, S, Q = coefficients
     n, unit = A.shape[-1], _units(*(np.abs(x).max(axis=0) for x in coefficients))
     A, S, Q = A * unit / unit[:, None], S / np.outer(unit, unit), Q * np.outer(unit, unit)
@@ -101,8 +103,8 @@ def _constant(coefficients: Coefficients, h: Array) -> Passage:
 
 
 def _units(A: Array, S: Array, Q: Array) -> Array:
-    """Return units (nx,) of the states in which rows and columns are of similar size."""
-    # Osborne's balancing; the units of the costates are the inverse ones.
+    """Return units (nx,) of the states that give rows and columns similar sizes."""
+    # Osborne's balancing; the costates have the inverse units.
     np.fill_diagonal(A, 0.0)
     unit = np.ones(len(A))
     for _ in range(12):
@@ -145,26 +147,29 @@ def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Inter
 
 
 def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
-    """Return times and P there, back from the last knot; `LinAlgError` where P changes too fast.
+    """Return times, and P at these times, integrated backwards from the last knot.
 
-    `at` returns the coefficients (k, nx, nx) at times (k,).
+    `at` returns the coefficients (k, nx, nx) at times (k,). If P changes too fast, `LinAlgError` is
+    raised.
     """
     times, values = [float(knots[-1])], [P]
     for last in range(len(knots) - 1, 0, -_BATCH):
-        # The intervals left to do, the latest last.
+        # Intervals still to be integrated; the latest interval is the last entry.
         pending = _intervals(at, knots[max(last - _BATCH, 0) : last + 1])
         while pending:
             interval, P = pending.pop(), values[-1]
             start, end, middle = *interval[:2], 0.5 * (interval.start + interval.end)
             error = math.inf
-            # Over a long step, the mixed coefficients can be indefinite; shorter steps follow.
+            # The mixed coefficients of a long step can be indefinite. Shorter steps are then
+            # tried.
             with suppress(np.linalg.LinAlgError):
                 single, half = interval.whole.back(P), interval.late.back(P)
                 double = interval.early.back(half)
-                # The cubic with these values and derivatives, midway.
+                # Value at the middle of the cubic that has these values and derivatives.
                 bend = interval.at_start.rate(double) - interval.at_end.rate(P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
-                # Halves are more accurate by sixteen times, of which four are kept in reserve.
+                # Half steps are sixteen times as accurate. A factor of four of this is kept in
+                # reserve.
                 error = 0.25 * max(_apart(double, single), _apart(half, between))
             if error <= _ACCURACY:
                 times += [middle, start]
@@ -177,9 +182,9 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
 
 
 def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array, Array, float]:
-    """Return K and P of samples, from the last on, and the worst residual."""
-    # A stage is what a sample costs, of the error and the input at its start, (nx + nu, nx + nu),
-    # and what takes these two to the next sample (nx, nx + nu).
+    """Return K and P of the samples, the last sample first, and the largest residual."""
+    # A stage has the cost matrix (nx + nu, nx + nu) of the error and the input at the start of a
+    # sample, and the matrix (nx, nx + nu) that maps both to the next error.
     nx, gains, costs, worst = len(P), list[Array](), [P], 0.0
     for weights, whole in stages:
         total = weights + whole.T @ P @ whole
@@ -197,9 +202,9 @@ def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array
 
 @contextmanager
 def bounded_by(remedy: str) -> Iterator[None]:
-    """Raise `InputError` if P changes too fast."""
+    """Raise `InputError` with a `remedy` if P changes too fast."""
     try:
-        # A P that overflows is refused, so that NumPy need not warn of it.
+        # A P that overflows raises an error, so NumPy's warnings are not needed.
         with np.errstate(over="ignore", invalid="ignore"):
             yield
     except np.linalg.LinAlgError:
@@ -214,7 +219,7 @@ def spread(B: Array, R: Array) -> Array:
 
 
 def imbalance(terms: Array) -> float:
-    """Return the largest norm of sums (.., n, n) relative to the sum of the norms of the terms."""
+    """Return the largest norm of a sum (.., n, n), relative to the norms of its terms."""
     size = np.linalg.norm(terms, axis=(-2, -1)).sum(axis=0)
     sums = np.linalg.norm(terms.sum(axis=0), axis=(-2, -1))
     return float((sums / np.maximum(size, 1e-300)).max())

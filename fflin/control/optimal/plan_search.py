@@ -13,60 +13,61 @@ from fflin.base.validation import Array
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.optimal.stage_qp import StageQP, StageRows
 
-# The goal and the limits are sought to this accuracy in rad, m and s.
+# Accuracy [rad, m, s] with which the goal and the limits are met.
 _ENDS = 1e-8
 
-# A state is limited at points within an interval once an iterate exceeds its limit there by the
-# first fraction of it. The limit is tightened by the second fraction, since the motion may exceed
-# it between these points.
+# A state is limited at a point within an interval once an iterate exceeds its limit there by the
+# first fraction. The limit is tightened by the second fraction, because the motion may exceed it
+# between the points.
 _LIMITED, _TIGHTER = 0.002, 0.005
 
-# Intervals are flown as one motion where they miss each other by no more.
+# Intervals with gaps of at most this size are integrated as one motion.
 _MEETS = 1e-10
 
-# One motion that misses the end by more is not corrected.
+# The end of this one motion is not corrected if its error is larger.
 _NEARLY = 1e-3
 
-# Accuracy of the ends of intervals during the search, and at its end.
+# Integration accuracy of interval ends, during the search and at its end.
 _SEEKS, _FLIES = 1e-6, 1e-8
 
-# Iterations go on until one would save less than this fraction of the effort, or so often.
+# The search ends if an iteration saves less than this fraction of the effort, or after _MOST
+# iterations.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 
-# What a step of wheels costs beside others, as they may take any.
+# Cost of a step of wheel states relative to other states, because wheels may have any state.
 _OF_WHEELS = 1e-6
 
-# What missing the goal or a limit by 1 rad or m costs, in efforts of the guess.
+# Penalty on a violation of the goal or a limit by 1 rad or 1 m, in efforts of the guess.
 _PRICE = 1e3
 
 Flags = NDArray[np.bool_]
 
 
 class Trial(NamedTuple):
-    """Knots and inputs, the gaps between the intervals, and the distances to limits of states."""
+    """Trial with knots, inputs, gaps between intervals, and distances to the limits of states."""
 
     q: Array  # (N + 1, nq)
     v: Array  # (N + 1, nv)
     u: Array  # (N + 1, nu)
     missed: Array  # (N, nx)
     knots: Array  # how far the knots may move down and up (2, N + 1, nx)
-    inside: Array  # and the points within the intervals (2, N, parts - 1, nx)
+    inside: Array  # the same for points within intervals (2, N, parts - 1, nx)
 
     @property
     def gap(self) -> float:
-        """The largest gap between intervals."""
+        """Largest gap between intervals."""
         return float(np.abs(self.missed).max())
 
     def outside(self, limited: Flags) -> float:
-        """Return the sum of what knots and `limited` points within intervals exceed of limits."""
+        """Return the sum of limit violations at knots and at `limited` points within intervals."""
         return float(excess(self.knots).sum() + excess(self.inside)[limited].sum())
 
 
 class Search(NamedTuple):
-    """Search for the inputs of least effort from a start to an end."""
+    """Search for the inputs of least effort from a start state to an end state."""
 
-    # The Hessian is that of Gauss and Newton. Steps of the states also cost something, which
-    # falls while whole steps succeed (Levenberg and Marquardt).
+    # The Hessian is the Gauss-Newton approximation. Steps of the states also have a cost, which is
+    # reduced while full steps succeed (Levenberg-Marquardt).
 
     shooting: Shooting
     start: Point
@@ -95,12 +96,12 @@ class Search(NamedTuple):
             return float((cost * u * u).sum() / 2.0 + lost)
 
         for iteration in range(_MOST):
-            self._tell(f"iteration {iteration + 1}", trial, limited)
+            self._report(f"iteration {iteration + 1}", trial, limited)
             step = self._step(trial, limited, near, cost * trial.u)
             if step is None:
                 return self._acting(self._flown(trial.u))
             z, du, y, outside = step
-            # What the multipliers say that it costs to miss (Powell).
+            # The multipliers determine the penalty on gaps (Powell).
             price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
             was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
             saved = was - merit(trial.u + du, 0.0 * trial.missed, outside)
@@ -118,7 +119,7 @@ class Search(NamedTuple):
                 break
         return self._acting(self._closed(trial, limited, first))
 
-    def _tell(self, what: str, trial: Trial, limited: Flags) -> None:
+    def _report(self, what: str, trial: Trial, limited: Flags) -> None:
         """Report the cost relative to the guess, and the largest violation."""
         cost, inside = float((self.cost * trial.u**2).sum()), excess(trial.inside)[limited]
         most = max(trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0)))
@@ -135,8 +136,8 @@ class Search(NamedTuple):
         motions = shooting.motions(q, v, u)
         knots = self.bounds[:, None] - shooting.limited_values(q, v)
         knots[0, 0], knots[1, 0] = -np.inf, np.inf
-        way = shooting.between((q[-1], v[-1]), self.end)
-        knots[:, -1, self.asked] = np.clip(way, *knots[:, -1])[self.asked]
+        to_end = shooting.between((q[-1], v[-1]), self.end)
+        knots[:, -1, self.asked] = np.clip(to_end, *knots[:, -1])[self.asked]
         tighter = self.bounds + _TIGHTER * np.array((self._size, -self._size))
         inside = tighter[:, None, None] - shooting.inside(motions, self.parts)
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
@@ -152,7 +153,7 @@ class Search(NamedTuple):
     def _step(
         self, trial: Trial, limited: Flags, near: Array, effort: Array
     ) -> tuple[Array, Array, Array, float] | None:
-        """Return the best step of knots and inputs, its multipliers and its violations."""
+        """Return the optimal step of knots and inputs, its multipliers and its violations."""
         u, nx = trial.u, self.shooting.state.nx
         if not max(trial.outside(limited), trial.gap) < np.inf:
             return None
@@ -177,20 +178,20 @@ class Search(NamedTuple):
         return *found, float(excess(trial.knots - found.x).sum() + excess(left).sum())
 
     def _closed(self, trial: Trial, limited: Flags, near: Array) -> Trial:
-        """Return a trial without gaps between intervals, by least changes, if possible."""
+        """Close the gaps between intervals by the smallest changes, if possible."""
         shooting, last = self.shooting, _NEARLY
         shooting.refine(trial.q, trial.v, trial.u, _FLIES)
         trial = self._trial(*trial[:3])
         for _ in range(_MOST_CLOSING):
             limited = limited | self._exceeding(trial)
-            self._tell("closing the gaps", trial, limited)
+            self._report("closing the gaps", trial, limited)
             if trial.gap <= _MEETS and trial.outside(limited) <= _ENDS:
                 one = self._flown(trial.u)
                 limited, before = limited | self._exceeding(one), last
                 last = one.outside(limited)
                 if last <= _ENDS:
                     return one
-                # Errors may grow so much along one motion that its end cannot be corrected.
+                # Errors may grow so much along a single motion that its end cannot be corrected.
                 if not last <= 0.5 * before:
                     return trial
                 trial = one
@@ -202,7 +203,7 @@ class Search(NamedTuple):
         return trial if trial.gap <= _MEETS else self._flown(trial.u)
 
     def _flown(self, u: Array) -> Trial:
-        """Return the motion under inputs from the start, without gaps."""
+        """Return the motion from the start under the inputs, which has no gaps."""
         trial = self._trial(*self.shooting.flown(self.start, u), u)
         return trial._replace(missed=0.0 * trial.missed)
 
@@ -215,7 +216,7 @@ class Search(NamedTuple):
 def cost_of_inputs(shooting: Shooting, R: Array, u: Array) -> Array:
     """Return the cost of squared inputs (N + 1, nu), scaled so that the guess costs 1."""
     h = shooting.h
-    # Of the knots in an integral: by the trapezoidal rule, or as long as each input is held.
+    # Weights of the knots in the integral: the trapezoidal rule, or the hold time of each input.
     held = np.append(h, h[-1]) if shooting.held else 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
     cost = held[:, None] * R
     cost /= (cost * u * u).sum() or cost.sum()
@@ -223,5 +224,5 @@ def cost_of_inputs(shooting: Shooting, R: Array, u: Array) -> Array:
 
 
 def excess(room: Array) -> Array:
-    """Return how far points are outside of limits, from how far they may move down and up."""
+    """Return by how much points exceed limits, from how far they may move down and up."""
     return np.maximum(np.maximum(room[0], -room[1]), 0.0)

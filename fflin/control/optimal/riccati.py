@@ -14,12 +14,12 @@ from fflin.base.validation import Array, Values
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
-# A solution with a smaller residual is exact but for rounding.
+# A solution with a smaller residual is exact up to rounding error.
 _SOUND = 1e-11
 _STEPS = 25
 
-# Residuals below _ROUNDED are rounding if a step does not lower them; below _NEAR every Newton step
-# lowers the residual.
+# A residual below _ROUNDED is rounding error if a step does not reduce it. Below _NEAR, every
+# Newton step reduces the residual.
 _ROUNDED = 1e-12
 _NEAR = 1e-3
 
@@ -36,13 +36,13 @@ class Solution(NamedTuple):
     method: str
 
     def ordered(self, dt: float) -> tuple[Values, float]:
-        """Return the poles in order, and how far they are from the boundary of stability."""
+        """Return the sorted poles, and their distance from the stability boundary."""
         poles = self.poles[np.lexsort((self.poles.imag, self.poles.real))]
         return poles, float(1.0 - np.abs(poles).max() if dt else -poles.real.max())
 
 
 def rates_of(poles: Values, dt: float) -> Values:
-    """Return poles [1/s] in continuous time, converted from samples of dt [s] if dt is not 0."""
+    """Return poles of a model with sample time dt [s], or 0, as continuous-time rates [1/s]."""
     return np.log(np.where(poles == 0.0, 1e-300, poles) + 0j) / dt if dt else poles
 
 
@@ -53,12 +53,12 @@ class _Trial(NamedTuple):
 
 
 class Riccati:
-    """A' P + P A - (P B + N) R^-1 (P B + N)' + Q = 0, or where dt is not zero its sampled twin."""
+    """Equation A' P + P A - (P B + N) R^-1 (P B + N)' + Q = 0, or its sampled form if dt > 0."""
 
     def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
         self.discrete = bool(dt)
-        # For a sampled system A - E, since the difference of P and A' P A would cancel.
+        # For a sampled system, use A - I, because the difference of P and A' P A would cancel.
         self.rate = A - np.eye(len(A)) if dt else A
         self.R_factor, indefinite = dpotrf(R, lower=1)
         self.definite = not indefinite
@@ -72,7 +72,7 @@ class Riccati:
         return dtrtrs(factor, Y, lower=1, trans=1)[0]
 
     def trial(self, P: Array) -> _Trial:
-        """Return P with its defect, and that relative to the sum of the norms of its terms."""
+        """Return P, its defect, and the defect relative to the sum of the norms of the terms."""
         _, Y = self._factored(P)
         change = P @ self.rate
         spent = Y.T @ Y
@@ -88,7 +88,7 @@ class Riccati:
         return _Trial(P, defect, residual)
 
     def _factored(self, P: Array) -> tuple[Array, Array]:
-        """Return the lower factor of W and Y with K = W^-T Y, so that the gain costs Y' Y."""
+        """Return L and Y with W = L L', where K = L^-T Y and Y' Y is the cost of the gain."""
         if not self.discrete:
             Y = self._inputs @ P
             return self.R_factor, Y if self.cross is None else Y + self.cross
@@ -104,9 +104,9 @@ class Riccati:
 def solve(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution:
-    """Solve for the stabilising P, by half the size or by SciPy; `LinAlgError` where none is found.
+    """Return the stabilising solution, by the half-size method or SciPy, or raise `LinAlgError`.
 
-    Newton's method refines either (D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968).
+    Newton's method refines both (D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968).
     """
     equation = Riccati(A, B, Q, R, N, dt)
     start = _half_size(equation)
@@ -114,7 +114,7 @@ def solve(
         return start
     found = [] if start is None else [start]
     for unit in (False, True):
-        # SciPy raises one or the other where it cannot reorder a pencil.
+        # SciPy raises either of these errors if it cannot reorder a pencil.
         with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
             refined = _refined(equation, _general(equation, unit), None)
             if (general := _finished(equation, *refined, "general")) is not None:
@@ -129,13 +129,13 @@ def solve(
 def half_size(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution | None:
-    """Solve as `solve` does by the half-size method; None where it falls short."""
+    """Return the solution of the half-size method, or None if the method is not accurate."""
     solution = _half_size(Riccati(A, B, Q, R, N, dt))
     return solution if solution is not None and solution.residual <= _SOUND else None
 
 
 def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
-    """Solve from the modes of a loop whose weights on velocities are larger by a part."""
+    """Solve from the modes of a loop in which velocities are scaled by 1 + `apart`."""
     found = None
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
@@ -143,7 +143,7 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
             return None
         A, Q, cross = source.A, source.Q, source.cross
         if cross is not None:
-            # In terms of u + R^-1 N' x the cost has no cross term.
+            # With u + R^-1 N' x as input, the cost has no cross term.
             A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
             Q = Q - cross.T @ cross
         scale = np.ones(len(A))
@@ -157,7 +157,8 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
         found = _finished(equation, *_refined(equation, P, modes), "structured")
     if apart or (found is not None and found.residual <= _SOUND):
         return found
-    # Modes that coincide, as of critical damping, have no inverse: Newton starts beside them.
+    # Coinciding modes, as in critical damping, have no inverse. Newton's method then starts from a
+    # slightly different loop.
     return _half_size(equation, _APART) or found
 
 
@@ -169,7 +170,7 @@ def _bilinear(equation: Riccati) -> Riccati | None:
     FB = F @ B
     R = equation.R - N.T @ FB - FB.T @ N + FB.T @ Q @ FB
     Bc = 2.0**0.5 * FB
-    # Rows that should be zero are rounding; Newton's method uses the equation without this map.
+    # Rows that should be zero contain rounding errors. Newton's method uses the original equation.
     Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
     N = 2.0**0.5 * F.T @ (N - Q @ FB)
     continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
@@ -189,7 +190,7 @@ def _finished(
 def _refined(
     equation: Riccati, P: Array, modes: ModalMatrix | None
 ) -> tuple[_Trial, ModalMatrix | None]:
-    """Apply Newton steps; `modes` belong to a closed loop near the loop of P, if known."""
+    """Refine P by Newton steps; `modes` belong to a closed loop near the loop of P, if known."""
     enough = 0.5 * _EPS * len(P) ** 0.5
     trial = best = equation.trial(P)
     fresh = False
@@ -201,7 +202,7 @@ def _refined(
             modes, fresh = ModalMatrix.of(F, equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
-        # Far from the solution a first step may raise the residual and still improve P.
+        # Far from the solution, the first step may raise the residual and still improve P.
         if gain > 1.0 or (fresh and trial.residual > _NEAR):
             trial = better
         if trial.residual < best.residual:
@@ -210,7 +211,7 @@ def _refined(
             if gain < 2.0:
                 break
         elif gain < 10.0:
-            # Slow progress: the modes are those of a loop too far away.
+            # Progress is slow, because the modes belong to a loop that is too far away.
             if fresh and trial is not better:
                 break
             modes = None
@@ -218,7 +219,7 @@ def _refined(
 
 
 def _general(equation: Riccati, unit: bool) -> Array:
-    """Solve by SciPy, which takes an R badly scaled for singular; `unit`: inputs that cost 1."""
+    """Solve by SciPy, which takes a badly scaled R for singular; `unit` scales R to I."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     solver = solve_discrete_are if equation.discrete else solve_continuous_are
@@ -253,21 +254,22 @@ class ModalMatrix:
         return cls(V, poles, discrete)
 
     def lyapunov(self, r: Array) -> Array:
-        """Solve F' D + D F = -r, or where discrete F' D F - D = -r, for a symmetric r (n, n)."""
+        """Solve F' D + D F = -r (discrete: F' D F - D = -r) for a symmetric r (n, n)."""
         return self.lyapunov_modal(self.V.conj().T @ r @ self.V)
 
     def lyapunov_modal(self, r: Values) -> Array:
-        """Solve the same where V^H r V is given."""
-        # In the modes the equation is a division.
+        """Solve the equation of `lyapunov`, with r given as V^H r V."""
+        # In modal coordinates, the equation is solved by an elementwise division.
         D: Array = (self.inverse.conj().T @ (r * self._factors) @ self.inverse).real
         return 0.5 * (D + D.T)
 
     def poles(self, F: Array) -> Values:
-        """Return the eigenvalues of a matrix, read off where these modes decouple it."""
+        """Return the eigenvalues of F, which are diagonal entries if the modes V decouple F."""
         M = self.inverse @ F @ self.V
         values = M.diagonal().astype(complex)
         M.flat[:: len(M) + 1] = 0.0
-        # Those of a normal matrix times E + X move by the norm of X at most, relatively.
+        # A relative perturbation X moves the eigenvalues of a normal matrix by at most the norm of
+        # X, relatively.
         if np.linalg.norm(M / np.abs(values)) > 1e-7:
             return np.linalg.eigvals(F)
         real, first = self.values.imag == 0.0, np.flatnonzero(self.values.imag)[::2]
@@ -277,20 +279,21 @@ class ModalMatrix:
 
 
 class OptimalLoop(NamedTuple):
-    """A closed loop by its modes V, and V^H (Q + K' R K) V of its gain."""
+    """Modes V of a closed loop, and the cost V^H (Q + K' R K) V of its gain."""
 
     modes: ModalMatrix
     cost: Values
 
 
 def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalLoop | None:
-    """Return a stable loop, optimal but for odd powers (10.5); None where the system is another."""
+    """Return a stable loop, optimal except for odd powers (10.5), or None for other systems."""
     nx = len(A)
     m = nx // 2
     if nx != 2 * m or B[:m].any():
         return None
     white = _lower(R_factor, B[m:].T)
-    # Of the inverse weight on forces, S = Ls Ls'; squaring it would square its condition.
+    # The inverse weight on forces is S = Ls Ls'. Computing S itself would square the condition
+    # number.
     triangle = np.asarray(np.linalg.qr(white, mode="r"))
     Ls = triangle.T
     sizes = np.abs(Ls.diagonal())
@@ -318,7 +321,7 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
     if ((squares.imag == 0.0) & (squares.real <= 0.0)).any():
         return None
     poles = -np.sqrt(squares)
-    # The lower half of w is a = mu p.
+    # The lower half of w is the acceleration a = mu p.
     a = W[m:]
     motion = np.concatenate((a / squares, a / poles))
     if not plain:

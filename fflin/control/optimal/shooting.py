@@ -17,17 +17,17 @@ from fflin.robot.robot import Robot
 
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
 
-# The motions of trials have at least so many, as they are limited between the ends of steps too.
+# Least number of steps per interval in a trial, because limits also apply between the steps.
 _STEPS = 16
 
-# Jacobians are integrated by a quarter of these steps, but by no more than this number.
+# Jacobians are integrated in a quarter of the steps of the motion, but in at most this number.
 _MOST_OF_JACOBIANS = 16
 
 Point = tuple[Array, Array]
 
 
 class Motions(NamedTuple):
-    """Motions of N intervals at the ends of equal steps, beginning at the knots."""
+    """Motions of N intervals from the knots, with a row at the end of each step."""
 
     q: Array  # (N, steps + 1, nq)
     v: Array  # (N, steps + 1, nv)
@@ -35,46 +35,46 @@ class Motions(NamedTuple):
 
 
 class Shooting:
-    """Equally spaced knots at times t (N + 1,): where N motions begin that are to be continuous."""
+    """Multiple shooting from equally spaced knots at times t (N + 1,), the starts of N motions."""
 
-    # Steps between configurations and velocities are z = (theta_b, r_b, q_m, nu) (nx,) in base
-    # axes, those of the linear models with the rotation vector for twice q_b.
+    # A step from one point to another is z = (theta_b, r_b, q_m, nu) (nx,) in base axes. It has
+    # the states of the linear models, but the rotation vector theta_b replaces 2 q_b.
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
         self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
         self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
         self._aba = Aba(self.state)
-        # Of one engine, so that a plan is the same to the last bit whatever ran before.
+        # The engine is fixed, so that a plan is the same bit for bit whatever ran before.
         self._linearizer = Linearizer(robot, moving=True)
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
     def between(self, start: Point, end: Point) -> Array:
-        """Return the step z (nx,) from a point to another; wheels may be at any angle."""
+        """Return the step z (nx,) from one point to another, in which wheel angles are zero."""
         state = self.state
-        way = pin.difference(state.robot.model, start[0], end[0])
-        z = np.concatenate((state.velocities(way), state.velocities(end[1] - start[1])))
+        difference = pin.difference(state.robot.model, start[0], end[0])
+        z = np.concatenate((state.velocities(difference), state.velocities(end[1] - start[1])))
         z[self.wheels] = 0.0
         return z
 
     def moved(self, q: Array, v: Array, z: Array) -> Point:
-        """Return knots a step z (N + 1, nx) further."""
-        model, (way, rates) = self.state.robot.model, np.split(z, 2, axis=1)
-        return integrate_rows(model, q, self.state.spread(way)), v + self.state.spread(rates)
+        """Return the knots after a step z (N + 1, nx)."""
+        model, (difference, rates) = self.state.robot.model, np.split(z, 2, axis=1)
+        return integrate_rows(model, q, self.state.spread(difference)), v + self.state.spread(rates)
 
     def motions(self, q: Array, v: Array, u: Array, steps: int = 0) -> Motions:
         """Return the motions of the intervals from knots q, v under inputs u (N + 1, ..).
 
-        The number of steps in each interval is by default that of `refine`, or larger.
+        By default, each interval has the number of steps that `refine` found, but at least _STEPS.
         """
         return self._fly(q[:-1], v[:-1], u[:-1], u[1:], steps or max(self.steps, _STEPS))
 
     def _fly(self, q: Array, v: Array, first: Array, last: Array, steps: int) -> Motions:
-        """Return the motions of some intervals whose inputs begin and end with these rows."""
+        """Return the motions of intervals whose inputs change from `first` to `last` (N, nu)."""
         h, change = self.h[0], 0.0 * first if self.held else last - first
         method = CommutatorFree4(self.state.robot.model, h / steps, len(q))
-        places, speeds, rates = [q], [v], list[Array]()
+        configurations, speeds, rates = [q], [v], list[Array]()
 
         def rate(t: float, q: Array, v: Array) -> Array:
             rates.append(self._aba.accelerations(q, v, first + t / h * change))
@@ -82,14 +82,14 @@ class Shooting:
 
         for step in range(steps):
             q, v = method.step(rate, step * method.dt, q, v)
-            places.append(q)
+            configurations.append(q)
             speeds.append(v)
         rate(h, q, v)
-        found = places, speeds, rates[:: len(method.nodes)]
+        found = configurations, speeds, rates[:: len(method.nodes)]
         return Motions(*(np.array(each).swapaxes(0, 1) for each in found))
 
     def missed(self, q: Array, v: Array, motions: Motions) -> Array:
-        """Return how far the ends of the intervals are from the next knots (N, nx)."""
+        """Return the gaps (N, nx) between the ends of the intervals and the next knots."""
         rows = zip(q[1:], v[1:], motions.q[:, -1], motions.v[:, -1], strict=True)
         return np.array([self.between(row[:2], row[2:]) for row in rows])
 
@@ -112,7 +112,7 @@ class Shooting:
 
     def inside(self, motions: Motions, parts: int) -> Array:
         """Return the limited values (N, parts - 1, nx) between equal parts of the intervals."""
-        # By cubics of Hermite for the rates between the ends of steps, and by their integrals.
+        # Between the ends of steps, rates are Hermite cubics and positions are their integrals.
         n, steps = self.state.robot.n, motions.q.shape[1] - 1
         at = np.arange(1, parts) * steps / parts
         step = at.astype(int)
@@ -121,13 +121,13 @@ class Shooting:
         ends = (x[:, k] for x in (rates, h * changes) for k in (step, step + 1))
         first, rate, late, bend = cubic(*ends).swapaxes(0, 1)
         values = self.limited_values(motions.q[:, step], motions.v[:, step])
-        way = first + s * (rate / 2.0 + s * (late / 3.0 + s * bend / 4.0))
-        values[..., 6 : 6 + n] += h * s * way
+        average = first + s * (rate / 2.0 + s * (late / 3.0 + s * bend / 4.0))
+        values[..., 6 : 6 + n] += h * s * average
         values[..., values.shape[-1] - n :] = first + s * (rate + s * (late + s * bend))
         return values
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
-        """Take so many steps that the ends of the intervals are this accurate in rad, m and s."""
+        """Increase the number of steps until interval ends have this accuracy [rad, m, s]."""
         self.steps = _FEWEST_STEPS
         missed = self.missed(q, v, self.motions(q, v, u, self.steps))
         while self.steps < _MOST_STEPS:
@@ -139,12 +139,12 @@ class Shooting:
     def jacobians(
         self, q: Array, v: Array, u: Array, parts: int = 1
     ) -> tuple[Array, Array, Array, Array]:
-        """Return Jacobians of the intervals' ends over z, the input there and the next one.
+        """Return Jacobians of interval ends with respect to z and the inputs at both knots.
 
-        The last array (N, parts - 1, nx, nx + 2 nu) has the Jacobians, side by side, of the points
-        between equal parts of the intervals.
+        The last array (N, parts - 1, nx, nx + 2 nu) contains the Jacobians, side by side, of the
+        points between the equal parts of the intervals.
         """
-        # By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
+        # Runge-Kutta steps of dZ/dt = A Z + B along the motions, for all intervals at once.
         N, nx, nu = len(self.h), len(self._size), u.shape[1]
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
         motions = self.motions(q, v, u, 4 * steps)
@@ -182,22 +182,23 @@ class Shooting:
         s, rates = self.t[:, None] / T, np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))
         rates[:, PIN_LINEAR] = (turned @ rates[:, PIN_LINEAR, None])[..., 0]
-        way, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
-        way[PIN_LINEAR] = end[0][:3] - start[0][:3]
+        difference, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
+        difference[PIN_LINEAR] = end[0][:3] - start[0][:3]
         turn = pin.log3(turned[0].T @ turned[1])
         axis = turn if turn.any() else mean[PIN_ANGULAR]
         axis = axis / (np.linalg.norm(axis) or 1.0)
         rounds = np.round((mean[PIN_ANGULAR] - turn) @ axis / (2.0 * np.pi))
-        way[PIN_ANGULAR] = turn + 2.0 * np.pi * rounds * axis
-        # Of the rotation vector at the end; on whole turns about the axis there is no other.
-        jacobian = pin.Jexp3(way[PIN_ANGULAR])
+        difference[PIN_ANGULAR] = turn + 2.0 * np.pi * rounds * axis
+        # Final rate of the rotation vector. Its Jacobian is singular after whole turns about the
+        # axis.
+        jacobian = pin.Jexp3(difference[PIN_ANGULAR])
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(jacobian, rates[1, PIN_ANGULAR], rcond=1e-6)[0]
-        late, bend = 3 * way - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * way
-        places = s * (rates[0] + s * (late + s * bend))
+        late, bend = 3 * difference - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * difference
+        displacements = s * (rates[0] + s * (late + s * bend))
         v = (rates[0] + s * (2 * late + 3 * s * bend)) / T
-        q = np.array([pin.integrate(model, start[0], step) for step in places])
-        q[:, :3] = start[0][:3] + places[:, PIN_LINEAR]
-        for turn, rate in zip(places[:, PIN_ANGULAR], v[:, PIN_ANGULAR], strict=True):
+        q = np.array([pin.integrate(model, start[0], step) for step in displacements])
+        q[:, :3] = start[0][:3] + displacements[:, PIN_LINEAR]
+        for turn, rate in zip(displacements[:, PIN_ANGULAR], v[:, PIN_ANGULAR], strict=True):
             rate[:] = pin.Jexp3(turn) @ rate
         v[:, PIN_LINEAR] = (v[:, None, PIN_LINEAR] @ rotation_matrices(q[:, 3:7]))[:, 0]
         q[-1], v[-1] = end

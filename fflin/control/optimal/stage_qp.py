@@ -7,7 +7,7 @@ import numpy as np
 from fflin.base.errors import MissingPackageError
 from fflin.base.validation import Array, Indices
 
-# What may be left of the optimality conditions of the scaled problem, absolute and relative.
+# Absolute and relative tolerance of the optimality conditions of the scaled problem.
 _ACCURACY = 1e-10
 
 
@@ -26,7 +26,7 @@ class StageRows(NamedTuple):
     G: Array  # (m, nx + 2 nu)
     low: Array  # (m,)
     high: Array
-    soft: float  # what a unit of s costs
+    soft: float  # cost of a unit of s
 
     def values(self, x: Array, u: Array) -> Array:
         """Return G (x[k], u[k], u[k + 1]) (m,)."""
@@ -43,7 +43,7 @@ class StageQP(NamedTuple):
         x_{k+1} = A_k x_k + B_k u_k + D_k u_{k+1} + c_k, \quad
         \mathrm{low}_k - s_k \le w_k \le \mathrm{high}_k + s_k, \quad s_k \ge 0
 
-    and within the soft limits of `rows`.
+    The soft limits of `rows` are further constraints.
     """
 
     start: Array  # x[0] (nx,)
@@ -57,10 +57,10 @@ class StageQP(NamedTuple):
     high: Array
     soft: Array  # (N + 1, nx + nu)
     rows: StageRows
-    scale: Array  # (nx + nu,), sizes that variables may have, in fractions of which it is solved
+    scale: Array  # (nx + nu,), typical sizes of the variables, which scale the program
 
     def solve(self) -> StageSolution | None:
-        """Return the solution; None if the hard bounds are infeasible, or no solution is found."""
+        """Return the solution, or None if the program is infeasible or the solver fails."""
         import scipy.sparse as sp
 
         try:
