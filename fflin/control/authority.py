@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     pass
 
 _FACETS = 20_000  # normals computed together
-_MANY = 36  # thrusters, which have 400 000 facets
+_MANY = 36  # thrusters; their zonotope has 400 000 facets
 
 # A force or torque that is smaller, relative to the sum of all thrusts, is rounding error.
 _ROUNDING = 1e-9

@@ -176,7 +176,7 @@ def plan(
     if made.reached:
         q, v, u = made.q, made.v, made.u
         if asked.all():
-            q[-1], v[-1] = end  # at rest, rounding would be all that a check sees
+            q[-1], v[-1] = end  # without the rounding errors of the motion
         note = _note(shooting, made, size)
         if made.most > _BETWEEN:
             warnings.warn(

@@ -384,7 +384,7 @@ def fed_back(policy: object) -> tuple[str, ...]:
     """Return the names of the states that a policy feeds back, or () if unknown."""
     (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
     if schedule is not None:
-        K = np.abs(schedule.K).max(axis=0)  # the largest over time
+        K = np.abs(schedule.K).max(axis=0)  # largest entries over time
     of: Any = lin if schedule is None else schedule
     if of is None:
         return ()
