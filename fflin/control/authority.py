@@ -15,8 +15,8 @@ from fflin.base.validation import Array, Mask
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.equipment.mounting import carrier
+from fflin.robot.fields import limits_of
 from fflin.robot.inputs import named_wheels
-from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
-from fflin.robot.limits import limits_of
+from fflin.robot.fields import limits_of
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
