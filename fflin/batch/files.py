@@ -323,7 +323,7 @@ class FileStore:
             install(self.part, self.path)
 
     def discard(self) -> None:
-        """Leave nothing behind."""
+        """Close and delete the unfinished file."""
         self.close()
         self.part.unlink(missing_ok=True)
 

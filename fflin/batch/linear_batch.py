@@ -107,7 +107,7 @@ class LinearBatch(FrozenArrays):
     fflin_version: str
     pinocchio_version: str
     columns: tuple[Column, ...]
-    # None if x0 follows from q (at rest), or if y0 is x0 (the outputs are the state).
+    # _x0 is None at rest, because x0 then follows from q. _y0 is None if the outputs are the state.
     _x0: Array | None
     _y0: Array | None
     # None if the reference is the base's own placement, which follows from q and _root.

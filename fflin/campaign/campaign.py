@@ -161,9 +161,9 @@ class Campaign(FrozenArrays):
     state_units: tuple[str, ...]
     input_names: tuple[str, ...]
     input_units: tuple[str, ...]
-    input_limits: tuple[float, ...]  # largest magnitudes that act, infinite where there are none
+    input_limits: tuple[float, ...]  # largest input magnitudes; infinite without a limit
     times: tuple[float, ...]
-    judged: tuple[str, ...]  # the kinds that are steered
+    judged: tuple[str, ...]  # kinds of errors that the policy controls
     robot: str
     urdf_sha256: str
     duration: float

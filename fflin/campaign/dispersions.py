@@ -36,7 +36,7 @@ from fflin.simulation.times import Times
 if TYPE_CHECKING:
     from fflin.robot.equipment.appendages import Appendage
 
-_BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
+_BLOCK = 1024  # runs drawn together, independent of the chunks
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
 _AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
@@ -48,8 +48,8 @@ class Column(NamedTuple):
     """Number drawn for each run, and the quantities that this number changes."""
 
     name: str
-    kind: str  # "state", "delay", "seed" of noise, or the ending of a name
-    at: tuple[tuple[int, int], ...]  # index of each state, body, joint, input or sensor, and axis
+    kind: str  # "state", "delay", "seed" (of noise), or the last part of a name
+    at: tuple[tuple[int, int], ...]  # (index of state, body, joint, .., axis)
     inverse: Callable[[Array], Array]  # inverse distribution function
 
 
@@ -173,10 +173,10 @@ class Dispersions:
             if kind == "misalignment":
                 require_direction(self._plant.robot, at)
             draws.setdefault(tied or own, (inverse, []))[1].append(at)
-        for own, (inverse, places) in draws.items():
+        for own, (inverse, targets) in draws.items():
             for axis, letter in enumerate(_AXES.get(kind, " ")):
                 name = f"{own}.{letter}".rstrip(". ")
-                where = tuple((at, axis) for at in places)
+                where = tuple((at, axis) for at in targets)
                 self.columns.append(Column(name, kind, where, inverse))
 
     def _by_piece(
@@ -366,8 +366,7 @@ class Dispersions:
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
                 old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
-                # The parameters are linear in the body's properties, so a difference keeps the
-                # wheels in the body.
+                # Only the change is added, because the parameters also contain wheels in the body.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(len(drawn), -1)
         runs |= {kind: self._springs(kind, drawn) for kind in self._springs_of}

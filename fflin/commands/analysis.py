@@ -203,7 +203,7 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
     from fflin.base.record import write_record
     from fflin.linear.equilibrium import equilibrium
     from fflin.linear.linearization import linearize
-    from fflin.robot.limits import limits_of
+    from fflin.robot.fields import limits_of
 
     if arguments.effort:
         raise InputError(

@@ -15,15 +15,15 @@ from fflin.base.validation import Array, Mask
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.equipment.mounting import carrier
+from fflin.robot.fields import limits_of
 from fflin.robot.inputs import named_wheels
-from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     pass
 
 _FACETS = 20_000  # normals computed together
-_MANY = 36  # thrusters, which have 400 000 facets
+_MANY = 36  # thrusters; their zonotope has 400 000 facets
 
 # A force or torque that is smaller, relative to the sum of all thrusts, is rounding error.
 _ROUNDING = 1e-9

@@ -223,7 +223,7 @@ class Channel:
         self._wheels, self._pulses = len(limits.wheels.at), len(limits.pulses.at)
         self._limited = bool(np.isfinite((limits.low, limits.high)).any())
         own = channel_of(limits, initial, sample, delay)
-        counts = ("left", "level", "end")  # of this run alone
+        counts = ("left", "level", "end")  # state of a single run
         self._rules = own._replace(
             wheels=own.wheels._replace(row=np.arange(self._wheels)),
             pulses=own.pulses._replace(**{key: np.zeros(self._pulses) for key in counts}),

@@ -25,8 +25,7 @@ from fflin.control.weights import Weight, sampled_cost, weight
 from fflin.dynamics.state import StateMap
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
-from fflin.robot.fields import range_of
-from fflin.robot.limits import chosen_limits
+from fflin.robot.fields import chosen_limits, range_of
 from fflin.robot.robot import Robot
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.

@@ -15,8 +15,7 @@ import umsgpack
 from fflin.base.validation import Array
 from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
-from fflin.view.meshes import Indices, Mesh, load_mesh
-from fflin.view.shapes import PLAIN, Shape, bendings, shapes
+from fflin.view.shapes import PLAIN, Indices, Mesh, Shape, bendings, load_mesh, shapes
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # from packages that meshcat imports
