@@ -138,7 +138,7 @@ class Dispersions:
                 names = f"'{self.names[column]}' and '{self.names[other]}'"
                 raise InputError(f"{names} disperse the same mass; disperse only one of them")
 
-    def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
+    def _add(self, kind: str, spreads: Mapping[str, Any], names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:
             raise InputError(
                 f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy "

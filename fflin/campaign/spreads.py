@@ -108,7 +108,7 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     return found
 
 
-def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, Any]]:
+def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, object]]:
     """Yield (name, spread); the key path ``base.mass = 0.1`` becomes the name "base.mass"."""
     for key, value in table.items():
         if isinstance(value, dict) and value and not {*value} & {*_FORMS}:
@@ -117,7 +117,7 @@ def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str,
             yield f"{before}{key}", value
 
 
-def _spread(value: object) -> Any:
+def _spread(value: object) -> object:
     table: dict[str, Any] = dict(value) if isinstance(value, dict) else {"normal": value}
     if "tied" in table:
         tied = table.pop("tied")
@@ -132,7 +132,7 @@ def _spread(value: object) -> Any:
     raise InputError(f"{reprlib.repr(value)} is not a dispersion, expected {_EXPECTED}")
 
 
-def _distribution(distribution: str, **given: object) -> Any:
+def _distribution(distribution: str, **given: object) -> object:
     from scipy import stats
 
     kinds = stats.rv_continuous, stats.rv_discrete

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +24,9 @@ from fflin.dynamics.outputs import Measuring
 from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default names of signals
 
@@ -320,7 +323,13 @@ def _realised(given: object) -> Any:
 
 
 def _checked(
-    A: Any, B: Any, C: Any, D: Any, dt: Any = None, inputs: Any = (), outputs: Any = ()
+    A: ArrayLike,
+    B: ArrayLike,
+    C: ArrayLike,
+    D: ArrayLike | None,
+    dt: object = None,
+    inputs: Iterable[object] = (),
+    outputs: Iterable[object] = (),
 ) -> System:
     """Return a system with consistent sizes; if A is empty, the system consists of D alone."""
     of = dict(zip("ABCD", (A, B, C, 0.0 if D is None else D), strict=True))

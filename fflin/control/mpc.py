@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError, listed
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, instance, number, whole
+from fflin.base.validation import Array, Indices, instance, number, whole
 from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
 from fflin.control.horizon import Horizon, Matrices, Receding, Stage
@@ -27,6 +27,10 @@ from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, range_of
 from fflin.robot.robot import Robot
+
+# Weights Q and R and their rule, and the limits E, D, low and high of a stage.
+Cost: TypeAlias = "tuple[Weight | None, Weight | None, str | None]"
+Rows: TypeAlias = Callable[..., tuple[Array, ...]]
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
 _MOST = 20_000_000
@@ -137,8 +141,12 @@ def mpc(
             f"horizon is {samples} samples with {len(at)} limits, which makes the optimisation "
             "problem too large; give a shorter horizon or fewer limits"
         )
-    designed: Any = _along if isinstance(source, LinearTrajectory) else _about
-    made, stages = designed(source, (Q, R, weights), Qf, samples, dt, names, rows)
+    given = (Q, R, weights), Qf, samples, dt, names, rows
+    made: Callable[[Horizon], Mpc | TrajectoryMpc]
+    if isinstance(source, LinearTrajectory):
+        made, stages = _along(source, *given)
+    else:
+        made, stages = _about(source, *given)
     acting = at[at < len(lin.input_names)]
     of: Any = getattr(source.robot, "name", source.robot)
     return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, names, of))
@@ -205,7 +213,9 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
         return Receding(self.horizon, self.deviation(robot))
 
 
-def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any]]:
+def _limits(
+    of: LinearModel | LinearTrajectory, limits: object
+) -> tuple[tuple[str, ...], Indices, Rows]:
     """Return the names of limited signals, their indices, and a function that limits a stage.
 
     The indices count inputs, then states, then outputs. The function returns E, D, low and high of
@@ -248,7 +258,13 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
 
 
 def _about(
-    lin: LinearModel, cost: Any, Qf: Any, samples: int, dt: float, names: Any, rows: Any
+    lin: LinearModel,
+    cost: Cost,
+    Qf: Weight | str,
+    samples: int,
+    dt: float,
+    names: tuple[str, ...],
+    rows: Rows,
 ) -> tuple[Callable[[Horizon], Mpc], list[Stage]]:
     """Return a function that creates the controller about a point, and the stages."""
     (Q, R, weights), sampled = cost, lin.discretize(dt)
@@ -272,14 +288,20 @@ def _about(
 
 
 def _along(
-    traj: LinearTrajectory, cost: Any, Qf: Any, samples: int, dt: float, _: Any, rows: Any
+    traj: LinearTrajectory,
+    cost: Cost,
+    Qf: Weight | str,
+    samples: int,
+    dt: float,
+    _: tuple[str, ...],
+    rows: Rows,
 ) -> tuple[Callable[[Horizon], TrajectoryMpc], list[Stage]]:
     """Return a function that creates the controller along a trajectory, and the stages."""
     schedule = tvlqr(traj, cost[0], cost[1], Qf, dt, weights=cost[2])
     follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
     Q, R, models, end = schedule.Q, schedule.R, along(traj.resampled(dt)), follows.end
 
-    def about(of: Any, u: Array) -> Any:
+    def about(of: LinearModel, u: Array) -> tuple[Array, ...]:
         # Limits on the base pose apply to its error relative to the trajectory.
         x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
         return rows(of.C, of.D, u, x, of.y0)

@@ -330,7 +330,7 @@ def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: object) -> S
 
 
 def _output_law(
-    given: LinearController | Compensator, lin: Any, robot: Robot | None, limits: Any
+    given: LinearController | Compensator, lin: Any, robot: Robot | None, limits: object
 ) -> OutputLaw:
     if isinstance(given, Compensator):
         none = np.zeros((len(given.u0), len(given.y0)))
