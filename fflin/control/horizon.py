@@ -133,7 +133,7 @@ _At = Callable[[float, Array, Array], tuple[Array, Array]]
 class Receding:
     """Policy that applies the first input of each plan; `at(t, q, v)` returns u* and e."""
 
-    def __init__(self, horizon: Horizon, at: _At) -> None:
+    def __init__(self, horizon: Horizon, at: _At | None = None) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
         self.solves = self.softened = self.unfinished = self.exceeded = 0
@@ -164,6 +164,7 @@ class Receding:
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,) at a sample."""
         self._clock.tick(t)
+        assert self._at is not None
         u, e = self._at(t, q, v)
         command: Array = u + self.step(t, e)
         return command

@@ -152,8 +152,6 @@ def draw_motion(motion: Motion, path: str | Path | None, show: Sequence[str] | N
 def _selected(
     motion: Motion, show: Sequence[str] | None
 ) -> tuple[dict[str, list[Curve]], dict[str, list[Curve]]]:
-    motion: Motion, show: Sequence[str] | None
-) -> tuple[dict[str, list[Curve]], dict[str, list[Curve]]]:
     """Return the chosen states by group, and chosen inputs, wheel speeds and momenta by title."""
     names = (*motion.state_names, *input_keys(motion))
     show = [show] if isinstance(show, str) else show
