@@ -258,7 +258,9 @@ def monte_carlo(
     return replace(Campaign.load(store.path), _job=job)
 
 
-def _goals(given: object, until: object, shapes: Any, header: dict[str, Any]) -> list[str]:
+def _goals(
+    given: object, until: object, shapes: Mapping[str, tuple[int, ...]], header: dict[str, Any]
+) -> list[str]:
     """Return the goals; raise an error for an invalid goal before any run begins."""
     goals = [given] if isinstance(given, str) else given
     if not isinstance(goals, list | tuple):
