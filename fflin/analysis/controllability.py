@@ -224,7 +224,7 @@ class _Part(NamedTuple):
 
     controllable: Array  # (2 r, d), a basis
     rows: Array  # (2 r - d, 2 r); no input acts on rows @ z
-    names: tuple[str, ...] | None  # of the rows; None: named after their states
+    names: tuple[str, ...] | None  # names of `rows`; None if they follow from the states
     method: str
     fixed: FixedPoles
 

@@ -46,7 +46,8 @@ _REFINEMENTS, _NEAR = 4, 0.1
 # shows may then be unobservable.
 _ALIASED = 1e-6
 
-# A slower decay may be a defective pair of zero poles, moved by the square root of rounding error.
+# A pole with a slower decay may belong to a defective pair at zero, which rounding moves by the
+# square root of the rounding error.
 _DECAY = 1e-7
 
 # A motion has died out if one sample reduces it below this fraction; the rest is rounding error.
@@ -102,7 +103,7 @@ class Split(NamedTuple):
     inside: Array  # (nx, d), basis of the controllable subspace
     outside: Array  # (nx, nx - d), complement; for a dual pair, the unobservable subspace
     rows: Array  # (nx - d, nx); no input acts on rows @ x
-    fixed: FixedPoles  # of the complement
+    fixed: FixedPoles  # poles of the complement
 
 
 def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False) -> Split:
@@ -147,9 +148,9 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
     from scipy.linalg import eig
 
     poles, left = eig(A, left=True, right=False)
-    unseen = np.linalg.norm(left.conj().T @ B, axis=1) < _SUSPICIOUS
+    missed_by_inputs = np.linalg.norm(left.conj().T @ B, axis=1) < _SUSPICIOUS
     distances = np.abs(poles[:, None] - poles) + np.eye(len(A))
-    near = unseen | (distances.min(axis=1) < _SUSPICIOUS)
+    near = missed_by_inputs | (distances.min(axis=1) < _SUSPICIOUS)
     # Rounding splits a defective zero eigenvalue into several poles, so zero itself is tested
     # first.
     candidates = [0j, *poles[(poles.imag >= 0.0) & near]]
@@ -207,9 +208,9 @@ def unobservable(
     result is None if this test is inconclusive: K or D is not symmetric, D is indefinite, sampling
     aliases two poles, or a pole is defective.
     """
-    # At the pole zero, Jordan chains have at most two vectors: K s = K v = D v = C_s v = 0 and C_s
-    # s + C_v v = 0. By symmetry, the inputs cannot excite the motions that C_s = S^T, C_v = 0 does
-    # not show.
+    # At the pole zero, Jordan chains have at most two vectors, s and v. They satisfy
+    # K s = K v = D v = C_s v = 0 and C_s s + C_v v = 0.
+    # The uncontrollable motions are, by symmetry, the unobservable motions of C_s = S^T, C_v = 0.
     if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
         return None
     at_zero, margin = _missed_at_zero(system, position, velocity)

@@ -214,8 +214,8 @@ class ConservedMomenta:
     coordinates: Array
     # (r,): kept coordinates. They and their rates determine all other states if L1 x = L2 x = 0.
     kept: Indices
-    T: Array  # (nx, 2 r): state with L1 x = L2 x = 0 from the kept coordinates and rates
-    margin: Margin  # of the decision on r
+    T: Array  # (nx, 2 r): maps kept coordinates and rates to the state, if L1 x = L2 x = 0
+    margin: Margin  # margin of the rank decision on r
 
     @property
     def selected(self) -> Indices:

@@ -30,8 +30,8 @@ class Decision(NamedTuple):
     """Singular value divided by its tolerance; it counts as nonzero if this ratio is above 1."""
 
     ratio: float
-    at: Values = np.zeros(0)  # its direction; empty if there was nothing to decide
-    states: int = 1  # states decided: 2 for a pair of poles, or for a momentum and its coordinate
+    at: Values = np.zeros(0)  # singular vector; empty without a decision
+    states: int = 1  # states concerned: 2 for a pair of poles, or a momentum and its coordinate
 
 
 class Margin(NamedTuple):
@@ -88,10 +88,10 @@ def decided(ratio: float, direction: Values, states: int = 1) -> Margin:
 class FixedPoles(NamedTuple):
     """Poles of the uncontrollable or unobservable part."""
 
-    poles: Values = np.zeros(0)  # (k,) [1/s], or of the sampled model
+    poles: Values = np.zeros(0)  # (k,) [1/s], or discrete-time poles
     decays: bool = True  # whether all these poles decay, beyond rounding error
-    margin: Margin = Margin()  # of the rank decisions
-    settling: Margin = Margin()  # of whether the slowest of these poles decays
+    margin: Margin = Margin()  # margin of the rank decisions
+    settling: Margin = Margin()  # certainty that the slowest pole decays
 
     def transformed(self, change: Array) -> FixedPoles:
         """Return the poles with the directions of their margins in other coordinates."""

@@ -77,7 +77,7 @@ class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
     __slots__ = ()
 
     def __str__(self) -> str:
-        """Show one row for each four equivalent attitudes."""
+        """Show a table with one row for each group of four equivalent attitudes."""
         rows = [["radial", "along", "normal [kg m^2]", "", "growth [1/s]"]]
         for one in self[::4]:
             said = {True: "stable", False: "unstable", None: "undecided"}[one.stable]

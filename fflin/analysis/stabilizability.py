@@ -30,7 +30,7 @@ _RANK = 1e-7
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` if there are states that the inputs cannot stabilise."""
     missed = "the inputs cannot stabilise {}; add inputs"
-    if len(lin.A) < 2 * len(lin.M):  # with speeds of wheels without their angles
+    if len(lin.A) < 2 * len(lin.M):  # the model has wheel speeds without wheel angles
         robot = lin._robot
         if robot and any(robot.damping.get(name) for name in robot.wheels):
             missed += ", or remove the damping of the wheels"
@@ -82,7 +82,7 @@ def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
-    """Raise `InputError` if a marginally stable mode is excited by no disturbance."""
+    """Raise `InputError` if no disturbance excites a marginally stable mode."""
     missed = (
         "W does not excite {}, whose motion does not decay by itself, so a steady-state filter "
         "would not correct its estimate; give the noise there a positive intensity"

@@ -97,7 +97,7 @@ def require_matplotlib() -> None:
         raise MissingPackageError(
             "figures need matplotlib; install it with: pip install 'fflin[plot]'"
         ) from None
-    except ValueError as error:  # of the environment's MPLBACKEND, or of a settings file
+    except ValueError as error:  # invalid MPLBACKEND or settings file
         said = str(error).partition(";")[0]
         raise MissingPackageError(
             f"matplotlib cannot be loaded: {said}; correct MPLBACKEND"

@@ -56,7 +56,7 @@ _JSON_CHECKSUM = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
 _MAT_TEXT, _MAT_CHECKSUM = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
 _MAT_NEARLY = re.compile(
     rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE
-)  # a header that was checksummed
+)  # remains of a damaged header with a digest
 
 
 class NoRoomError(FileError):
@@ -332,7 +332,7 @@ def record_of(design: Design) -> Record:
     return record
 
 
-def _saved(cls: type[Design]) -> list[Field[Any]]:
+def _saved(cls: type[Design]) -> list[Field[object]]:
     """Return the fields that files contain."""
     own = (item for item in fields(cls) if item.name != "verified" and item.name[0] != "_")
     return [item for item in own if item.type != "Robot"]

@@ -110,7 +110,7 @@ class TomlFile:
         return *table, *[key for key in keys if stands_for_any(key, names)][:1]
 
 
-def flat(table: Mapping[str, object]) -> dict[str, Any]:
+def flat(table: Mapping[str, object]) -> dict[str, object]:
     """Flatten nested tables: ``a.b = 1``, read as a table in a table, becomes the name "a.b"."""
     while any(isinstance(value, dict) and value for value in table.values()):
         pairs = []
@@ -121,9 +121,9 @@ def flat(table: Mapping[str, object]) -> dict[str, Any]:
     return dict(table)
 
 
-def _values(record: Mapping[str, object]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+def _values(record: Mapping[str, object]) -> Iterator[tuple[tuple[str | int, ...], object]]:
     """Yield (key path, value) of all values, at any depth, that are not tables or arrays."""
-    left: list[tuple[tuple[str | int, ...], Any]] = [((), record)]
+    left: list[tuple[tuple[str | int, ...], object]] = [((), record)]
     while left:
         key_path, value = left.pop()
         if isinstance(value, dict | list):

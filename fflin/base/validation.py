@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
     Indices = NDArray[np.intp]
 else:
-    # numpy.typing takes a tenth of the command line's start.
+    # Importing numpy.typing would take a tenth of the start time of the command line.
     Array = Complex = Values = Mask = Indices = np.ndarray
 
 T = TypeVar("T")

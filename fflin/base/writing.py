@@ -132,7 +132,7 @@ def replacing(*targets: Path) -> Iterator[list[Path]]:
     try:
         for target in targets:
             temporary = followed_path(target).parent / f".fflin-{os.urandom(8).hex()}"
-            temporary.touch(exist_ok=False)  # with the mode that the umask leaves
+            temporary.touch(exist_ok=False)  # its mode follows from the umask
             written[temporary] = target
         yield list(written)
         for temporary, target in list(written.items()):

@@ -109,9 +109,9 @@ class ChunkJob:
         if actuation.default:
             return
         # The columns do not depend on the base position, which would only add rounding error.
-        still = q.copy()
-        still[:3] = 0.0
-        np.matmul(inverse, actuation.columns(data, still), out=B_lower)
+        base_centred = q.copy()
+        base_centred[:3] = 0.0
+        np.matmul(inverse, actuation.columns(data, base_centred), out=B_lower)
 
     @cached_property
     def compiled(self) -> BatchEquations | None:

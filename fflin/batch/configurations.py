@@ -268,7 +268,7 @@ def as_configurations(robot: Robot, q: ArrayLike | Configurations) -> Configurat
     return replace(q, robot=robot)
 
 
-def content(configurations: Configurations) -> dict[str, Any]:
+def content(configurations: Configurations) -> dict[str, object]:
     """Return all values that determine the rows, by name and in order."""
     values = {item.name: getattr(configurations, item.name) for item in fields(configurations)}
     of_joints = values.pop("axes", None) or values.pop("ranges", {})

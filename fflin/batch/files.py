@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,11 @@ from fflin.base.writing import (
     reason,
     replacing,
 )
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    import h5py
 
 FORMATS = (".npz", ".h5")
 
@@ -52,7 +57,7 @@ def check_format(path: Path) -> None:
         hdf5()
 
 
-def hdf5() -> Any:
+def hdf5() -> ModuleType:
     """Return h5py, or raise `MissingPackageError`."""
     try:
         import h5py
@@ -165,7 +170,7 @@ def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, st
     return arrays, texts, True
 
 
-def _mapped(path: Path, dataset: Any) -> Array:
+def _mapped(path: Path, dataset: h5py.Dataset) -> Array:
     """Return a contiguous dataset as a memory-mapped array."""
     offset = dataset.id.get_offset()
     if offset is None or not dataset.size:
@@ -318,7 +323,7 @@ class FileStore:
             install(self.part, self.path)
 
     def discard(self) -> None:
-        """Leave nothing behind."""
+        """Close and delete the unfinished file."""
         self.close()
         self.part.unlink(missing_ok=True)
 

@@ -107,7 +107,7 @@ class LinearBatch(FrozenArrays):
     fflin_version: str
     pinocchio_version: str
     columns: tuple[Column, ...]
-    # None if x0 follows from q (at rest), or if y0 is x0 (the outputs are the state).
+    # _x0 is None at rest, because x0 then follows from q. _y0 is None if the outputs are the state.
     _x0: Array | None
     _y0: Array | None
     # None if the reference is the base's own placement, which follows from q and _root.
@@ -319,7 +319,7 @@ class LinearBatch(FrozenArrays):
         return {"header": json.dumps({**header, "points": count, "columns": self.columns})}
 
     def _model(self, index: int) -> LinearModel:
-        common: dict[str, Any] = dict.fromkeys(_MODEL)  # None unless it is set below
+        common: dict[str, object] = dict.fromkeys(_MODEL)  # None unless it is set below
         common |= {key: getattr(self, key) for key in (*_TEXTS, "verified")}
         # The row is read from the file here, so that no model keeps the file open.
         rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}

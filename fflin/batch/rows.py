@@ -55,7 +55,7 @@ def positions(q: Array, columns: Sequence[Column]) -> Array:
 
 
 def away(q: Array, column: Column, value: float) -> Array:
-    """Return distances (N,) of a joint from a value, by the shorter arc of a continuous joint."""
+    """Return distances (N,) of a joint from a value; a continuous joint uses the shorter arc."""
     distance = values(q, column) - value
     if column[1] >= 0:
         distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))

@@ -146,8 +146,14 @@ def sweep(
     check_workers(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
     points = as_configurations(robot, q)
-    options: Any = {"frame": frame, "reference": reference, "moving": moving}
-    job = ChunkJob(robot, at_rest=v is None and u is None, engine=engine, **options)
+    job = ChunkJob(
+        robot,
+        at_rest=v is None and u is None,
+        engine=engine,
+        frame=frame,
+        reference=reference,
+        moving=moving,
+    )
     task = SweepTask(job, points, v, u)
     parallel = executor is not None or workers is not None
     threads = threads or available_cores()

@@ -11,10 +11,13 @@ from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from threading import Lock, Thread, local
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning
 from fflin.kernel.compiled import available_cores
+
+if TYPE_CHECKING:
+    from multiprocessing.process import BaseProcess
 
 # Time for a terminated process to end before it is killed [s].
 _PATIENCE = 5.0
@@ -43,7 +46,7 @@ class OwnWorkers(Executor):
         self._threads = ThreadPoolExecutor(count)
         self._mine = local()
         self._lock, self._closed = Lock(), False
-        self._processes: dict[Any, Connection] = {}
+        self._processes: dict[BaseProcess, Connection] = {}
 
     def submit(self, fn: Callable[..., object], /, *args: object, **kwargs: object) -> Future[Any]:
         """Call a function in a worker process; raise `WorkerDied` if the process dies."""
@@ -78,7 +81,7 @@ class OwnWorkers(Executor):
             raise error
         return result
 
-    def _start(self) -> Any:
+    def _start(self) -> BaseProcess:
         """Start a process for this thread and wait until it is ready."""
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_serve, args=(theirs,), daemon=True)
@@ -102,7 +105,7 @@ class OwnWorkers(Executor):
         self._mine.process = process
         return process
 
-    def _end(self, process: Any) -> None:
+    def _end(self, process: BaseProcess) -> None:
         pipe = self._processes.pop(process, None)
         if pipe is None:  # another thread is already ending it
             return
@@ -162,7 +165,7 @@ def _serve(pipe: Connection) -> None:
         pipe.send(None)
         while True:
             function, args, kwargs = pipe.recv()
-            answer: tuple[Exception | None, Any]
+            answer: tuple[Exception | None, object]
             try:
                 answer = None, function(*args, **kwargs)
             except Exception as error:

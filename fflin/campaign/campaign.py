@@ -17,7 +17,7 @@ from fflin.base import intervals
 from fflin.base.errors import InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import reading
-from fflin.base.validation import Array, FrozenArrays, share, whole
+from fflin.base.validation import Array, FrozenArrays, Mask, share, whole
 from fflin.base.writing import as_path, check_ending, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
@@ -161,9 +161,9 @@ class Campaign(FrozenArrays):
     state_units: tuple[str, ...]
     input_names: tuple[str, ...]
     input_units: tuple[str, ...]
-    input_limits: tuple[float, ...]  # largest magnitudes that act, infinite where there are none
+    input_limits: tuple[float, ...]  # largest input magnitudes; infinite without a limit
     times: tuple[float, ...]
-    judged: tuple[str, ...]  # the kinds that are steered
+    judged: tuple[str, ...]  # kinds of errors that the policy controls
     robot: str
     urdf_sha256: str
     duration: float
@@ -186,7 +186,7 @@ class Campaign(FrozenArrays):
         return campaign_report(self)
 
     @property
-    def stopped(self) -> Any:
+    def stopped(self) -> Mask:
         """Whether each run (N,) was stopped before its end."""
         return self.stop != 0.0
 
@@ -243,7 +243,7 @@ class Campaign(FrozenArrays):
     def _beyond(self, sizes: Array) -> Array:
         return np.where(self.stopped[:, None], np.inf, sizes)
 
-    def met(self, condition: object) -> Any:
+    def met(self, condition: object) -> Mask:
         """Return a mask (N,) of the runs that meet a condition.
 
         Parameters
@@ -409,7 +409,9 @@ class Campaign(FrozenArrays):
             return cls.of(arrays, header)
 
     @classmethod
-    def of(cls, arrays: Mapping[str, Array], header: Any, job: Any = None) -> Campaign:
+    def of(
+        cls, arrays: Mapping[str, Array], header: Mapping[str, Any], job: CampaignJob | None = None
+    ) -> Campaign:
         """Return a campaign from its header and arrays; rows of missing runs are left out."""
         run = np.asarray(arrays["stop"]) != NOT_RUN
         values: dict[str, Any] = {

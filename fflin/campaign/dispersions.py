@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -33,7 +33,10 @@ from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
 
-_BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
+if TYPE_CHECKING:
+    from fflin.robot.equipment.appendages import Appendage
+
+_BLOCK = 1024  # runs drawn together, independent of the chunks
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
 _AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
@@ -45,8 +48,8 @@ class Column(NamedTuple):
     """Number drawn for each run, and the quantities that this number changes."""
 
     name: str
-    kind: str  # "state", "delay", "seed" of noise, or the ending of a name
-    at: tuple[tuple[int, int], ...]  # index of each state, body, joint, input or sensor, and axis
+    kind: str  # "state", "delay", "seed" (of noise), or the last part of a name
+    at: tuple[tuple[int, int], ...]  # (index of state, body, joint, .., axis)
     inverse: Callable[[Array], Array]  # inverse distribution function
 
 
@@ -95,7 +98,7 @@ class Dispersions:
             known["frequency"] = modes
         # Indices of the joints of the modes, in the order of the names.
         self._modes = [plant.robot.joint_names.index(name) for name in modes]
-        by_kind: dict[str, dict[str, Any]] = {}
+        by_kind: dict[str, dict[str, object]] = {}
         self.columns: list[Column] = []
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
@@ -170,17 +173,17 @@ class Dispersions:
             if kind == "misalignment":
                 require_direction(self._plant.robot, at)
             draws.setdefault(tied or own, (inverse, []))[1].append(at)
-        for own, (inverse, places) in draws.items():
+        for own, (inverse, targets) in draws.items():
             for axis, letter in enumerate(_AXES.get(kind, " ")):
                 name = f"{own}.{letter}".rstrip(". ")
-                where = tuple((at, axis) for at in places)
+                where = tuple((at, axis) for at in targets)
                 self.columns.append(Column(name, kind, where, inverse))
 
     def _by_piece(
         self, kind: str, spreads: Mapping[str, object]
     ) -> tuple[dict[str, Any], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: name} if given without a pattern."""
-        robot, found, named = self._plant.robot, dict[str, Any](), dict[str, str]()
+        robot, found, named = self._plant.robot, dict[str, object](), dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
         for key in sorted(spreads, key=lambda key: key in alone):  # names go before patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
@@ -263,7 +266,9 @@ class Dispersions:
             if appendages := self._plant.robot.appendages:
                 self._require_realisable(appendages, drawn, start)
 
-    def _require_realisable(self, appendages: Any, drawn: Array, start: int) -> None:
+    def _require_realisable(
+        self, appendages: Sequence[Appendage], drawn: Array, start: int
+    ) -> None:
         """Raise `InputError` if a body's inertia is too small for its modes' participation."""
         refused = first_impossible(self._model, appendages, self.bodies(drawn))
         if refused is not None:
@@ -361,8 +366,7 @@ class Dispersions:
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
                 old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
-                # The parameters are linear in the body's properties, so a difference keeps the
-                # wheels in the body.
+                # Only the change is added, because the parameters also contain wheels in the body.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(len(drawn), -1)
         runs |= {kind: self._springs(kind, drawn) for kind in self._springs_of}

@@ -411,9 +411,9 @@ def funnel(
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """Judge of the runs of a funnel: bounds on final errors or level, and on errors at any time."""
+    """Evaluation of runs: bounds on final errors or final level, and on errors at any time."""
 
-    FIELDS: ClassVar[tuple[str, ...]] = ("outcome",)  # as `Funnel.outcomes` has it
+    FIELDS: ClassVar[tuple[str, ...]] = ("outcome",)  # the codes of `Funnel.outcomes`
     over: ClassVar[None] = None
 
     final: Mapping[str, float]
@@ -476,7 +476,7 @@ def runs_from(
 
 
 def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
-    """Return the root of the largest level to test, at which about one in sixteen runs fails."""
+    """Return the square root of the largest level to test, where about one run in sixteen fails."""
     root = widest
     if simulate(np.zeros(1)).any():
         return root  # the goal is missed even without an error
@@ -533,7 +533,7 @@ def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int
 
 
 def _widest(W: Array, robot: Robot) -> float:
-    """Return the root of the level at which errors reach the largest allowed start error."""
+    """Return the square root of the largest level whose errors a start may have."""
     largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in robot.joints]
     reach = [
         np.linalg.norm(W[:3], 2) / np.sin(np.radians(_LARGEST_ATTITUDE / 2.0)),

@@ -258,7 +258,9 @@ def monte_carlo(
     return replace(Campaign.load(store.path), _job=job)
 
 
-def _goals(given: object, until: object, shapes: Any, header: dict[str, Any]) -> list[str]:
+def _goals(
+    given: object, until: object, shapes: Mapping[str, tuple[int, ...]], header: dict[str, Any]
+) -> list[str]:
     """Return the goals; raise an error for an invalid goal before any run begins."""
     goals = [given] if isinstance(given, str) else given
     if not isinstance(goals, list | tuple):
@@ -273,7 +275,9 @@ def _goals(given: object, until: object, shapes: Any, header: dict[str, Any]) ->
     return goals
 
 
-def _memory(path: Path | None, runs: int, size: int, shapes: Any) -> MemoryStore | None:
+def _memory(
+    path: Path | None, runs: int, size: int, shapes: Mapping[str, tuple[int, ...]]
+) -> MemoryStore | None:
     """Return a store in memory, or None for a .h5 file, which must fit on the disk."""
     if path is None or path.suffix == ".npz":
         return MemoryStore(runs, size, shapes)
@@ -282,7 +286,7 @@ def _memory(path: Path | None, runs: int, size: int, shapes: Any) -> MemoryStore
     return None
 
 
-def _complete(store: FileStore, done: int, shapes: Any) -> None:
+def _complete(store: FileStore, done: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Complete a file in which the runs from `done` on are not needed."""
     for start in range(done, store.count, store.chunk):
         stop = min(start + store.chunk, store.count)

@@ -17,7 +17,7 @@ from fflin.robot.inputs import Input, JointTorque, ReactionWheel, Thruster, name
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 
-_ALONG: dict[type[Any], str] = {Thruster: "direction", ReactionWheel: "axis"}
+_ALONG: dict[type, str] = {Thruster: "direction", ReactionWheel: "axis"}
 
 
 def turned(direction: object, angles: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fflin.base.tables import folded, grid
 from fflin.campaign.statistics import KINDS
@@ -96,7 +96,7 @@ def _when(time: float, unit: str = "") -> str:
     return f"{time:.3g}{unit}" if math.isfinite(time) else "not yet"
 
 
-def campaign_record(campaign: Campaign, worst: int) -> dict[str, Any]:
+def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
     """Return the report as JSON values: [value, low, high], with null for infinite values."""
 
     def plain(values: Iterable[float]) -> list[float | None]:

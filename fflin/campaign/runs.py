@@ -64,7 +64,7 @@ class CampaignJob:
         options: Any,
         judge: Judge | None = None,
     ) -> None:
-        self._arguments: tuple[Any, ...] = (robot, policy, given, seed, engine, options, judge)
+        self._arguments: tuple[object, ...] = (robot, policy, given, seed, engine, options, judge)
         self.judge, options = judge, dict(options)
         # A judge compares with the start.
         histories = options.pop("histories", 0 if judge is None else 1)
@@ -229,7 +229,7 @@ def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:
     return run
 
 
-def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, Any]:
+def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, object]:
     """Return all arrays and numbers that the compiled loop reads for a plan, without compiling it.
 
     Two plans with equal arrays have equal runs.
@@ -237,7 +237,7 @@ def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, Any]:
     parts = packed(plan, plant)
     last = min(plan.times.steps, SLOTS * plan.times.sample)
     samples = noises(plan, len(parts.law.y), 0, last)[1] if noise_of(plan) else np.zeros(0)
-    found: dict[str, Any] = {"noise": samples}
+    found: dict[str, object] = {"noise": samples}
 
     def collect(name: str, value: object) -> None:
         if isinstance(value, tuple):

@@ -36,7 +36,7 @@ SETTLED, DIVERGED = 1e-3, 1e3
 # Duration of a random run, in settling times of this pole.
 _CONSTANTS, _PATIENCE = 3.0, 3.0
 _STEP = 0.25  # time step times the fastest pole
-_WIDEST = 10.0  # displacement of a joint [rad] up to which steps shorten in proportion
+_WIDEST = 10.0  # largest joint displacement [rad] to which the step is adapted
 _FINER, _FINEST = 8, 2  # factor by which steps are shortened if a run diverges, and how often
 _MOST_STEPS = 1_000_000
 _CHECKS = 60  # comparisons with the prediction in a run
@@ -63,7 +63,7 @@ class Loop:
         return self.state.to_state(self.lin.q, self.lin.v)
 
     @cached_property
-    def watched(self) -> Array:
+    def model_states(self) -> Array:
         """Indices of the model's states in the full state."""
         names = self.state.names
         return np.array([names.index(name) for name in self.lin.state_names], dtype=np.intp)
@@ -117,7 +117,7 @@ class Loop:
         moved[g.r_b] += position * along
         spread = rng.uniform(-1.0, 1.0, size=self.robot.n)
         moved[g.q_m] += joint * spread / np.abs(spread).max(initial=1e-300)
-        x[self.watched] = moved[self.watched]
+        x[self.model_states] = moved[self.model_states]
         return x
 
 
@@ -173,7 +173,7 @@ def _transition(loop: Loop, dt: float, every: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Settling:
-    """Judge that finds whether runs settle, and how far they are from the linear loop.
+    """Evaluation of runs: whether they settle, and how far they are from the linear loop.
 
     `step` is the transition matrix of the linear loop from one history entry to the next. If it is
     given, runs are not ended early and are compared with the linear loop.
@@ -191,15 +191,15 @@ class Settling:
         return self._is_over if self.step is None else None
 
     def _is_over(self, first: Array, e: Array) -> Mask:
-        first, size = (self.loop.size(each[:, self.loop.watched]) for each in (first, e))
+        first, size = (self.loop.size(each[:, self.loop.model_states]) for each in (first, e))
         over: Mask = (size <= SETTLED * first) | ~(size < DIVERGED * first)
         return over
 
     def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
         """Return the outcomes and errors of runs."""
         loop, stop = self.loop, runs["stop"]
-        e = runs["state_errors"][:, :, loop.watched]
-        last, first = loop.size(runs["x"][:, loop.watched] - loop.lin.x0), loop.size(e[:, 0])
+        e = runs["state_errors"][:, :, loop.model_states]
+        last, first = loop.size(runs["x"][:, loop.model_states] - loop.lin.x0), loop.size(e[:, 0])
         turned = (stop == STOPS.index("left the chart")) | (runs["largest"][:, 0] > EDGE)
         diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
         code = np.select([turned, diverged, last <= SETTLED * first], [2, 3, 1], 0)

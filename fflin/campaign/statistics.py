@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias
+from typing import ClassVar, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -258,7 +258,7 @@ class RunStatistics:
         )._asdict()
 
 
-def _by_run(values: Any, *shape: int) -> Array:
+def _by_run(values: Array, *shape: int) -> Array:
     """Convert values (.., LANES) with one lane per run to rows (LANES, *shape)."""
     shape = shape or (len(values),)
     return np.moveaxis(np.reshape(values, (*shape, LANES)), -1, 0)

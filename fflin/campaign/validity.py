@@ -6,7 +6,6 @@ from collections import Counter
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -249,7 +248,7 @@ def validity(
         work.append((job, Draws(starts(np.arange(min(LANES, len(at))))), len(at)))
     total, done, found = sum(count for *_, count in sets), 0, []
     with executor_of(executor, workers) as others:
-        how: dict[str, Any] = {"executor": others, "workers": workers, "threads": threads}
+        how: dict[str, object] = {"executor": others, "workers": workers, "threads": threads}
         expect(progress, work, others, threads)
         for runs_of, starts, count in sets:
             how["progress"] = progress and partial(_report, progress, done, total)

@@ -7,7 +7,7 @@ import math
 import warnings
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.tables import counted, folded, signals
@@ -135,7 +135,7 @@ def _add_uncertain(commands: parser.Commands) -> None:
     options.add_output_file(uncertain.group(parser.OUTPUT), what, parser.RECORD, "LFT")
 
 
-def _range(text: str) -> tuple[str, Any]:
+def _range(text: str) -> tuple[str, object]:
     name, _, value = text.rpartition("=")
     tied = value.endswith(",tied")
     ends = value.removesuffix(",tied").split(":")
@@ -178,7 +178,7 @@ def _modes(arguments: argparse.Namespace) -> Report:
 
     robot, lin = linear_model(arguments)
     found = modes(lin)
-    result: dict[str, Any] = {"modes": found}
+    result: dict[str, object] = {"modes": found}
     parts = [str(found)]
     if any(robot.stiffness.values()):
         result["effective_masses"] = effective_masses(lin)
@@ -203,7 +203,7 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
     from fflin.base.record import write_record
     from fflin.linear.equilibrium import equilibrium
     from fflin.linear.linearization import linearize
-    from fflin.robot.limits import limits_of
+    from fflin.robot.fields import limits_of
 
     if arguments.effort:
         raise InputError(

@@ -137,7 +137,7 @@ def _info(arguments: argparse.Namespace) -> Report:
     from fflin.control.authority import point_properties, point_report
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
-    from fflin.robot.limits import limits_of
+    from fflin.robot.fields import limits_of
     from fflin.robot.summary import robot_info
 
     robot = load_robot(arguments)
@@ -284,7 +284,7 @@ def inputs_report(robot: Robot) -> str:
     """Format the inputs of a robot and their limits."""
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
-    from fflin.robot.limits import limits_of
+    from fflin.robot.fields import limits_of
 
     acting, limits = Actuation(StateMap(robot)), limits_of(robot)
     rows = [["input", "unit", "min", "max"]]

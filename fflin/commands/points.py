@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
     from fflin.base.validation import Array
+    from fflin.dynamics.state import Frame
     from fflin.linear.model import LinearModel
     from fflin.robot.inputs import Input
     from fflin.robot.robot import Robot
@@ -28,7 +29,7 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
         first["damping"] = "urdf"
     robot = load(arguments.robot, lock=lock, **first)
     given = {name: getattr(arguments, name, None) for name in ("gravity", "orbit")}
-    fields: dict[str, Any] = {name: value for name, value in given.items() if value}
+    fields: dict[str, object] = {name: value for name, value in given.items() if value}
     for name in ("stiffness", "damping"):
         values = getattr(arguments, name, [])
         for_all = [value for joint, value in values if joint is None]
@@ -213,7 +214,7 @@ def held_at(
     return held.q, held.u, reference
 
 
-def attitude(robot: Robot, q: Array, number: int, frame: Any) -> tuple[Array, pin.SE3]:
+def attitude(robot: Robot, q: Array, number: int, frame: Frame) -> tuple[Array, pin.SE3]:
     """Return q (nq,) and base placement of the relative equilibrium with a number from 1 to 24."""
     import pinocchio as pin
 

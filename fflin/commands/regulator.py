@@ -22,6 +22,8 @@ from fflin.commands.points import linear_model, load_robot, once, refuse
 from fflin.commands.results import Report, figure_of
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     from fflin.control.gain import Gain
     from fflin.control.gain_schedule import GainSchedule
     from fflin.control.kalman import Compensator
@@ -371,7 +373,12 @@ def check_along(arguments: argparse.Namespace) -> Report:
     return checked(along.robot, found, f"{found}\n\n{along}")
 
 
-def checked(robot: Robot, found: Check, text: str, files: Any = MappingProxyType({})) -> Report:
+def checked(
+    robot: Robot,
+    found: Check,
+    text: str,
+    files: Mapping[Path | None, Callable[[Path], object] | None] = MappingProxyType({}),
+) -> Report:
     """Return the report of a check, with the exit code."""
     result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
     return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)

@@ -99,7 +99,7 @@ def _wrote(path: Path) -> str:
     return f"wrote {path}{size}"
 
 
-def _record(command: str, report: Report, files: list[Path]) -> dict[str, Any]:
+def _record(command: str, report: Report, files: list[Path]) -> dict[str, object]:
     """Return the JSON object of --json: entries of every command, then the fields of the result."""
     head = {
         "fflin": __version__,

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
 
-_ROWS = 240  # of errors and inputs for a figure
+_ROWS = 240  # rows of errors and inputs in a figure
 _PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
 
 

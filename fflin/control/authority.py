@@ -15,15 +15,15 @@ from fflin.base.validation import Array, Mask
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.equipment.mounting import carrier
+from fflin.robot.fields import limits_of
 from fflin.robot.inputs import named_wheels
-from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     pass
 
 _FACETS = 20_000  # normals computed together
-_MANY = 36  # thrusters, which have 400 000 facets
+_MANY = 36  # thrusters; their zonotope has 400 000 facets
 
 # A force or torque that is smaller, relative to the sum of all thrusts, is rounding error.
 _ROUNDING = 1e-9
@@ -31,7 +31,7 @@ _ROUNDING = 1e-9
 _AXES = "xyz"
 
 
-def point_properties(robot: Robot, q: Array, v: Array) -> dict[str, Any]:
+def point_properties(robot: Robot, q: Array, v: Array) -> dict[str, object]:
     """Return mass properties and properties of wheels and thrusters, by name, in base axes."""
     center, inertia = mass_properties(robot, q)
     return {
@@ -91,7 +91,7 @@ def wheel_momenta(robot: Robot, q: Array, v: Array) -> tuple[Array, Array, Array
     return np.array(axes).reshape(-1, 3).T, np.array(stored), np.array(largest)
 
 
-def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, Any]:
+def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, object]:
     """Return the total momentum [N m s] of the wheels, their least capacity, and their rank."""
     axes, stored, largest = wheel_momenta(robot, q, v)
     rank = int(np.linalg.matrix_rank(axes, tol=1e-6)) if stored.size else 0
@@ -122,7 +122,7 @@ def wheel_report(properties: Mapping[str, Any]) -> str:
     return folded([text])
 
 
-def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]:
+def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, object]:
     """Return the least force and torque that the thrusters alone produce in any direction.
 
     Both are None unless the thrusters push in every direction, all have limits, and there are at
@@ -130,7 +130,7 @@ def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, Any]
     """
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust", ())
-    found = dict[str, Any](thrusters=len(thrusters), every_way=False, bounded=False)
+    found = dict[str, object](thrusters=len(thrusters), every_way=False, bounded=False)
     found |= {"least_force": None, "least_torque": None}
     if not len(thrusters):
         return found

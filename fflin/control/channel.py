@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -157,7 +157,7 @@ class Law:
         self.policy, self._names, self._limits, self._slow = policy, names, limits, slow
         self._shape = (len(names),)
         # Only policies that integrate their own state have `advance`.
-        self.advance: Any = getattr(policy, "advance", None)
+        self.advance: Callable[..., None] | None = getattr(policy, "advance", None)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` if it is not finite or of wrong shape."""
@@ -223,7 +223,7 @@ class Channel:
         self._wheels, self._pulses = len(limits.wheels.at), len(limits.pulses.at)
         self._limited = bool(np.isfinite((limits.low, limits.high)).any())
         own = channel_of(limits, initial, sample, delay)
-        counts = ("left", "level", "end")  # of this run alone
+        counts = ("left", "level", "end")  # state of a single run
         self._rules = own._replace(
             wheels=own.wheels._replace(row=np.arange(self._wheels)),
             pulses=own.pulses._replace(**{key: np.zeros(self._pulses) for key in counts}),

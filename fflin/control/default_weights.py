@@ -327,7 +327,7 @@ class _Trial(NamedTuple):
     limit: Limit
     left: float  # bandwidth factor that the efforts allow
     effort: str  # input that allows the smallest factor
-    rates: Values  # of the modes (nx,) [1/s]
+    rates: Values  # poles as rates (nx,) [1/s]
     modes: Complex
     required: Array  # largest inputs (nu,)
 

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -251,7 +251,7 @@ class Receding:
             raise MissingPackageError(
                 "this needs the solver DAQP; install it with: pip install 'fflin[mpc]'"
             ) from None
-        self._model: Any = daqp.Model()
+        self._model = daqp.Model()
         self._model.settings = {"primal_tol": _EXACT * self._size, "iter_limit": _MOST}
         self._model.settings = {"w_soft": _PRICE * self._size, "rho_soft": _YIELDS}
         (m, size), kinds = self._rows.shape, (_SOFT * self._soft).astype(np.int32)

@@ -314,10 +314,10 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
             "the gain and the estimator belong to different models; use one model for both"
         )
     names = e.estimated or e.state_names
-    if unseen := [name for name in gain.regulated if name not in names]:
+    if missing := [name for name in gain.regulated if name not in names]:
         raise InputError(
-            f"the gain feeds back {listed(unseen)}, which the estimator does not estimate; use the "
-            "same wheel_speeds= for both designs"
+            f"the gain feeds back {listed(missing)}, which the estimator does not estimate; use "
+            "the same wheel_speeds= for both designs"
         )
     S = selection(names, e.state_names)
     return Compensator(

@@ -135,7 +135,7 @@ class LinearController(Feedback):
                 "there; set D of the controller to 0 there, for example with a low-pass filter"
             )
         dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
-        dt = lin.dt or dt if dt < 0.0 else dt  # of a sampled system without a sampling time
+        dt = lin.dt or dt if dt < 0.0 else dt  # a sampled system with unknown sample time
         if dt < 0.0 or (lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt):
             raise InputError(
                 f"the controller has dt = {'unknown' if dt < 0.0 else f'{dt:g} s'}, but the "
@@ -143,7 +143,7 @@ class LinearController(Feedback):
                 "the model, or give the continuous model"
             )
         self.system = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
-        self.sign = 1.0  # `system` has it from here on
+        self.sign = 1.0  # `system` contains the sign from here on
 
     def __repr__(self) -> str:
         (nu, ny), dt = self.system.D.shape, self.dt

@@ -25,8 +25,7 @@ from fflin.control.weights import Weight, sampled_cost, weight
 from fflin.dynamics.state import StateMap
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
-from fflin.robot.fields import range_of
-from fflin.robot.limits import chosen_limits
+from fflin.robot.fields import chosen_limits, range_of
 from fflin.robot.robot import Robot
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
@@ -217,7 +216,10 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
     beside = [name for name in outputs if name not in states]
     known = (*state_keys(robot.joint_names), *input_keys(of))
-    found, parts = dict[str, Any](), list(limits) if isinstance(limits, list | tuple) else [limits]
+    found, parts = (
+        dict[str, object](),
+        list(limits) if isinstance(limits, list | tuple) else [limits],
+    )
     for k, part in enumerate(parts):
         if isinstance(part, Mapping) and beside:
             own = [x for x in part if stands_for_any(x, beside) and not stands_for_any(x, known)]

@@ -25,8 +25,8 @@ from fflin.dynamics.coordinates import refuse_orbit
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
+from fflin.robot.fields import chosen_limits
 from fflin.robot.inputs import JointTorque, ReactionWheel
-from fflin.robot.limits import chosen_limits
 from fflin.robot.robot import Robot
 
 # Tolerance [rad, m, s] of the goal, and of the limits of states at knots.
@@ -176,7 +176,7 @@ def plan(
     if made.reached:
         q, v, u = made.q, made.v, made.u
         if asked.all():
-            q[-1], v[-1] = end  # at rest, rounding would be all that a check sees
+            q[-1], v[-1] = end  # without the rounding errors of the motion
         note = _note(shooting, made, size)
         if made.most > _BETWEEN:
             warnings.warn(

@@ -187,12 +187,12 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Values) -> None:
 
 
 def _pole_map(axes: Axes, sets: dict[str, Values], dt: float) -> None:
-    for place, (label, values) in enumerate(sets.items()):
+    for index, (label, values) in enumerate(sets.items()):
         axes.plot(
             values.real,
             values.imag,
-            "x" if place == 0 else "+",
-            color=COLORS[place % len(COLORS)],
+            "x" if index == 0 else "+",
+            color=COLORS[index % len(COLORS)],
             label=label or None,
         )
     if dt:

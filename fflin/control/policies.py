@@ -20,7 +20,7 @@ from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
-from fflin.robot.limits import limits_of
+from fflin.robot.fields import limits_of
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
@@ -384,7 +384,7 @@ def fed_back(policy: object) -> tuple[str, ...]:
     """Return the names of the states that a policy feeds back, or () if unknown."""
     (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
     if schedule is not None:
-        K = np.abs(schedule.K).max(axis=0)  # the largest over time
+        K = np.abs(schedule.K).max(axis=0)  # largest entries over time
     of: Any = lin if schedule is None else schedule
     if of is None:
         return ()

@@ -336,7 +336,8 @@ def _of_regulated(
     terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
     if speeds := [name for name in part.state_names if name not in body.state_names]:
         S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
-        # The inputs R^-1/2 Z n rotate no body, and change the wheel speeds at the rates X n.
+        # Z spans the null space of the scaled forces. The inputs R^-1/2 Z n rotate no body, and
+        # change the wheel speeds at the rates X n.
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
         X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S

@@ -1,13 +1,11 @@
 """Generalised forces of the inputs: columns of the input matrix, and wrenches on links."""
 
-from typing import Any
-
 import numpy as np
 import pinocchio as pin
 
 import fflin.robot.inputs as kinds
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Indices
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import find_frame
@@ -72,7 +70,7 @@ class Actuation:
         # Whether the inputs are tau_b, F_b and all joint torques, so that `fixed` is the identity.
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
         # (joint, indices of the inputs mounted on it, their wrenches (6, ..) in its frame).
-        self.wrench_columns: list[tuple[int, Any, Array]] = [
+        self.wrench_columns: list[tuple[int, Indices, Array]] = [
             (joint, np.array([at for at, _ in items]), np.column_stack([w for _, w in items]))
             for joint, items in carried.items()
         ]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, cast, get_args
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 import pinocchio as pin
@@ -21,7 +21,7 @@ from fflin.base.rotation import (
     rotation_matrix,
     skew,
 )
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Indices
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.robot import Robot
 
@@ -360,7 +360,7 @@ def _turned(x: Array) -> tuple[Array, Array]:
     return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
 
 
-def _in_reference(frame: str, nx: int) -> list[Any]:
+def _in_reference(frame: str, nx: int) -> list[Indices]:
     """Return the indices of the base velocities that are in reference axes."""
     velocities = np.arange(nx)[nx // 2 :]
     return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]

@@ -25,8 +25,8 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.fit import sensed
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
+from fflin.robot.fields import chosen_limits
 from fflin.robot.inputs import named_inputs
-from fflin.robot.limits import chosen_limits
 from fflin.robot.loading import load
 from fflin.robot.robot import Robot
 

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -174,7 +173,7 @@ class _Texts:
         law, lin = self.law, self.law.lin
         follows = isinstance(law, StateLaw) and law.follows
         header, source = self._filled("header.h"), self._filled(f"{self.kind}_law.c")
-        about: dict[str, Any] = {
+        about: dict[str, object] = {
             **{"title": self.title, "real": self.real, "frame": law.frame, "dt": law.dt},
             "kind": "samples" if follows else self.kind,
             "signals": {
@@ -290,7 +289,7 @@ def _at_least_one(matrix: Array) -> Array:
     return np.pad(matrix, ((0, int(not rows)), (0, int(not columns))))
 
 
-def _whole(values: Iterable[Any]) -> str:
+def _whole(values: Iterable[int]) -> str:
     return "{" + (", ".join(str(int(x)) for x in values) or "0") + "}"
 
 

@@ -99,7 +99,7 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
     write_atomically({_csv_path(path, key): content for key, content in contents.items()})
 
 
-def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, Any], T]:
+def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, object], T]:
     """Return the fields of a model, and its certificate; see `LinearModel.load`."""
     check_ending(path, FORMATS)
     with reading(path, "linear model"):
@@ -143,15 +143,15 @@ def _fields(entries: Record) -> dict[str, Any]:
     }
 
 
-def given(value: Any, _: object) -> Any:
+def given(value: T, _: object) -> T:
     """Return an entry of a file unchanged."""
     return value
 
 
-def _tables(entries: Record) -> dict[str, list[list[Any]]]:
+def _tables(entries: Record) -> dict[str, list[list[object]]]:
     names = {signal: entries[f"{signal}_names"] for signal in _SIGNALS}
     names["velocity"] = names["state"][-len(entries["M"]) :]
-    tables: dict[str, list[list[Any]]] = {}
+    tables: dict[str, list[list[object]]] = {}
     for key, (rows, columns) in _MATRICES.items():
         body = zip(names[rows], entries[key].tolist(), strict=True)
         tables[key] = [["", *names[columns]], *([name, *row] for name, row in body)]
@@ -276,7 +276,7 @@ def arguments(
     for columns in Actuation(state).held:
         # Inputs in reference axes are rotated to world axes.
         u[:, columns] = u[:, columns] @ reference.rotation.T
-    found_as: dict[str, Any] = {"t": np.ravel(entries["t"]), "u": u}
+    found_as: dict[str, object] = {"t": np.ravel(entries["t"]), "u": u}
     found_as |= {"hold": hold, "frame": frame, "verified": verified}
     if states:
         return found_as | {name: entries[name] for name in "qv"}
@@ -289,7 +289,7 @@ def arguments(
     return found_as | {"q": q, "v": v}
 
 
-def _require_inputs(known: Sequence[str], names: Any, count: int) -> None:
+def _require_inputs(known: Sequence[str], names: object, count: int) -> None:
     """Raise `InputError` if the names or the number of a file's inputs differ from the robot's."""
     given = texts(names)
     if given == tuple(known):

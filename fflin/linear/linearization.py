@@ -23,8 +23,8 @@ from fflin.kernel.compiled import numba_is_there
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, at_rest, drift, output_equations
 from fflin.linear.verification import certify, inertia_matrix
+from fflin.robot.fields import magnitudes_of
 from fflin.robot.joints import ROOT
-from fflin.robot.limits import magnitudes_of
 from fflin.robot.mass_properties import require_inertia, rotor_names
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot

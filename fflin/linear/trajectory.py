@@ -133,7 +133,7 @@ class Trajectory(Design):
                 rows["u"].append(vector("u", row[2], nu, "the robot's inputs"))
             except FflinError as error:
                 raise InputError(f"at t = {t:g} s: {error}") from None
-        values: dict[str, Any] = {name: frozen(np.array(each)) for name, each in rows.items()}
+        values: dict[str, object] = {name: frozen(np.array(each)) for name, each in rows.items()}
         values |= {"t": times, "hold": self.hold or ("previous" if short else "linear")}
         for name, value in values.items():
             object.__setattr__(self, name, value)

@@ -1,19 +1,32 @@
-"""Checks of the fields of a robot that the user may set."""
+"""Checks of the fields of a robot that the user may set, and the limits of a robot."""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
 from fflin.base.validation import dimension, number, numbers
 from fflin.robot import inputs as kinds
-from fflin.robot.inputs import Input, JointTorque, named_inputs, named_wheels, three_numbers
+from fflin.robot.inputs import (
+    Input,
+    JointTorque,
+    ReactionWheel,
+    named_inputs,
+    named_wheels,
+    three_numbers,
+)
 from fflin.robot.joints import Find, by_joint
 from fflin.robot.orbit import checked_orbit
 from fflin.robot.outputs import Output, parse_output
+
+if TYPE_CHECKING:
+    from fflin.robot.joints import Joint
+    from fflin.robot.robot import Robot
 
 # Least and largest value; infinite without a limit.
 Range: TypeAlias = tuple[float, float]
@@ -238,3 +251,74 @@ FIELDS: dict[str, Callable[[Any, Scope], object]] = {
 
 # Fields with entries by name: the entries of a call are added to the entries of a robot file.
 MERGED = ("stiffness", "damping", "rest", "limits")
+
+
+_OPEN: Range = (-math.inf, math.inf)
+
+
+def limits_of(robot: Robot) -> dict[str, Range]:
+    """Return {name of an input or state: (least, largest)} for all limits."""
+    # Limits of the URDF come first; a limit of zero means none, as exporters write it. Limits of
+    # the inputs replace them, and `Robot.limits` replaces both.
+    found: dict[str, Range] = {}
+    for joint in robot.joints:
+        found[f"q_m.{joint.name}"] = _travel(robot, joint)
+        found[f"qdot_m.{joint.name}"] = _either(float(robot.model.velocityLimit[joint.idx_v]))
+    for item, names in named_inputs(robot.inputs):
+        found |= dict(zip(names, item.ranges, strict=True))
+        if isinstance(item, JointTorque) and item.max is None:
+            low, high = _either(float(robot.model.effortLimit[robot.joint(item.joint).idx_v]))
+            found[names[0]] = (low if item.min is None else item.ranges[0][0], high)
+        if isinstance(item, ReactionWheel) and item.max_speed is not None:
+            found[f"qdot_m.{names[0]}"] = _either(item.max_speed)
+    known = {*found, *state_keys(robot.joint_names)}
+    found |= {name: limits for name, limits in robot.limits.items() if name in known}
+    return {name: limits for name, limits in found.items() if limits != _OPEN}
+
+
+def magnitudes_of(robot: Robot) -> dict[str, float]:
+    """Return {input or state: magnitude} of all finite limits.
+
+    The magnitude of a joint position is its whole travel, and of a one-sided input its range.
+    """
+    sizes = {
+        name: largest - least if name.startswith("q_m.") or least >= 0.0 else min(-least, largest)
+        for name, (least, largest) in limits_of(robot).items()
+    }
+    return {name: size for name, size in sizes.items() if 0.0 < size < math.inf}
+
+
+def chosen_limits(robot: Robot, limits: Any) -> tuple[dict[str, Range], dict[str, Range]]:
+    """Return the saturation limits of the inputs for `simulate`, and all known limits."""
+    own, cutting = limits_of(robot), dict[str, Range]()
+    given: dict[str, Range] = {}
+    several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)
+    for part in limits if several else [limits]:
+        if isinstance(part, str):
+            if part != "urdf":
+                raise InputError(
+                    f"limits is '{part}', expected 'urdf', a largest magnitude, {{input: "
+                    "magnitude}, or ['urdf', {input: magnitude}]"
+                )
+            cutting = own
+        elif part is not None:
+            given |= given_limits(robot.inputs, robot.joint_names, part)
+    return cutting | given, own | given
+
+
+def _travel(robot: Robot, joint: Joint) -> Range:
+    if joint.unbounded:
+        return _OPEN
+    low = _known(float(robot.model.lowerPositionLimit[joint.idx_q]))
+    high = _known(float(robot.model.upperPositionLimit[joint.idx_q]))
+    return (low, high) if low < high else _OPEN
+
+
+def _either(size: float) -> Range:
+    """Return the range (-size, size), or an infinite range for a size of zero."""
+    return (-_known(size), _known(size)) if size > 0.0 else _OPEN
+
+
+def _known(limit: float) -> float:
+    # Pinocchio stores a missing limit as the largest double or as infinity.
+    return limit if abs(limit) < 1e300 else math.copysign(math.inf, limit)

@@ -10,7 +10,7 @@ IEEE Robotics and Automation Letters 3(1), 2018).
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -52,7 +52,7 @@ def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
             links.setdefault(frame.parentJoint, []).append(frame.name)
     several = {name: index for index, many in links.items() if many[1:] for name in many}
     index_of |= {many[0]: index for index, many in links.items() if not many[1:]}
-    names, done, new = [*index_of, *several], dict[int, Any](), dict[int, pin.Inertia]()
+    names, done, new = [*index_of, *several], dict[int, object](), dict[int, pin.Inertia]()
     for place, value in by_name("body", given, names).items():
         name = names[place]
         index = {**several, **index_of}[name]

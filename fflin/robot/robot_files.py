@@ -206,7 +206,7 @@ def read_appendages(document: TomlFile) -> list[Appendage]:
     return found
 
 
-def _tables(document: TomlFile, key: str) -> list[dict[str, Any]]:
+def _tables(document: TomlFile, key: str) -> list[dict[str, object]]:
     """Return an array of tables of a file, empty if there is none."""
     tables = document.record.get(key, [])
     if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):

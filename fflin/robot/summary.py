@@ -12,9 +12,9 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.tables import counted, folded, grid, width
+from fflin.robot.fields import limits_of
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.joints import ROOT
-from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 _LIMITS = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"

@@ -17,8 +17,8 @@ from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.arguments import empty
 from fflin.kernel.tree import Tree, batch_tree, layout_of, loads_of
+from fflin.robot.fields import limits_of
 from fflin.robot.joints import ROOT, find_frame
-from fflin.robot.limits import limits_of
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import MomentumReference, Plant, conserved_by, triads
 from fflin.simulation.run import stop_conditions

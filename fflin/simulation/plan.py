@@ -26,8 +26,7 @@ from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import Integrator, integrator
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
-from fflin.robot.fields import Range
-from fflin.robot.limits import chosen_limits
+from fflin.robot.fields import Range, chosen_limits
 from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 from fflin.simulation.plant import Disturbance, Plant

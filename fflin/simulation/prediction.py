@@ -1,5 +1,7 @@
 """Motion predicted by the linear model under the control law of the simulated robot."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
@@ -46,9 +48,9 @@ def predictor(plant: Plant, policy: Any, linear: object) -> Predictor | None:
     )
 
 
-def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
+def _checked(plant: Plant, policy: object, linear: object) -> LinearModel:
     """Return the given model, or raise `InputError` if it does not fit the simulation."""
-    instance("linear", linear, LinearModel, "a fflin.LinearModel, True or False")
+    linear = instance("linear", linear, LinearModel, "a fflin.LinearModel, True or False")
     state = plant.state
     names = (state.names, plant.actuation.names, state.frame)
     same = (linear.state_names, linear.input_names, linear.frame) == names and not linear.moving

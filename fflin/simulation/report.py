@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from textwrap import shorten
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -230,7 +230,7 @@ def motion_report(motion: Motion) -> str:
     return "\n".join(parts)
 
 
-def motion_record(motion: Motion) -> dict[str, Any]:
+def motion_record(motion: Motion) -> dict[str, object]:
     """Return the numbers of the report by name."""
     t = motion.t
     errors = {

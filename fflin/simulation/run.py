@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -54,7 +54,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
 
     def record(t: float, u: Array) -> None:
         nonlocal count
-        values: tuple[Any, ...] = t, q, v, u, reference.momentum, reference.center(t)
+        values: tuple[Array | float, ...] = t, q, v, u, reference.momentum, reference.center(t)
         for row, value in zip(rows, values, strict=True):
             row[count] = value
         count += 1

@@ -233,7 +233,7 @@ class Variants:
         if bodies:
             changed_bodies = pin.Inertia.FromDynamicParameters
             robot = robot.with_bodies({at: changed_bodies(x) for at, x in bodies.items()})
-        fields: dict[str, Any] = {}
+        fields: dict[str, object] = {}
         springs = {
             joint.name: _spring(joint, parts[joint.name], self._robot)
             for joint in robot.joints

@@ -263,7 +263,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     5
     """
     instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
-    given: dict[str, Any] = {}
+    given: dict[str, object] = {}
     for key, value in mapping("ranges", ranges, "parameter").items():
         if isinstance(value, Mapping) and "range" not in value:
             given |= {f"{key}.{part}": each for part, each in value.items()}

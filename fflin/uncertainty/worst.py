@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 from itertools import islice, pairwise, product
 from operator import itemgetter
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, Mask, shaped
 from fflin.control.gain import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
+
+if TYPE_CHECKING:
+    from fflin.uncertainty.uncertain import Uncertain
 
 _CORNERS = 256
 # Number of steps of a climb, and step lengths relative to half a range; 1e9 leads to a corner.
@@ -112,7 +115,7 @@ class Worst:
 
 
 @in_one_thread
-def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
+def searched(of: Uncertain, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
     K = shaped("gain", getattr(gain, "K", gain), lft.B2.T.shape, " (nu, nx)")
     size, loops = len(lft.repeats), Loops(lft, K)

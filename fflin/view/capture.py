@@ -193,7 +193,7 @@ class _Browser:
             if not pieces[-1]:
                 raise _BrowserError("the browser does not respond")
         text, _, self._rest = b"".join(pieces).partition(b"\0")
-        message: dict[str, Any] = json.loads(text)
+        message: dict[str, object] = json.loads(text)
         return message
 
     def open_tab(self) -> None:

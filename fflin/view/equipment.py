@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -16,13 +16,16 @@ from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.view.scene import Drawing, body_paths
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
 # Distance between wheels at one point, which are drawn apart along their axes, in robot sizes.
 _APART = 0.1
 
 
 def equipment(
     robot: Robot, drawings: list[Drawing], tool: str | None, size: float
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the marks of a page: axes at base and tool, nozzles, wheels and selectable links."""
     paths = body_paths(robot)
     found = [(paths[0], pin.SE3.Identity(), 0.3)]
@@ -61,7 +64,7 @@ def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
     return found
 
 
-def _wheels(robot: Robot, size: float) -> list[dict[str, Any]]:
+def _wheels(robot: Robot, size: float) -> Sequence[Mapping[str, object]]:
     """Return the wheels at their frames, with the spinning body if the wheel's speed is a state."""
     named, paths = named_wheels(robot.inputs), body_paths(robot)
     frames = [wheel.frame for _, wheel in named]

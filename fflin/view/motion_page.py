@@ -13,7 +13,6 @@ from fflin.dynamics.impact import Impact
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
-from fflin.view.equipment import thrusters
 from fflin.view.page import (
     Recorder,
     build_page,
@@ -22,6 +21,7 @@ from fflin.view.page import (
     rounded,
     stage_info,
     subtitle,
+    thrusters,
 )
 from fflin.view.panel import panel
 from fflin.view.playback import (

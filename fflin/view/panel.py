@@ -74,7 +74,7 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
     return {k: (unit, np.where(x < _NOTHING, 0.0, x)) for k, (unit, x) in found.items()}
 
 
-def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, Any]:
+def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, object]:
     """Return the readouts and plots of the rows `shown`, with errors from the target (k, nq)."""
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
     of = "{} error" if len(target) else "{} change"

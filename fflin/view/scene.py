@@ -15,8 +15,7 @@ import umsgpack
 from fflin.base.validation import Array
 from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
-from fflin.view.meshes import Indices, Mesh, load_mesh
-from fflin.view.shapes import PLAIN, Shape, bendings, shapes
+from fflin.view.shapes import PLAIN, Indices, Mesh, Shape, bendings, load_mesh, shapes
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # from packages that meshcat imports
@@ -42,7 +41,7 @@ class _Piece(MeshcatMesh):
     ) -> None:
         self._geometry, self._matrix, self._about = geometry, matrix, about
 
-    def lower(self) -> dict[str, Any]:
+    def lower(self) -> dict[str, object]:
         return {
             "metadata": {"version": 4.5, "type": "Object"},
             "geometries": [self._geometry],
@@ -107,7 +106,7 @@ class Drawing:
             node = self._visualizer[path]
             node.window.send(SetTransform(pin.XYZQUATToSE3(pose).homogeneous, node.path))
 
-    def tracks(self, t: Array, poses: Array) -> list[dict[str, Any]]:
+    def tracks(self, t: Array, poses: Array) -> list[dict[str, object]]:
         """Return the animation of all bodies by times t (N,) and poses (N, njoints - 1, 7)."""
         times = typed(t)
         clips = []
@@ -141,7 +140,7 @@ class Animation(SetAnimation):
     def __init__(self, clips: Sequence[dict[str, object]]) -> None:
         self._clips = list(clips)
 
-    def lower(self) -> dict[str, Any]:
+    def lower(self) -> dict[str, object]:
         """Return the command."""
         options = {"play": True, "repetitions": 1}
         return {"type": "set_animation", "animations": self._clips, "options": options, "path": ""}
@@ -186,7 +185,7 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
     return pieces
 
 
-def _triangles(mesh: Mesh) -> dict[str, Any]:
+def _triangles(mesh: Mesh) -> dict[str, object]:
     kind = "<u2" if len(mesh.vertices) < 2**16 else "<u4"
     digest = sha1(mesh.vertices.tobytes() + mesh.faces.tobytes(), usedforsecurity=False)
     corners = {"itemSize": 3, "type": "Float32Array", "array": typed(mesh.vertices)}

@@ -8,7 +8,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.control.optimal.differential_riccati import Coefficients, Passage, passage, solve_back
+from fflin.control.optimal.differential_riccati import (
+    Coefficients,
+    Transition,
+    solve_back,
+    transition,
+)
 from fflin.dynamics.integrators import GAUSS
 from tests.support.messages import says
 from tests.support.motions import motion
@@ -130,7 +135,7 @@ def test_a_step_is_of_order_four():
         P, h = np.eye(4), 1.0 / steps
         for k in range(steps, 0, -1):
             early, late = (at([(k - 1 + c) * h]) for c in nodes)
-            P = Passage(*(x[0] for x in passage(early, late, np.array([h])))).back(P)
+            P = Transition(*(x[0] for x in transition(early, late, np.array([h])))).back(P)
         return P
 
     exact = solved(256)
@@ -155,7 +160,7 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
         rtol=1e-10,
         atol=1e-14,
     )
-    single = passage(*(at(np.array([c])) for c in GAUSS), np.ones(1))
+    single = transition(*(at(np.array([c])) for c in GAUSS), np.ones(1))
     assert np.abs(single.back(1e3 * np.eye(1)) / found.y[0, -1] - 1.0).max() > 0.1
     assert times[0] == 0.0
     assert values[0, 0, 0] == pytest.approx(found.y[0, -1], rel=1e-5)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.robot.limits import limits_of, magnitudes_of
+from fflin.robot.fields import limits_of, magnitudes_of
 
 INF = math.inf
 AT = ("base", (0, 0, 0), (1, 0, 0))

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import fflin
-from fflin.view.meshes import _colored, _triangles, load_mesh
-from fflin.view.shapes import shapes
+from fflin.view.shapes import _colored, _triangles, load_mesh, shapes
 from tests.support.meshes import tetrahedron
 
 

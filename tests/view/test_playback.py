@@ -6,7 +6,7 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
-from fflin.view.equipment import thrusters
+from fflin.view.page import thrusters
 from fflin.view.playback import play_back
 from tests.support.robots import random_point, random_pose
 

@@ -36,7 +36,7 @@ class Coefficients(NamedTuple):
         return P @ self.S @ P - drift - drift.T - self.Q
 
 
-class Passage(NamedTuple):
+class Transition(NamedTuple):
     r"""Solution of the Hamiltonian system over intervals: x1 = T x0 - G l1, l0 = W x0 + T' l1.
 
     G and W are positive semidefinite. x is the state and l the costate at the start (0) and at the
@@ -47,14 +47,14 @@ class Passage(NamedTuple):
     G: Array
     W: Array
 
-    def then(self, late: Passage) -> Passage:
-        """Return the passage through these intervals followed by the `late` intervals."""
+    def then(self, late: Transition) -> Transition:
+        """Return the transition over these intervals and then over the `late` intervals."""
         T, G, W = self
         n = T.shape[-1]
         right = np.concatenate((T, G @ late.T.mT), axis=-1)
         inner = np.linalg.solve(np.eye(n) + G @ late.W, right)
         forward, back = inner[..., :n], inner[..., n:]
-        return Passage(
+        return Transition(
             late.T @ forward,
             _symmetric(late.G + late.T @ back),
             _symmetric(W + T.mT @ late.W @ forward),
@@ -68,17 +68,19 @@ class Passage(NamedTuple):
         return _symmetric(self.W + forward.T @ costate + costate.T @ self.G @ costate)
 
 
-def passage(early: Coefficients, late: Coefficients, h: Array) -> Passage:
-    """Return fourth-order passages (k,) through intervals, from coefficients at the Gauss nodes."""
+def transition(early: Coefficients, late: Coefficients, h: Array) -> Transition:
+    """Return fourth-order transitions (k,) over intervals, from coefficients at the Gauss nodes."""
     pairs = zip(early, late, strict=True)
     mixed = [np.concatenate((HEAVY * a + LIGHT * b, LIGHT * a + HEAVY * b)) for a, b in pairs]
     both = _constant(Coefficients(*mixed), 0.5 * np.concatenate((h, h)))
-    first, second = (Passage(*each) for each in zip(*(np.split(x, 2) for x in both), strict=True))
+    first, second = (
+        Transition(*each) for each in zip(*(np.split(x, 2) for x in both), strict=True)
+    )
     return first.then(second)
 
 
-def _constant(coefficients: Coefficients, h: Array) -> Passage:
-    """Return passages with constant coefficients: a matrix exponential of a short time, doubled."""
+def _constant(coefficients: Coefficients, h: Array) -> Transition:
+    """Return transitions for constant coefficients, by scaling and doubling an exponential."""
     A, S, Q = coefficients
     n, unit = A.shape[-1], _units(*(np.abs(x).max(axis=0) for x in coefficients))
     A, S, Q = A * unit / unit[:, None], S / np.outer(unit, unit), Q * np.outer(unit, unit)
@@ -90,7 +92,7 @@ def _constant(coefficients: Coefficients, h: Array) -> Passage:
     doublings = max(0, math.ceil(math.log2(max(size, 1.0))))
     theta = expm(H / 2**doublings)
     inverse = np.linalg.inv(theta[:, n:, n:])
-    found = Passage(
+    found = Transition(
         inverse.mT,
         _symmetric(-theta[:, :n, n:] @ inverse),
         _symmetric(-inverse @ theta[:, n:, :n]),
@@ -99,7 +101,7 @@ def _constant(coefficients: Coefficients, h: Array) -> Passage:
         found = found.then(found)
     T, G, W = found
     scale = np.outer(unit, unit)
-    return Passage(T * unit[:, None] / unit, G * scale, W / scale)
+    return Transition(T * unit[:, None] / unit, G * scale, W / scale)
 
 
 def _units(A: Array, S: Array, Q: Array) -> Array:
@@ -117,13 +119,13 @@ def _units(A: Array, S: Array, Q: Array) -> Array:
 
 
 class _Interval(NamedTuple):
-    """Interval between two times, with its passages and the coefficients at both ends."""
+    """Interval between two times, with its transitions and the coefficients at both ends."""
 
     start: float
     end: float
-    whole: Passage
-    early: Passage  # through the first half
-    late: Passage
+    whole: Transition
+    early: Transition  # through the first half
+    late: Transition
     at_start: Coefficients
     at_end: Coefficients
 
@@ -136,13 +138,15 @@ def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Inter
     h = np.concatenate((b, middle, b)) - start
     found = at(np.concatenate((start + GAUSS[0] * h, start + GAUSS[1] * h, knots)))
     early, late, ends = zip(*(np.split(x, (3 * count, 6 * count)) for x in found), strict=True)
-    mapped = passage(Coefficients(*early), Coefficients(*late), h)
-    through = [Passage(*x) for x in zip(*mapped, strict=True)]
+    mapped = transition(Coefficients(*early), Coefficients(*late), h)
+    through = [Transition(*x) for x in zip(*mapped, strict=True)]
     of_knots = [Coefficients(*x) for x in zip(*ends, strict=True)]
-    passages = zip(through[:count], through[count : 2 * count], through[2 * count :], strict=True)
+    transitions = zip(
+        through[:count], through[count : 2 * count], through[2 * count :], strict=True
+    )
     return [
         _Interval(float(knots[k]), float(knots[k + 1]), *three, of_knots[k], of_knots[k + 1])
-        for k, three in enumerate(passages)
+        for k, three in enumerate(transitions)
     ]
 
 
@@ -168,8 +172,7 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
                 # Value at the middle of the cubic that has these values and derivatives.
                 bend = interval.at_start.rate(double) - interval.at_end.rate(P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
-                # Half steps are sixteen times as accurate. A factor of four of this is kept in
-                # reserve.
+                # Half steps are sixteen times as accurate. The estimate assumes only four times.
                 error = 0.25 * max(_apart(double, single), _apart(half, between))
             if error <= _ACCURACY:
                 times += [middle, start]

@@ -24,7 +24,7 @@ _LIMITED, _TIGHTER = 0.002, 0.005
 # Intervals with gaps of at most this size are integrated as one motion.
 _MEETS = 1e-10
 
-# The end of this one motion is not corrected if its error is larger.
+# If a single motion has a larger error at the end, the error is not corrected.
 _NEARLY = 1e-3
 
 # Integration accuracy of interval ends, during the search and at its end.
@@ -75,9 +75,9 @@ class Search(NamedTuple):
     asked: Flags  # states whose value at the end is prescribed (nx,)
     bounds: Array  # limits of states (2, nx)
     limits: Array  # limits of inputs (2, nu)
-    cost: Array  # of squared inputs (N + 1, nu)
-    parts: int  # states are limited at the ends of so many equal parts of each interval
-    report: Callable[[str], None]  # is given a line of text in each iteration
+    cost: Array  # weights of squared inputs (N + 1, nu)
+    parts: int  # number of parts per interval, at whose ends states are limited
+    report: Callable[[str], None]  # receives a line of text in each iteration
 
     def best(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return q, v and u at the knots with least effort, or closest to the end.

@@ -16,7 +16,7 @@ class StageSolution(NamedTuple):
 
     x: Array  # (N + 1, nx)
     u: Array  # (N + 1, nu)
-    y: Array  # (N, nx), of A x + B u + D u[k + 1] + c - x[k + 1]
+    y: Array  # (N, nx), multipliers of A x + B u + D u[k + 1] + c - x[k + 1] = 0
 
 
 class StageRows(NamedTuple):
@@ -49,7 +49,7 @@ class StageQP(NamedTuple):
     start: Array  # x[0] (nx,)
     A: Array  # (N, nx, nx)
     B: Array  # (N, nx, nu)
-    D: Array  # (N, nx, nu), zero where inputs are held
+    D: Array  # (N, nx, nu), zero if inputs are held
     c: Array  # (N, nx)
     H: Array  # (N + 1, nx + nu, nx + nu), positive semidefinite
     g: Array  # (N + 1, nx + nu)

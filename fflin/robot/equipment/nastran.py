@@ -117,7 +117,7 @@ def _matrices(path: Path, size: int) -> tuple[Array, Array]:
     from pyyeti.nastran import op4
 
     try:
-        found: Mapping[str, Any] = op4.read(str(path), sparse=False)
+        found: Mapping[str, object] = op4.read(str(path), sparse=False)
     except Exception as error:  # pyYeti raises whatever its parsing meets
         raise InputError(f"{path} cannot be read as an output4 file (.op4): {_line(error)}") from (
             None
