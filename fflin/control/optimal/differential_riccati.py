@@ -80,7 +80,7 @@ def transition(early: Coefficients, late: Coefficients, h: Array) -> Transition:
 
 
 def _constant(coefficients: Coefficients, h: Array) -> Transition:
-    """Return transitions for constant coefficients, by a doubled short matrix exponential."""
+    """Return transitions for constant coefficients, by scaling and doubling an exponential."""
     A, S, Q = coefficients
     n, unit = A.shape[-1], _units(*(np.abs(x).max(axis=0) for x in coefficients))
     A, S, Q = A * unit / unit[:, None], S / np.outer(unit, unit), Q * np.outer(unit, unit)
