@@ -212,7 +212,7 @@ def translated(function: Any) -> Any:
 
 
 def _counterpart(value: Any) -> Any:
-    """Return the replacement of a global value of the kernel's modules in compiled code."""
+    """Return what replaces a global value of a kernel module in compiled code."""
     if isinstance(value, Opener):
         return opener(value.kind)
     if isinstance(value, ModuleType) and value.__name__.startswith("fflin.kernel."):
