@@ -29,7 +29,7 @@ Part = TypeVar("Part", bound=LinearModel)
 # Smaller values, relative to the largest, are rounding errors.
 _ROUNDING = 1e-9
 
-# Largest part of f0, relative to its largest entry, that the reduced state may leave out.
+# The reduced state may leave out a part of f0 up to this fraction of the largest entry of f0.
 _DRIFT = 1e-9
 
 

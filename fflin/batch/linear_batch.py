@@ -114,7 +114,7 @@ class LinearBatch(FrozenArrays):
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Model fields that need the robot to be computed, by name.
+    # Fields of the models, by name, that are the same at all points or need the robot.
     _asked: Mapping[str, Any]
     verified: bool = True
 

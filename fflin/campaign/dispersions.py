@@ -438,7 +438,10 @@ def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: float)
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
-    """Return inertial parameters (N, 10) of bodies in axes: m, m c, and I (xx xy xz yy yz zz)."""
+    """Return m, m c and I (xx xy xz yy yz zz) of bodies (N, 10), in the axes given as columns.
+
+    I is about the origin.
+    """
     square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
     rows, columns = np.triu_indices(3)

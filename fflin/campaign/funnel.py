@@ -54,7 +54,7 @@ _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
 
 
 def ellipsoid_axes(P: Array) -> Array:
-    """Return W (nx, nx) with W W' the pseudoinverse of P, for errors of different units.
+    """Return W (nx, nx) with W W' a generalised inverse of P, for a P with mixed units.
 
     P is scaled to a unit diagonal, and W contains the symmetric root of its pseudoinverse.
     Eigenvectors are not unique, so errors drawn along them would depend on the processor's

@@ -92,7 +92,11 @@ def wheel_momenta(robot: Robot, q: Array, v: Array) -> tuple[Array, Array, Array
 
 
 def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, object]:
-    """Return the total momentum [N m s] of the wheels, their least capacity, and their rank."""
+    """Return the total momentum of the wheels, and the momentum that they can store.
+
+    The stored momentum [N m s] is the largest one that they can store in every direction. `rank` is
+    the number of axes that they span.
+    """
     axes, stored, largest = wheel_momenta(robot, q, v)
     rank = int(np.linalg.matrix_rank(axes, tol=1e-6)) if stored.size else 0
     bounded = rank == 3 and np.isfinite(largest).all()

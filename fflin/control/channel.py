@@ -152,8 +152,8 @@ class Law:
         limits: tuple[Array, Array],
         slow: float,
     ) -> None:
-        # If the squared velocity exceeds `slow`, the motion diverges and commands may become
-        # infinite.
+        # Above the squared velocity `slow`, the motion counts as diverging, and a command that is
+        # not finite raises no error.
         self.policy, self._names, self._limits, self._slow = policy, names, limits, slow
         self._shape = (len(names),)
         # Only policies that integrate their own state have `advance`.

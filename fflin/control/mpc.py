@@ -28,8 +28,9 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, range_of
 from fflin.robot.robot import Robot
 
-# Weights Q and R and their rule, and the limits E, D, low and high of a stage.
+# Weights Q and R, and the name of their rule.
 Cost: TypeAlias = "tuple[Weight | None, Weight | None, str | None]"
+# Function that returns the limits of a stage: E, D, low and high.
 Rows: TypeAlias = Callable[..., tuple[Array, ...]]
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.

@@ -253,7 +253,7 @@ class Sensing:
     ) -> None:
         robot = state.robot
         self.state, self._own_reference = state, own_reference
-        # The model may placement its free-flyer joint away from the world's origin.
+        # The model may place its free-flyer joint away from the world's origin.
         self._home = pin.SE3ToXYZQUAT(robot.model.jointPlacements[ROOT].inverse())
 
         # (output, state) for each output that is a state.

@@ -4,8 +4,9 @@ An array with one axis holds numbers. An array with a second axis of eight holds
 per lane, and one instruction for all eight. A double is valid for every lane. So a function that is
 written for one number can be compiled for eight.
 
-LLVM does not vectorise loops over arrays that may overlap, but it does vectorise this type. If the
-registers of a machine are narrower, LLVM splits the eight numbers over several registers.
+LLVM does not vectorise loops over arrays that may overlap. So eight numbers are one value of the
+vector type `Lanes`, whose operations LLVM compiles to vector instructions. If the registers of a
+machine are narrower, LLVM splits the eight numbers over several registers.
 """
 
 from __future__ import annotations

@@ -133,7 +133,8 @@ def _row_products(a: Any, size: int, b: Any, out: Any) -> None:
 
 @called
 def _remove_components(Q: Any, size: int, count: int, x: Any, found: Any, first: int) -> None:
-    # Modified Gram-Schmidt. With x as the last column it is as accurate as Householder's method.
+    # Modified Gram-Schmidt. Least squares by it are as accurate as by Householder's method, if the
+    # right-hand side is treated as the last column of the matrix.
     for index in range(count):
         share = _row_product(Q, index * size, x, 0, size)
         _add_row(x, 0, -share, Q, index * size, size)

@@ -186,8 +186,8 @@ def opener(kind: Struct) -> Any:
 
 
 # A product and a sum may become one fused instruction, which rounds once. A division by zero gives
-# infinity. Array references are not counted, which would take three quarters of the time. So
-# kernel functions cannot allocate arrays.
+# infinity. Counting references of arrays is off, because it would take three quarters of the time.
+# So kernel functions cannot allocate arrays.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
 _PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
@@ -212,7 +212,7 @@ def translated(function: Any) -> Any:
 
 
 def _counterpart(value: Any) -> Any:
-    """Return the replacement of a global value of the kernel's modules in compiled code."""
+    """Return what replaces a global value of a kernel module in compiled code."""
     if isinstance(value, Opener):
         return opener(value.kind)
     if isinstance(value, ModuleType) and value.__name__.startswith("fflin.kernel."):

@@ -186,8 +186,9 @@ def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> A
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
     """Return the columns of each row of the factor, ending with its diagonal."""
-    # With mimic joints, the coordinates inwards of the bodies that one coordinate moves need not
-    # be on one path. Fill-in of the factor joins them to one path: Liu's elimination tree.
+    # With mimic joints, one coordinate moves several bodies, whose ancestors may be on different
+    # branches. Fill-in of the factor joins the ancestors' coordinates to one path (Liu's
+    # elimination tree).
     reached: list[set[int]] = [set(range(index)) if index < 6 else set() for index in range(size)]
     for body in range(1, len(parent)):
         above = body

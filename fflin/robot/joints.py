@@ -63,7 +63,7 @@ class Joint(NamedTuple):
         return self.kind != "joint"
 
     def oscillation(self, stiffness: float, damping: float) -> tuple[float, float]:
-        """Return the clamped frequency [rad/s] and damping ratio of a mode with a spring."""
+        """Return frequency [rad/s] and damping ratio of a mode on a spring, its link clamped."""
         omega = math.sqrt(stiffness / self.inertia)
         return omega, 0.5 * damping / (self.inertia * omega)
 

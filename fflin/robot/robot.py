@@ -152,7 +152,8 @@ class Robot(Coordinates):
     _unequipped: Robot | None = None
     # Wheels and modes that were removed when inputs or appendages were replaced.
     _removed: tuple[str, ...] = ()
-    # The model, and a copy from when the first robot was made from it.
+    # The model, and a copy of it that shows whether the model was changed since this robot, or the
+    # robot that it derives from, was made.
     _as_made: tuple[pin.Model, pin.Model] | None = None
 
     def __post_init__(self) -> None:

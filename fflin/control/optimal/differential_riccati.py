@@ -172,7 +172,8 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
                 # Value at the middle of the cubic that has these values and derivatives.
                 bend = interval.at_start.rate(double) - interval.at_end.rate(P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
-                # Half steps are sixteen times as accurate. The estimate assumes only four times.
+                # Two half steps are sixteen times as accurate as one whole step, so that their
+                # error is a fifteenth of the difference. To be safe, a quarter is assumed.
                 error = 0.25 * max(_apart(double, single), _apart(half, between))
             if error <= _ACCURACY:
                 times += [middle, start]

@@ -211,7 +211,8 @@ def _refined(
             if gain < 2.0:
                 break
         elif gain < 10.0:
-            # Progress is slow, because the modes belong to a loop that is too far away.
+            # Progress is slow, because the modes belong to a closed loop that is too far from the
+            # closed loop of the current P. So new modes are computed.
             if fresh and trial is not better:
                 break
             modes = None
