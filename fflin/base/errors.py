@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from fflin.analysis.ranks import Margin
+from typing import Any
 
 # Patterns of control characters, which could break a line or control the terminal, and of names
 # too long to read. Each part of a path counts as a name. _LONGEST is the longest message.
@@ -170,7 +167,7 @@ class StabilizabilityError(FflinError, ValueError):
     fflin.base.errors.StabilizabilityError: the inputs cannot stabilise linear momentum ...
     """
 
-    margin: Margin | None = None
+    margin: Any = None
 
 
 class DetectabilityError(FflinError, ValueError):
@@ -191,7 +188,7 @@ class DetectabilityError(FflinError, ValueError):
     fflin.base.errors.DetectabilityError: the outputs do not observe q_b.x, q_b.y, q_b.z, ...
     """
 
-    margin: Margin | None = None
+    margin: Any = None
 
 
 class MissingPackageError(FflinError, ImportError):

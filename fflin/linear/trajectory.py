@@ -6,7 +6,7 @@ import warnings
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,9 +22,6 @@ from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from fflin.simulation.motion import Motion
 
 # Largest residual up to which knots count as a motion of the robot.
 _MOTION = 1e-2
@@ -343,7 +340,7 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
     return wide
 
 
-def along(motion: Motion, robot: Robot | None) -> Trajectory:
+def along(motion: Any, robot: Robot | None) -> Trajectory:
     """Convert a motion to a trajectory with constant or linear inputs, by the smaller residual."""
     if motion.phases:
         raise InputError(
