@@ -241,12 +241,13 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
         body = content[: len(content) - len(found.group())]
         if hashlib.sha256(body).hexdigest().encode() != found.group(1):
             raise ValueError(
-                f"{DAMAGED}; to read the file without this check, delete its line {CHECKSUM}"
+                f"{DAMAGED}; to read the file without this check, delete its last entry "
+                f"{CHECKSUM}, with the comma before it"
             )
     record: Record = json.loads(content)
     if record.pop(CHECKSUM, None) is not None and not found:
         raise ValueError(
-            f"its line {CHECKSUM} is not in the form that fflin writes; delete this line"
+            f"its entry {CHECKSUM} is not in the form that fflin writes; delete this entry"
         )
     return record, bool(found)
 
