@@ -96,7 +96,7 @@ def _add_funnel(commands: parser.Commands) -> None:
     funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
 
 
-_FREE = "not saturated; --limits urdf saturates them at the limits of the robot"
+_FREE = "not saturated; use --limits urdf to saturate them"
 
 
 def _validity(arguments: argparse.Namespace) -> Report:
