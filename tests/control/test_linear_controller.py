@@ -232,7 +232,7 @@ def test_accelerometers_are_fed_back_without_a_loop_in_themselves():
 def test_only_the_simulation_integrates_it(arm):
     robot, lin, gain, seen = arm
     policy = fflin.LinearController(fflin.lqg(gain, seen), lin)
-    with pytest.raises(fflin.InputError, match="only fflin.simulate can integrate"):
+    with pytest.raises(fflin.InputError, match="can integrate the states"):
         fflin.simulate(robot, policy.bind(robot).__call__, duration=0.1)
 
 
