@@ -220,10 +220,7 @@ class Campaign(FrozenArrays):
             return self.settle[:, at].max(axis=1, initial=0.0), "s"
         of, _, rest = name.partition(" ")
         of, rest = (of, rest) if of in ("worst", "settle", "drawn") else ("final", name)
-        states, inputs = (
-            (self.state_names, self.state_units),
-            (self.input_names, self.input_units),
-        )
+        states, inputs = (self.state_names, self.state_units), (self.input_names, self.input_units)
         kinds = tuple(KINDS), tuple(KINDS.values())
         groups: list[tuple[Any, Any, Array]] = {
             "final": [(*kinds, self._beyond(self.errors)), (*states, self.x), (*inputs, self.u)],
@@ -342,15 +339,12 @@ class Campaign(FrozenArrays):
             If the run does not exist, or the campaign was loaded from a file.
         """
         at = whole("run", run, 0, len(self) - 1)
-        return self._flown().replay(np.array(self.drawn[at]))
-
-    def _flown(self) -> CampaignJob:
         if self._job is None:
             raise InputError(
                 "the campaign was loaded from a file, which does not contain its robot and policy; "
                 "call monte_carlo again with the same seed, and replay a run of the new campaign"
             )
-        return self._job
+        return self._job.replay(np.array(self.drawn[at]))
 
     def save(self, path: str | Path) -> None:
         """Save the campaign to a .npz, .h5, .csv or .mat file, atomically.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -32,9 +32,6 @@ from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
-
-if TYPE_CHECKING:
-    from fflin.robot.equipment.appendages import Appendage
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
@@ -263,20 +260,16 @@ class Dispersions:
             except ChartError as error:
                 said = f"an invalid initial attitude is drawn in the runs from {start} on"
                 raise InputError(f"{said}: {error}; use a smaller dispersion") from None
-            if appendages := self._plant.robot.appendages:
-                self._require_realisable(appendages, drawn, start)
-
-    def _require_realisable(
-        self, appendages: Sequence[Appendage], drawn: Array, start: int
-    ) -> None:
-        """Raise `InputError` if a body's inertia is too small for its modes' participation."""
-        refused = first_impossible(self._model, appendages, self.bodies(drawn))
-        if refused is not None:
-            try:
-                self.one(drawn[refused])
-            except InputError as error:
-                said = f"run {start + refused} draws an invalid mass or inertia"
-                raise InputError(f"{said}: {error}; use a smaller dispersion") from None
+            if not (appendages := self._plant.robot.appendages):
+                continue
+            # A body's inertia may be too small for the participation of its modes.
+            refused = first_impossible(self._model, appendages, self.bodies(drawn))
+            if refused is not None:
+                try:
+                    self.one(drawn[refused])
+                except InputError as error:
+                    said = f"run {start + refused} draws an invalid mass or inertia"
+                    raise InputError(f"{said}: {error}; use a smaller dispersion") from None
 
     def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
         """Return the drawn values (N, size, axes) of a kind, or zeros if it is not dispersed."""

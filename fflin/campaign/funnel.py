@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError, require_known
 from fflin.base.intervals import until_failure
 from fflin.base.record import Design
 from fflin.base.tables import folded, grid
@@ -23,7 +23,7 @@ from fflin.base.validation import (
     dimension,
     instance,
     number,
-    numbers,
+    positive,
     share,
     vector,
     whole,
@@ -365,9 +365,7 @@ def funnel(
     feedback = followed(schedule, robot)
     expected = "a GainSchedule or a TrajectoryFeedback"
     instance("schedule", feedback, TrajectoryFeedback, expected)
-    for name in options:
-        if name not in _OPTIONS:
-            raise unknown("option of funnel", name, list(_OPTIONS))
+    require_known("option of funnel", options, _OPTIONS)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)
     by_level = not isinstance(goal, Mapping)
@@ -383,13 +381,14 @@ def funnel(
     with executor_of(executor, workers) as others:
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
-            starts = Starts(job.x0, by.P[first], ellipsoid_axes(by.P[first]), rng)
+            axes = ellipsoid_axes(by.P[first])
+            drawn = partial(_starts, job.x0, by.P[first], axes, rng)
 
-            def simulate(roots: Array, job: CampaignJob = job, starts: Starts = starts) -> Array:
-                rows = Draws(starts.drawn(roots)).part
+            def simulate(roots: Array, job: CampaignJob = job, drawn: Any = drawn) -> Array:
+                rows = Draws(drawn(roots)).part
                 return completed(job, rows, len(roots), others, workers, threads)["outcome"]
 
-            root = _largest_root(simulate, _widest(starts.axes, robot))
+            root = _largest_root(simulate, _widest(axes, robot))
             tried[knot] = root**2
             outcomes[knot] = simulate(root * (np.arange(samples) + 0.5) / samples)
             if progress:
@@ -438,20 +437,15 @@ def _beyond(sizes: Mapping[str, Array], bounds: Mapping[str, float]) -> Array:
     return beyond
 
 
-class Starts(NamedTuple):
-    """Random errors about a state at a knot."""
+def _starts(center: Array, P: Array, axes: Array, rng: np.random.Generator, roots: Array) -> Array:
+    """Return random deviations (N, nx) from `center` whose levels have square roots (N,).
 
-    center: Array  # (nx,)
-    P: Array  # (nx, nx), of the level
-    axes: Array  # W of `ellipsoid_axes`
-    rng: np.random.Generator
-
-    def drawn(self, roots: Array) -> Array:
-        """Return random initial deviations (N, nx) whose levels have these square roots (N,)."""
-        e = self.rng.normal(size=(len(roots), len(self.P))) @ self.axes.T
-        # Directions in which P is zero do not contribute to the level.
-        e *= (roots / np.sqrt(((e @ self.P) * e).sum(axis=1)))[:, None]
-        return moved_by("local", np.tile(self.center, (len(e), 1)), e) - self.center
+    P (nx, nx) is the matrix of the level, and `axes` are its `ellipsoid_axes`.
+    """
+    e = rng.normal(size=(len(roots), len(P))) @ axes.T
+    # Directions in which P is zero do not contribute to the level.
+    e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
+    return moved_by("local", np.tile(center, (len(e), 1)), e) - center
 
 
 def runs_from(
@@ -488,22 +482,16 @@ def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
     return min(root * (2.0 if further else 1.4), widest)
 
 
-def _bounds(name: str, given: Any, kinds: Iterable[str]) -> dict[str, float]:
+def _bounds(name: str, given: Any, kinds: Collection[str]) -> dict[str, float]:
     """Return {kind: largest error}, or raise `InputError`."""
     given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
-    for key in given:
-        if key not in kinds:
-            raise unknown(f"kind of error in {name}", str(key), list(kinds))
+    require_known(f"kind of error in {name}", given, kinds)
     if name == "goal" and not given:
         raise InputError(
             "goal is empty; give the largest final error of at least one kind, such as "
             "{'attitude': 1.0} in deg"
         )
-    found = numbers(name, given, "kind", name)
-    for key, value in found.items():
-        if not value > 0.0:
-            raise InputError(f"{name} '{key}' is {value:g}, expected more than 0")
-    return found
+    return {key: positive(f"{name} '{key}'", value) for key, value in given.items()}
 
 
 def _shown(bounds: Mapping[str, float]) -> str:

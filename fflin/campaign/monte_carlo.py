@@ -16,9 +16,9 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import __version__
-from fflin.base.errors import FileError, InputError, unknown
+from fflin.base.errors import FileError, InputError, require_known
 from fflin.base.record import content_digest, reading
-from fflin.base.validation import share, truth, whole
+from fflin.base.validation import instance, share, truth, whole
 from fflin.batch.files import (
     FileStore,
     MemoryStore,
@@ -203,9 +203,7 @@ def monte_carlo(
     >>> len(runs), runs.fraction("attitude < 1 deg").value > 0.5
     (16, True)
     """
-    for name in options:
-        if name not in _OPTIONS:
-            raise unknown("option of monte_carlo", name, sorted(_OPTIONS))
+    require_known("option of monte_carlo", options, sorted(_OPTIONS))
     runs, seed = whole("runs", runs, 1), whole("seed", seed, 0)
     width, confidence = share("width", width), share("confidence", confidence)
     check_workers(executor, workers, threads, chunk, progress)
@@ -262,15 +260,12 @@ def _goals(
     given: object, until: object, shapes: Mapping[str, tuple[int, ...]], header: dict[str, Any]
 ) -> list[str]:
     """Return the goals; raise an error for an invalid goal before any run begins."""
-    goals = [given] if isinstance(given, str) else given
-    if not isinstance(goals, list | tuple):
-        said = f"goals has type {type(given).__name__}"
-        raise InputError(f"{said}, expected a list such as ['attitude < 1 deg']")
+    listed = [given] if isinstance(given, str) else given
+    expected = "a list such as ['attitude < 1 deg']"
+    goals: Any = instance("goals", listed, (list, tuple), expected)
     goals = [*goals, *([] if until is None or until in goals else [until])]
     for goal in goals:
-        if not isinstance(goal, str):
-            said = f"a goal has type {type(goal).__name__}"
-            raise InputError(f"{said}, expected a text such as 'attitude < 1 deg'")
+        instance("a goal", goal, str, "a text such as 'attitude < 1 deg'")
         Campaign.of(MemoryStore(1, 1, shapes).arrays, header | {"goals": []}).met(goal)
     return goals
 

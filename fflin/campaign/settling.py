@@ -18,7 +18,7 @@ from fflin.analysis.names import rate_of
 from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
-from fflin.base.validation import Array, Indices, Mask, as_double
+from fflin.base.validation import Array, Indices, Mask, as_double, instance
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, Over
@@ -247,9 +247,8 @@ def settle(
 
 def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     """Return the loop of a gain; raise `InputError` if it cannot settle at the operating point."""
-    if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
-        given = f"robot has type {type(robot).__name__}, lin has type {type(lin).__name__}"
-        raise InputError(f"{given}; expected a fflin.Robot and its fflin.LinearModel")
+    instance("robot", robot, Robot, "a fflin.Robot")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
     kept = getattr(gain, "regulated", ())
     part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))

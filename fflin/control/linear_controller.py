@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,9 +24,6 @@ from fflin.dynamics.outputs import Measuring
 from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default names of signals
 

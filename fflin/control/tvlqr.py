@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import DetectabilityError, EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, instance, number
 from fflin.control.default_weights import pace_along
 from fflin.control.gain import Gain
 from fflin.control.gain_schedule import FilterSchedule, GainSchedule, Interpolant
@@ -180,12 +180,8 @@ def held_stages(
 
 def require_continuous(traj: LinearTrajectory) -> None:
     """Raise `InputError` if traj is not a LinearTrajectory in continuous time."""
-    if not isinstance(traj, LinearTrajectory):
-        raise InputError(
-            f"traj has type {type(traj).__name__}, expected a LinearTrajectory; "
-            "fflin.linearize_trajectory returns one"
-        )
-    if traj.dt:
+    expected = "a LinearTrajectory; fflin.linearize_trajectory returns one"
+    if instance("traj", traj, LinearTrajectory, expected).dt:
         raise InputError("traj is sampled; give the continuous trajectory and sample=")
 
 
