@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 NOT_RUN = -1.0  # value of `stop` in the rows of a file that contain no run
 
-_COMPARED = re.compile(r"\s*(.+?)\s*(<=|>=|<|>)\s*([-+.\de]+)\s*(.*?)\s*")
+_COMPARED = re.compile(
+    r"\s*(.+?)\s*(<=|>=|<|>)\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?![.\d])\s*(.*?)\s*"
+)
 _COMPARE = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}
 _DEGREE = math.pi / 180.0
 _FACTORS = {  # from the unit of a condition to the unit of a figure
@@ -59,16 +61,12 @@ def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> lis
     """
     bounds = []
     for part in condition.split(" and "):
-        match = _COMPARED.fullmatch(part)
-        try:
-            name, sign, bound, unit = match.groups() if match else ("", "", "", "")
-            limit = float(bound)
-        except ValueError:
+        if not (match := _COMPARED.fullmatch(part)):
             raise InputError(
                 f"condition {part!r} cannot be read, expected NAME < NUMBER UNIT, such as "
                 "'attitude < 1 deg'"
-            ) from None
-        name = kind_named(name)
+            )
+        name, sign, limit, unit = kind_named(match[1]), match[2], float(match[3]), match[4]
         values, own = figure(name)
         factors = [_FACTORS.get((unit, each), 0.0) for each in own.split("|")]
         factor = 1.0 if unit in ("", own, *own.split("|")) else max(factors)

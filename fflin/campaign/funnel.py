@@ -32,7 +32,7 @@ from fflin.base.writing import as_path
 from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
-from fflin.campaign.statistics import EDGE, KINDS, kind_named
+from fflin.campaign.statistics import EDGE, KINDS, Judge, kind_named
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
 from fflin.dynamics.coordinates import moved_by, moving_error
@@ -373,7 +373,8 @@ def funnel(
     limits = _bounds("within", {} if within is None else within, KINDS)
     check_workers(executor, workers, threads, None, progress)
     motion, by = feedback.trajectory, feedback.schedule
-    reached, indices = Goal(final, limits, by.P[-1]), _indices(motion, by, knots)
+    reached = Judge(("outcome",), partial(_outcomes, final, limits, by.P[-1]))
+    indices = _indices(motion, by, knots)
     jobs = [runs_from(robot, feedback, *pair, options, reached) for pair in indices]
     for job in jobs:
         job.choose(engine)
@@ -408,27 +409,19 @@ def funnel(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Goal:
-    """Evaluation of runs: bounds on final errors or final level, and on errors at any time."""
+def _outcomes(
+    final: Mapping[str, float], within: Mapping[str, float], P: Array, runs: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Return the codes of `Funnel.outcomes` for bounds on final errors and on errors at any time.
 
-    FIELDS: ClassVar[tuple[str, ...]] = ("outcome",)  # the codes of `Funnel.outcomes`
-    over: ClassVar[None] = None
-
-    final: Mapping[str, float]
-    within: Mapping[str, float]
-    P: Array  # (nx, nx), of the final level
-
-    def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
-        """Return the outcomes of runs."""
-        e = runs["state_errors"][:, -1]
-        largest, final = (
-            dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors")
-        )
-        final["level"] = ((e @ self.P) * e).sum(axis=1)
-        stopped = (runs["stop"] != 0.0) | (largest["attitude"] > EDGE)
-        failures = [stopped, _beyond(largest, self.within), _beyond(final, self.final)]
-        return {"outcome": np.select(failures, [1.0, 2.0, 3.0])}
+    P (nx, nx) is the matrix of the final level.
+    """
+    e = runs["state_errors"][:, -1]
+    largest, last = (dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors"))
+    last["level"] = ((e @ P) * e).sum(axis=1)
+    stopped = (runs["stop"] != 0.0) | (largest["attitude"] > EDGE)
+    failures = [stopped, _beyond(largest, within), _beyond(last, final)]
+    return {"outcome": np.select(failures, [1.0, 2.0, 3.0])}
 
 
 def _beyond(sizes: Mapping[str, Array], bounds: Mapping[str, float]) -> Array:
@@ -454,7 +447,7 @@ def runs_from(
     k: int,
     first: int,
     options: Mapping[str, Any],
-    judge: Goal | None = None,
+    judge: Judge | None = None,
 ) -> CampaignJob:
     """Return the runs from knot k of the trajectory, which is knot `first` of the schedule."""
     motion, schedule = feedback.trajectory, feedback.schedule

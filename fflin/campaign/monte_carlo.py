@@ -213,7 +213,11 @@ def monte_carlo(
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     threads = threads or available_cores()
     size = _chunk(runs, chunk, workers or threads, until is not None)
-    store: Any = _memory(path, runs, size, shapes)
+    store: Any = None
+    if path is None or path.suffix == ".npz":
+        store = MemoryStore(runs, size, shapes)
+    elif not part_of(path).exists():
+        require_room(path, 8 * runs * sum(map(math.prod, shapes.values())))
     if executor or workers:
         _require_sendable(job)
     job.choose(engine)
@@ -229,8 +233,7 @@ def monte_carlo(
         texts = {"header": json.dumps(header), "constant": "[]"}
         store = FileStore(path, request, runs, size, shapes, {}, texts)
     with closing(store), executor_of(executor, workers) as others:
-        how: Any = {"executor": others, "progress": progress}
-        how["threads"] = threads if job.engine == "compiled" else 1
+        how: Any = {"executor": others, "progress": progress, "threads": job.threads(threads)}
         expect(progress, [(job, job.dispersions.rows(0, min(runs, LANES)), runs)], others, threads)
         done = runs if until is None else min(_STAGE, runs)
         while not (failed := run_chunks(job, job.dispersions.rows, store, upto=done, **how)):
@@ -268,17 +271,6 @@ def _goals(
         instance("a goal", goal, str, "a text such as 'attitude < 1 deg'")
         Campaign.of(MemoryStore(1, 1, shapes).arrays, header | {"goals": []}).met(goal)
     return goals
-
-
-def _memory(
-    path: Path | None, runs: int, size: int, shapes: Mapping[str, tuple[int, ...]]
-) -> MemoryStore | None:
-    """Return a store in memory, or None for a .h5 file, which must fit on the disk."""
-    if path is None or path.suffix == ".npz":
-        return MemoryStore(runs, size, shapes)
-    if not part_of(path).exists():
-        require_room(path, 8 * runs * sum(map(math.prod, shapes.values())))
-    return None
 
 
 def _complete(store: FileStore, done: int, shapes: Mapping[str, tuple[int, ...]]) -> None:

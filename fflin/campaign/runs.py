@@ -96,6 +96,15 @@ class CampaignJob:
         # pickled.
         return _remade, (self._arguments, self.engine)
 
+    @property
+    def lanes(self) -> int:
+        """Number of runs that are computed together."""
+        return LANES if self.engine == "compiled" else 1
+
+    def threads(self, asked: int | None) -> int:
+        """Return the number of threads that compute runs in this process."""
+        return (asked or available_cores()) if self.engine == "compiled" else 1
+
     def choose(self, engine: object) -> None:
         """Set the engine of the runs: the requested one, or the fastest that supports the plan."""
         self.engine = engine_of(engine, self.plan, self.plant, many=True)
@@ -104,7 +113,7 @@ class CampaignJob:
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape per run of each array of the result."""
         if self.judge:
-            return dict.fromkeys(self.judge.FIELDS, ())
+            return dict.fromkeys(self.judge.fields, ())
         return {key: self._shapes[key] for key in ARRAYS}
 
     @property
@@ -193,9 +202,7 @@ class CampaignJob:
     def seconds(self, first: Draws, count: int) -> float:
         """Estimate the time [s] of runs on one core from a few steps of the first runs."""
         few, plan = _remade(self._arguments, self.engine), self.plan
-        compiled, steps = self.engine == "compiled", plan.times.steps
-        lanes = LANES if compiled else 1
-        drawn = first.part(0, lanes)
+        drawn, steps = first.part(0, self.lanes), plan.times.steps
 
         def measured(steps: int) -> float:
             few.plan = replace(plan, times=plan.times._replace(steps=steps))
@@ -207,7 +214,7 @@ class CampaignJob:
         measured(1)  # compiles the loop if needed
         begin = measured(short)
         step = (measured(long) - begin) / (long - short) if long > short else 0.0
-        return (begin + max(step, 0.0) * (steps - short)) * math.ceil(count / lanes)
+        return (begin + max(step, 0.0) * (steps - short)) * math.ceil(count / self.lanes)
 
     def replay(self, drawn: Array) -> Motion:
         """Repeat a run (k,) with the same arithmetic, and return its motion."""
@@ -264,11 +271,9 @@ def expect(
     tell = getattr(progress, "expect", None)
     if tell is None:
         return
-    compiled = any(job.engine == "compiled" for job, *_ in work)
-    here = (threads or available_cores()) if compiled else 1
-    lanes = LANES if compiled else 1
-    cores = worker_count(executor) if executor else here
-    cores = min(cores, max(math.ceil(count / lanes) for *_, count in work))
+    here = max(job.threads(threads) for job, *_ in work)
+    most = max(math.ceil(count / job.lanes) for job, _, count in work)
+    cores = min(worker_count(executor) if executor else here, most)
     try:
         seconds = sum(job.seconds(first, count) for job, first, count in work)
     except FflinError:
@@ -303,19 +308,9 @@ def completed(
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Run a job on all its rows, and return its arrays."""
-    compiled = job.engine == "compiled"
-    threads = (threads or available_cores()) if compiled else 1
-    size = chunk_size(count, workers or threads, LANES if compiled else 1)
-    store = MemoryStore(count, size, job.shapes)
-    failed = run_chunks(
-        job,
-        rows,
-        store,
-        executor=executor,
-        threads=threads,
-        progress=progress,
-        all_needed=True,
-    )
-    if failed:
+    threads = job.threads(threads)
+    store = MemoryStore(count, chunk_size(count, workers or threads, job.lanes), job.shapes)
+    how: Any = {"executor": executor, "threads": threads, "progress": progress}
+    if failed := run_chunks(job, rows, store, all_needed=True, **how):
         raise FflinError(failed[0].reason)
     return dict(store.arrays)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -72,17 +72,13 @@ class Outcome(NamedTuple):
     state_errors: Array  # (N, times, nx), NaN after a run was stopped
 
 
-class Judge(Protocol):
-    """Evaluation of runs that replaces the record of a campaign, and may end runs early."""
+class Judge(NamedTuple):
+    """Evaluation of runs, whose results replace the record of a campaign; it is sent to workers."""
 
-    FIELDS: ClassVar[tuple[str, ...]]
-
-    @property
-    def over(self) -> Over | None:
-        """Stop condition, checked every `LOOK` steps; None if no run is ended early."""
-
-    def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
-        """Return the FIELDS (N,) from the runs' `Outcome`; the first history entry is the start."""
+    fields: tuple[str, ...]  # names of the results
+    # Return the results (N,) from the runs' `Outcome`; the first history entry is the start.
+    figures: Callable[[Mapping[str, Array]], dict[str, Array]]
+    over: Over | None = None  # condition that ends a run early
 
 
 def kinds_of(state: StateMap) -> Indices:

@@ -326,15 +326,11 @@ def _checked_displacement(
     """Return the largest displacement, with zeros for quantities that are not model states."""
     given = {"attitude": attitude, "position": position, "joint": joint}
     given = {key: number(key, value) for key, value in given.items()}
-    if not 0.0 <= given["attitude"] < 175.0 or min(given.values()) < 0.0:
+    if given["attitude"] >= 175.0 or not all(0.0 <= x <= _FARTHEST for x in given.values()):
         raise InputError(
-            f"the displacements are {shown(given)}, but each must be 0 or more, and the rotation "
-            "must be less than 175 deg, because the attitude chart ends at 180 deg"
-        )
-    if max(given.values()) > _FARTHEST:
-        raise InputError(
-            f"the displacements are {shown(given)}; expected at most {_FARTHEST:g}; give smaller "
-            "ones"
+            f"the displacements are {shown(given)}, but each must be 0 or more and at most "
+            f"{_FARTHEST:g}, and the rotation must be less than 175 deg, because the attitude "
+            "chart ends at 180 deg"
         )
     groups = {name.partition(".")[0] for name in lin.state_names}
     names = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}
