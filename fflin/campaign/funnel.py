@@ -241,10 +241,8 @@ class Funnel(Design):
     def __str__(self) -> str:
         count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
         head = f"{self.robot.name}: initial errors from which every run ends with {self.goal}"
-        head += (
-            f", and with {self.within} at all times" * bool(self.within)
-            + f"; {count} runs per knot"
-        )
+        head += f", and with {self.within} at all times" * bool(self.within)
+        head += f"; {count} runs per knot"
         tail = [
             "base, joint: largest half-axes of the ellipsoid of initial errors",
             "runs: number of runs that start inside the ellipsoid, all of which succeeded (+: "

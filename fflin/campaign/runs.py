@@ -23,7 +23,6 @@ from fflin.campaign.statistics import (
     KINDS,
     LOOK,
     Judge,
-    Outcome,
     Over,
     RunStatistics,
     errors_of,
@@ -42,7 +41,6 @@ from fflin.simulation.plant import Plant, conserved_by
 from fflin.simulation.run import Recording, go
 from fflin.simulation.simulate import motion_of
 
-ARRAYS = Outcome._fields[:-1]  # arrays in the record of a campaign
 _LARGEST_CHUNK = 256
 _FEW_STEPS, _SOME_STEPS = 4, 64  # steps timed to estimate the duration of runs
 
@@ -114,14 +112,23 @@ class CampaignJob:
         """Shape per run of each array of the result."""
         if self.judge:
             return dict.fromkeys(self.judge.fields, ())
-        return {key: self._shapes[key] for key in ARRAYS}
+        return {key: x for key, x in self.outcome_shapes.items() if key != "state_errors"}
 
     @property
-    def _shapes(self) -> dict[str, tuple[int, ...]]:
+    def outcome_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape per run of each array of an outcome: those of `Campaign`, and the state errors.
+
+        The state errors at the times of the histories are NaN after a run was stopped.
+        """
         robot, nx, nu = self.plant.robot, self.plant.state.nx, len(self.plan.initial)
-        sizes = [(size,) for size in (robot.nq, robot.nv, nx, nu, nx, nu, *[len(KINDS)] * 3)]
-        *histories, states = [(len(self.steps), size) for size in (len(KINDS), nu, nx)]
-        return dict(zip(Outcome._fields, [*sizes, *histories, (), (), states], strict=True))
+        sizes = {"q": robot.nq, "v": robot.nv, "x": nx, "u": nu, "largest_x": nx, "largest_u": nu}
+        sizes |= dict.fromkeys(("errors", "largest", "settle"), len(KINDS))
+        histories = {"error_history": len(KINDS), "input_history": nu, "state_errors": nx}
+        return {
+            **{key: (size,) for key, size in sizes.items()},
+            **{key: (len(self.steps), size) for key, size in histories.items()},
+            **{"stop": (), "end": ()},
+        }
 
     def digest(self, first: Draws) -> str:
         """Return a digest of the robot, the policy, the options and the first run.
@@ -138,7 +145,7 @@ class CampaignJob:
 
     def run(self, rows: Draws, start: int, out: Mapping[str, Array] | None = None) -> ChunkResult:
         """Simulate runs with the given drawn values."""
-        drawn, shapes = np.asarray(rows.drawn), self._shapes if self.judge else self.shapes
+        drawn, shapes = np.asarray(rows.drawn), self.outcome_shapes if self.judge else self.shapes
         found: dict[str, Array] = {
             key: np.empty((len(drawn), *shape)) for key, shape in shapes.items()
         }

@@ -53,30 +53,11 @@ def kind_named(name: str) -> str:
     return f"{of} {kind}".strip()
 
 
-class Outcome(NamedTuple):
-    """Outcomes of runs; each array has one row per run."""
-
-    q: Array  # (N, nq), final
-    v: Array  # (N, nv)
-    x: Array  # (N, nx)
-    u: Array  # (N, nu)
-    largest_x: Array  # (N, nx), errors
-    largest_u: Array  # (N, nu)
-    errors: Array  # (N, kinds), final
-    largest: Array  # (N, kinds)
-    settle: Array  # (N, kinds) [s], settling times; infinite if the error has not settled
-    error_history: Array  # (N, times, kinds), infinite after a run was stopped
-    input_history: Array  # (N, times, nu), zero after a run was stopped
-    stop: Array  # (N,), index into STOPS
-    end: Array  # (N,) [s]
-    state_errors: Array  # (N, times, nx), NaN after a run was stopped
-
-
 class Judge(NamedTuple):
     """Evaluation of runs, whose results replace the record of a campaign; it is sent to workers."""
 
     fields: tuple[str, ...]  # names of the results
-    # Return the results (N,) from the runs' `Outcome`; the first history entry is the start.
+    # Return the results (N,) from the runs' outcomes; the first history entry is the start.
     figures: Callable[[Mapping[str, Array]], dict[str, Array]]
     over: Over | None = None  # condition that ends a run early
 
@@ -111,7 +92,9 @@ def errors_of(state: StateMap, target: Array, q: Array, v: Array) -> tuple[Array
 def outcome_of(
     plan: Plan, state: StateMap, target: Array, steps: Array, run: Recording
 ) -> dict[str, Array]:
-    """Return a run's outcome, one row of each array of `Outcome`, from its recorded steps.
+    """Return a run's outcome from its recorded steps: a row of each array of `Campaign`.
+
+    The outcome also has the state errors at the times of the histories.
 
     Errors are relative to the state `target` (nx,), or to a moving state (steps + 1, nx). Histories
     have entries at `steps`.
@@ -130,7 +113,7 @@ def outcome_of(
         found[: len(kept)] = values[kept]
         return found
 
-    return Outcome(
+    return dict(
         q=run.q[-1],
         v=run.v[-1],
         x=x[-1],
@@ -145,7 +128,7 @@ def outcome_of(
         stop=np.array(float(stop)),
         end=np.array(run.steps * plan.times.dt),
         state_errors=history(signed, np.nan),
-    )._asdict()
+    )
 
 
 def marks_of(
@@ -236,7 +219,7 @@ class RunStatistics:
         (q, nu, u), marks, times = self._last, self._marks, len(self._steps)
         settled = _by_run(marks.outside) + 1.0
         late = (stop != 0.0)[:, None] | is_late(settled, done + 1)
-        return Outcome(
+        return dict(
             q=q,
             v=self._state.spread(nu),
             x=_by_run(marks.law.x),
@@ -251,7 +234,7 @@ class RunStatistics:
             stop=stop,
             end=np.full(LANES, done * self._dt),
             state_errors=_by_run(marks.states, times, self._state.nx),
-        )._asdict()
+        )
 
 
 def _by_run(values: Array, *shape: int) -> Array:

@@ -16,7 +16,7 @@ from fflin.base.validation import Array, FrozenArrays, Indices, number, share, w
 from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import expect
-from fflin.campaign.settling import OUTCOMES, Loop, checked_loop, settle, settling_runs
+from fflin.campaign.settling import OUTCOMES, checked_loop, settle, settling_runs
 from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -234,6 +234,15 @@ def validity(
     confidence = share("confidence", confidence)
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
+
+    def displaced(levels: Array, streams: Indices, runs: Indices) -> Array:
+        """Return the initial deviations of some runs, each from its own random stream."""
+        x = []
+        for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+            x.append(loop.displaced(rng, **_scaled(largest, level)))
+        return np.array(x) - loop.start
+
     sets, work = [], []
     # Level and random stream of each run for the prediction error, and of each random run.
     for predicts, at, streams in (
@@ -241,7 +250,7 @@ def validity(
         (False, levels, _DIRECTIONS + np.arange(samples)),
     ):
         runs_of = partial(settling_runs, loop, predicts, limits, largest["joint"])
-        starts = partial(_starts, loop, largest, seed, at, streams)
+        starts = partial(displaced, at, streams)
         sets.append((runs_of, starts, len(at)))
         job = runs_of()
         job.choose(engine)  # a wrong argument is refused before anything is compiled
@@ -276,22 +285,6 @@ def validity(
         robot=loop.lin.robot,
         frame=loop.lin.frame,
     )
-
-
-def _starts(
-    loop: Loop,
-    largest: dict[str, float],
-    seed: int,
-    levels: Array,
-    streams: Indices,
-    runs: Indices,
-) -> Array:
-    """Return the initial deviations of some runs, each from its own random stream."""
-    x = []
-    for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-        x.append(loop.displaced(rng, **_scaled(largest, level)))
-    return np.array(x) - loop.start
 
 
 def _report(progress: Progress, before: int, total: int, done: int, _: int) -> None:

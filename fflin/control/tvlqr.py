@@ -310,7 +310,12 @@ def tvkalman(
         return 0.5 * (spread + spread.T)
 
     if asks_steady(P0, "P0", "a covariance"):
-        P = _steady_filter(traj, intensity(float(traj.t[0])), V, dt)
+        lin, early = steady_end(traj, 0), intensity(float(traj.t[0]))
+        try:
+            P = kalman(lin.discretize(dt), held_cost(lin.A.T, early, dt), V).P
+        except (DetectabilityError, InputError) as error:
+            said = f"no steady filter exists at the start of the trajectory: {error}; or give P0"
+            raise type(error)(said) from None
     else:
         P = weight("P0", P0, traj.state_names)
     held, at_samples, nx = list(transitions(traj, dt)), along(traj.resampled(dt)), len(P)
@@ -337,16 +342,6 @@ def tvkalman(
         dt=dt,
         **{key: getattr(traj, key) for key in _OF_FILTER},
     )
-
-
-def _steady_filter(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Array:
-    lin = steady_end(traj, 0)
-    try:
-        return kalman(lin.discretize(dt), held_cost(lin.A.T, W, dt), V).P
-    except (DetectabilityError, InputError) as error:
-        raise type(error)(
-            f"no steady filter exists at the start of the trajectory: {error}; or give P0"
-        ) from None
 
 
 def _disturbed(steps: Steps, intensity: Callable[[float], Array]) -> Array:

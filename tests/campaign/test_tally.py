@@ -13,7 +13,6 @@ from fflin.campaign.statistics import (
     KINDS,
     LOOK,
     Judge,
-    Outcome,
     RunStatistics,
     kinds_of,
     marks_of,
@@ -166,7 +165,7 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
             defined(job, home, *(each[:, lane] for each in (q, nu, u)), stop[lane])
             for lane in range(LANES)
         ]
-        for name in Outcome._fields:
+        for name in job.outcome_shapes:
             expected = np.array([each[name] for each in plain])
             found = ends[-1][name]
             assert found.shape == expected.shape
