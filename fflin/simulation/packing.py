@@ -203,7 +203,7 @@ def _filtered(
 
 def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
     """Return the allocation of one robot's commands (`asking`) to the other's inputs (`giving`)."""
-    names, tree = plant.actuation.names, batch_tree(asking.robot)
+    tree = batch_tree(asking.robot)
     assert tree is not None
     size, asks = plant.state.nx // 2, mechanics_of(asking, tree)
     least, most = input_limits(plant.robot, limits_of(plant.robot))
