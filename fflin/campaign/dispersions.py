@@ -385,13 +385,11 @@ class Dispersions:
         """Return a run's robot with its inputs, its policy, and its initial q and v."""
         plant, policy, rows = self._plant, self._policy, drawn[None]
         robot, (q, v) = plant.robot, self.starts(rows)
-        if bodies := self.bodies(rows):
-            robot = robot.with_bodies(
-                {
-                    joint: pin.Inertia(float(mass[0]), com[0], inertia[0])
-                    for joint, (mass, com, inertia) in bodies.items()
-                }
-            )
+        bodies = {
+            joint: pin.Inertia(float(mass[0]), com[0], inertia[0])
+            for joint, (mass, com, inertia) in self.bodies(rows).items()
+        }
+        robot = robot.with_bodies(bodies) if bodies else robot
         for kind in self._springs_of:
             values = self._springs(kind, rows)[0].tolist()
             of: Any = {kind: dict(zip(robot.joint_names, values, strict=True))}

@@ -49,10 +49,6 @@ class Feedback:
         require_fit(self.lin, robot, state)
         return state
 
-    def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot."""
-        raise NotImplementedError
-
 
 @dataclass(eq=False)
 class StateFeedback(Feedback):

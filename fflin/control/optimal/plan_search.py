@@ -6,10 +6,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Mask
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.optimal.stage_qp import StageQP, StageRows
 
@@ -40,8 +39,6 @@ _OF_WHEELS = 1e-6
 # Penalty on a violation of the goal or a limit by 1 rad or 1 m, in efforts of the guess.
 _PRICE = 1e3
 
-Flags = NDArray[np.bool_]
-
 
 class Trial(NamedTuple):
     """Trial with knots, inputs, gaps between intervals, and distances to the limits of states."""
@@ -58,7 +55,7 @@ class Trial(NamedTuple):
         """Largest gap between intervals."""
         return float(np.abs(self.missed).max())
 
-    def outside(self, limited: Flags) -> float:
+    def outside(self, limited: Mask) -> float:
         """Return the sum of limit violations at knots and at `limited` points within intervals."""
         return float(excess(self.knots).sum() + excess(self.inside)[limited].sum())
 
@@ -72,7 +69,7 @@ class Search(NamedTuple):
     shooting: Shooting
     start: Point
     end: Point
-    asked: Flags  # states whose value at the end is prescribed (nx,)
+    asked: Mask  # states whose value at the end is prescribed (nx,)
     bounds: Array  # limits of states (2, nx)
     limits: Array  # limits of inputs (2, nu)
     cost: Array  # weights of squared inputs (N + 1, nu)
@@ -119,7 +116,7 @@ class Search(NamedTuple):
                 break
         return self._acting(self._closed(trial, limited, first))
 
-    def _report(self, what: str, trial: Trial, limited: Flags) -> None:
+    def _report(self, what: str, trial: Trial, limited: Mask) -> None:
         """Report the cost relative to the guess, and the largest violation."""
         cost, inside = float((self.cost * trial.u**2).sum()), excess(trial.inside)[limited]
         most = max(trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0)))
@@ -142,16 +139,16 @@ class Search(NamedTuple):
         inside = tighter[:, None, None] - shooting.inside(motions, self.parts)
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
 
-    def _exceeding(self, trial: Trial) -> Flags:
+    def _exceeding(self, trial: Trial) -> Mask:
         """Return whether points (N, parts - 1, nx) or their neighbours exceed a limit."""
-        beyond: Flags = excess(trial.inside) > (_LIMITED + _TIGHTER) * self._size
+        beyond: Mask = excess(trial.inside) > (_LIMITED + _TIGHTER) * self._size
         near = beyond.copy()
         near[:, 1:] |= beyond[:, :-1]
         near[:, :-1] |= beyond[:, 1:]
         return near
 
     def _step(
-        self, trial: Trial, limited: Flags, near: Array, effort: Array
+        self, trial: Trial, limited: Mask, near: Array, effort: Array
     ) -> tuple[Array, Array, Array, float] | None:
         """Return the optimal step of knots and inputs, its multipliers and its violations."""
         u, nx = trial.u, self.shooting.state.nx
@@ -177,7 +174,7 @@ class Search(NamedTuple):
         left = np.array((rows.low, rows.high)) - rows.values(found.x, found.u)
         return *found, float(excess(trial.knots - found.x).sum() + excess(left).sum())
 
-    def _closed(self, trial: Trial, limited: Flags, near: Array) -> Trial:
+    def _closed(self, trial: Trial, limited: Mask, near: Array) -> Trial:
         """Close the gaps between intervals by the smallest changes, if possible."""
         shooting, last = self.shooting, _NEARLY
         shooting.refine(trial.q, trial.v, trial.u, _FLIES)
