@@ -64,11 +64,11 @@ class Progress:
 
 def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
     """Return `sys.path` without some folders, in whatever form its entries name them."""
-    return [entry for entry in sys.path if not any(same_folder(entry, each) for each in folders)]
+    return [entry for entry in sys.path if not any(same_file(entry, each) for each in folders)]
 
 
-def same_folder(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> bool:
-    """Return whether two paths are the same folder; an empty path is the working folder."""
+def same_file(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> bool:
+    """Return whether two paths are the same file or folder; an empty path is the working folder."""
     try:
         return os.path.samefile(first or os.curdir, second or os.curdir)
     except (OSError, ValueError):  # one of them does not exist

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def load_robot(arguments: argparse.Namespace) -> Robot:
     """Load the robot with the joints, inputs, outputs, gravity and orbit of the arguments."""
-    from fflin.robot.loading import load, with_fields
+    from fflin.robot.loading import load
 
     lock, passive = once("--lock", arguments.lock), getattr(arguments, "passive", [])
     first: dict[str, Any] = {"passive": passive} if passive else {}
@@ -49,7 +49,7 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
         from fflin.robot.outputs import parse_output
 
         fields["outputs"] = [output for text in arguments.output for output in parse_output(text)]
-    return with_fields(robot, fields)
+    return robot.merged(fields)
 
 
 def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:

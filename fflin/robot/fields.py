@@ -25,6 +25,8 @@ from fflin.robot.orbit import checked_orbit
 from fflin.robot.outputs import Output, parse_output
 
 if TYPE_CHECKING:
+    import pinocchio as pin
+
     from fflin.robot.joints import Joint
     from fflin.robot.robot import Robot
 
@@ -249,9 +251,6 @@ FIELDS: dict[str, Callable[[Any, Scope], object]] = {
     "start": partial(_state, "start"),
 }
 
-# Fields with entries by name: the entries of a call are added to the entries of a robot file.
-MERGED = ("stiffness", "damping", "rest", "limits")
-
 
 _OPEN: Range = (-math.inf, math.inf)
 
@@ -262,7 +261,8 @@ def limits_of(robot: Robot) -> dict[str, Range]:
     # the inputs replace them, and `Robot.limits` replaces both.
     found: dict[str, Range] = {}
     for joint in robot.joints:
-        found[f"q_m.{joint.name}"] = _travel(robot, joint)
+        low, high = travel_of(robot.model, joint)
+        found[f"q_m.{joint.name}"] = (low, high) if low < high else _OPEN
         found[f"qdot_m.{joint.name}"] = _either(float(robot.model.velocityLimit[joint.idx_v]))
     for item, names in named_inputs(robot.inputs):
         found |= dict(zip(names, item.ranges, strict=True))
@@ -306,12 +306,12 @@ def chosen_limits(robot: Robot, limits: Any) -> tuple[dict[str, Range], dict[str
     return cutting | given, own | given
 
 
-def _travel(robot: Robot, joint: Joint) -> Range:
+def travel_of(model: pin.Model, joint: Joint) -> Range:
+    """Return the position limits of a joint in its model, infinite without limits."""
     if joint.unbounded:
         return _OPEN
-    low = _known(float(robot.model.lowerPositionLimit[joint.idx_q]))
-    high = _known(float(robot.model.upperPositionLimit[joint.idx_q]))
-    return (low, high) if low < high else _OPEN
+    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
+    return _known(float(lower[joint.idx_q])), _known(float(upper[joint.idx_q]))
 
 
 def _either(size: float) -> Range:

@@ -237,6 +237,15 @@ class Robot(Coordinates):
             If the robot's Pinocchio model (``robot.model``) was modified after the robot was
             created.
         """
+        return self._replaced(fields, merged=False)
+
+    def merged(self, fields: Mapping[str, object]) -> Robot:
+        """Return a copy with other fields; joints and limits that are not named keep theirs."""
+        if self.passive and isinstance(given := fields.get("passive"), list | tuple):
+            fields = {**fields, "passive": [*self.passive, *given]}
+        return self._replaced({**fields}, merged=True)
+
+    def _replaced(self, fields: dict[str, object], *, merged: bool) -> Robot:
         self.require_unchanged()
         robot = self
         if "passive" in fields:
@@ -248,10 +257,11 @@ class Robot(Coordinates):
         joints, own = robot.joint_names, robot._bare.joint_names
         scope = Scope(robot.joint, joints, own, robot.inputs, self.urdf_damping)
         checked = checked_fields(fields, scope)
-        for key in ("stiffness", "damping"):
-            if key in checked:  # modes keep their values unless they are named
-                old = getattr(robot, key)
-                kept = {joint.name: old[joint.name] for joint in robot.modes if joint.name in old}
+        # Without `merged`, only modes keep their values unless they are named.
+        modes = {joint.name for joint in robot.modes}
+        for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
+            if key in checked:
+                kept = {k: x for k, x in getattr(robot, key).items() if merged or k in modes}
                 checked[key] = kept | checked[key]
         robot = replace(robot, **checked)
         if robot.orbit and any(robot.gravity):
