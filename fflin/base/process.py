@@ -40,15 +40,11 @@ class Progress:
     def __call__(self, done: int, total: int, what: str = "") -> None:
         """Update the bar: `done` of `total` steps of `what`."""
         self.done, self.total = done, total
-        if not self._shown or (now := time.monotonic()) < self._next:
-            return
-        self._next = now + _INTERVAL
-        share = done / total
-        left = (now - self._start) * (1.0 - share) / share
-        bar = "#" * round(30 * share)
-        self._drawn = True
-        said = f"\r{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left "
-        print(said, end="", file=sys.stderr, flush=True)
+        if self._shown:
+            share = done / total
+            left = (time.monotonic() - self._start) * (1.0 - share) / share
+            bar = "#" * round(30 * share)
+            self.say(f"{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left ")
 
     def say(self, text: str) -> None:
         """Show a line instead of the bar, for work of unknown length."""

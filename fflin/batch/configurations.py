@@ -284,12 +284,9 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
         except (TypeError, ValueError):
             raise InputError(f"{what} is {given!r}, expected (low, high)") from None
         low, high = number(what, low), number("its end", high)
-        if not low <= high:
-            raise InputError(f"{what} is {low:g} to {high:g}, expected low <= high")
-        if math.isinf(high - low):
-            raise InputError(
-                f"{what} is {low:g} to {high:g}, and its width overflows; give a narrower range"
-            )
+        if not 0.0 <= high - low < math.inf:
+            said = f"{what} is {low:g} to {high:g}"
+            raise InputError(f"{said}, expected low <= high with a width that does not overflow")
         return low, high
     low, high = travel_of(robot.model, joint)
     if not joint.prismatic:

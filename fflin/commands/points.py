@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FflinError, FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, located
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -41,10 +41,8 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
             fields[name] = for_all[0] if for_all else once(f"--{name}", values)
     if getattr(arguments, "inputs", None) is not None:
         inputs = _inputs(robot, arguments.inputs)
-        try:
+        with located(arguments.inputs):  # a name or an inertia that this robot does not accept
             robot = robot.replace(inputs=inputs)
-        except FflinError as error:  # a name or an inertia that this robot does not accept
-            raise type(error)(f"{arguments.inputs}: {error}") from None
     if getattr(arguments, "output", []):
         from fflin.robot.outputs import parse_output
 

@@ -17,7 +17,7 @@ from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import with_appendages, with_inputs
 from fflin.robot.equipment.mounting import difference, stored_momentum
-from fflin.robot.fields import Range, Scope, checked_fields, checked_passive
+from fflin.robot.fields import Range, checked_fields, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
 from fflin.robot.mass_properties import (
@@ -254,9 +254,7 @@ class Robot(Coordinates):
             robot = with_inputs(robot, fields.pop("inputs"))
         if "appendages" in fields:
             robot = with_appendages(robot, fields.pop("appendages"))
-        joints, own = robot.joint_names, robot._bare.joint_names
-        scope = Scope(robot.joint, joints, own, robot.inputs, self.urdf_damping)
-        checked = checked_fields(fields, scope)
+        checked = checked_fields(fields, robot)
         # Without `merged`, only modes keep their values unless they are named.
         modes = {joint.name for joint in robot.modes}
         for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
@@ -460,6 +458,11 @@ class Robot(Coordinates):
     def modes(self) -> tuple[Joint, ...]:
         """Joints of the robot that represent modes of flexible appendages or slosh."""
         return tuple(joint for joint in self.joints if joint.mode)
+
+    @property
+    def own_joints(self) -> tuple[str, ...]:
+        """Names of the independent joints except wheels and modes."""
+        return self._bare.joint_names
 
     @property
     def _bare(self) -> Robot:

@@ -208,17 +208,9 @@ def _joined(
     parts = []
     for index in range(ROOT + 1, other.njoints):
         parent, at = other.parents[index], other.jointPlacements[index]
-        on_root = parent == ROOT
+        carrier, at = (joint, placement * at) if parent == ROOT else (names[parent], at)
         moved = joint_of(other, index)._replace(name=names[index])
-        parts.append(
-            Mounted(
-                moved,
-                joint if on_root else names[parent],
-                placement * at if on_root else at,
-                other.joints[index],
-                other.inertias[index],
-            )
-        )
+        parts.append(Mounted(moved, carrier, at, other.joints[index], other.inertias[index]))
     new = with_mounted(model, bodies, parts)
     on = new.getJointId(model.names[joint])
     others = {ROOT: on} | {

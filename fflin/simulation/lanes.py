@@ -153,11 +153,8 @@ class LaneLoop:
         span = max(1, min((len(space) // self.width - 1) * every, statistics.span))
         if self._noisy:
             span = min(span, SLOTS * times.sample)
-        clock, going, messages = (
-            np.zeros(1, dtype=np.intp),
-            np.ones(count, dtype=bool),
-            [""] * count,
-        )
+        clock, messages = np.zeros(1, dtype=np.intp), [""] * count
+        going = np.ones(count, dtype=bool)
         bar = Progress(self._plan.progress)
         try:
             while clock[0] < steps and going.any():
