@@ -28,27 +28,12 @@ if TYPE_CHECKING:
 
 def add_commands(commands: parser.Commands) -> None:
     """Add the commands robots, info, init, linearize and check."""
-    summary = "list the robots that can be loaded by name"
-    parser.command(commands, "robots", _robots, summary, example="fflin robots")
-    info = parser.command(
-        commands,
-        "info",
-        _info,
-        "show the joint tree, limits and settings of a robot, and its mass, inertia, wheels and "
-        "thrusters at a configuration",
-        example="fflin info servicer_7dof",
-    )
+    parser.command(commands, _robots)
+    info = parser.command(commands, _info)
     options.add_robot(info)
     options.add_pose(info.group(parser.POINT))
     options.add_system(info)
-    init = parser.command(
-        commands,
-        "init",
-        _init,
-        "write an initial robot.toml for a URDF; the file lists all inputs, limits and "
-        "unactuated joints",
-        example="fflin init my.urdf && fflin simulate my.toml",
-    )
+    init = parser.command(commands, _init)
     urdf = "path of a URDF, or a robot name listed by `fflin robots`"
     init.add_argument("robot", metavar="URDF", type=parser.input_name, help=urdf)
     what = "the robot file (by default the URDF's name with .toml, in the current folder)"
@@ -62,11 +47,8 @@ def add_commands(commands: parser.Commands) -> None:
 def _add_linearize(commands: parser.Commands) -> None:
     linearize = parser.command(
         commands,
-        "linearize",
         _linearize,
-        "show or save the linear model A, B, C, D about an operating point",
-        example="fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat",
-        common="joint rpy position velocity effort equilibrium frame reference inputs dt tool "
+        "joint rpy position velocity effort equilibrium frame reference inputs dt tool "
         "trajectory output-file plot",
     )
     options.add_point(linearize)
@@ -90,12 +72,8 @@ def _add_linearize(commands: parser.Commands) -> None:
 def _add_check(commands: parser.Commands) -> None:
     check = parser.command(
         commands,
-        "check",
         _check,
-        "compare A and B with two independent computations; the exit code is 1 if the results "
-        "differ",
-        example="fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
-        common="joint rpy position velocity effort equilibrium frame reference inputs trajectory "
+        "joint rpy position velocity effort equilibrium frame reference inputs trajectory "
         "tolerance plot",
     )
     options.add_point(check)
@@ -109,6 +87,10 @@ def _add_check(commands: parser.Commands) -> None:
 
 
 def _robots(_: argparse.Namespace) -> Report:
+    """List the robots that can be loaded by name.
+
+    example: fflin robots
+    """
     from fflin.robot.catalog import find_robot, list_robots
     from fflin.robot.loading import load
     from fflin.robot.summary import robot_list
@@ -132,6 +114,10 @@ def _robots(_: argparse.Namespace) -> Report:
 
 
 def _info(arguments: argparse.Namespace) -> Report:
+    """Show the joints, limits, settings, mass, inertia, wheels and thrusters of a robot.
+
+    example: fflin info servicer_7dof
+    """
     import numpy as np
 
     from fflin.control.authority import point_properties, point_report
@@ -163,6 +149,10 @@ def _info(arguments: argparse.Namespace) -> Report:
 
 
 def _init(arguments: argparse.Namespace) -> Report:
+    """Write an initial robot.toml for a URDF, with all inputs, limits and unactuated joints.
+
+    example: fflin init my.urdf && fflin simulate my.toml
+    """
     from fflin.base.writing import check_output_path, write_atomically
     from fflin.robot.catalog import find_robot
     from fflin.robot.loading import load
@@ -193,6 +183,10 @@ def _init(arguments: argparse.Namespace) -> Report:
 
 
 def _linearize(arguments: argparse.Namespace) -> Report:
+    """Show or save the linear model A, B, C, D about an operating point.
+
+    example: fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat
+    """
     if arguments.tool and arguments.trajectory:
         raise InputError(
             "--for converts the model about one operating point, but --trajectory defines many; "
@@ -218,6 +212,10 @@ def _linearize(arguments: argparse.Namespace) -> Report:
 
 
 def _check(arguments: argparse.Namespace) -> Report:
+    """Compare A and B with two independent computations; the exit code is 1 if the results differ.
+
+    example: fflin check canadarm2 --rpy 20 0 0 --reference world --frame world
+    """
     if arguments.trajectory:
         return check_along(arguments)
     from fflin.linear.check import check

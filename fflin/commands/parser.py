@@ -209,25 +209,20 @@ def print_error(line: str) -> None:
 
 
 def command(
-    commands: Commands,
-    name: str,
-    run: Callable[[argparse.Namespace], Report],
-    summary: str,
-    *,
-    example: str,
-    common: str = "",
+    commands: Commands, run: Callable[[argparse.Namespace], Report], common: str = ""
 ) -> Command:
-    """Add a command and its option --json.
+    """Add the command `name` that the function `_name` runs, and its option --json.
 
-    The help of the command ends with `example`. ``--help`` lists --json and the `common` options,
-    or all options if `common` is empty.
+    The docstring of the function is the help of the command: a summary, and an example at the end.
+    ``--help`` lists --json and the `common` options, or all options if `common` is empty.
     """
+    summary, _, example = (run.__doc__ or ".").partition("\n\n")
     command = commands.add_parser(
-        name,
+        run.__name__.removeprefix("_"),
         add_help=False,
-        help=summary,
-        description=f"{summary[0].upper()}{summary[1:]}.",
-        epilog=f"example: {example}",
+        help=summary[:1].lower() + summary[1:].removesuffix("."),
+        description=summary,
+        epilog=example,
     )
     about = "show help for the common options; --help all shows help for all options"
     command.add_argument("-h", "--help", nargs="?", metavar="all", action=_Help, help=about)

@@ -31,11 +31,8 @@ def add_commands(commands: parser.Commands) -> None:
 def _add_validity(commands: parser.Commands) -> None:
     validity = parser.command(
         commands,
-        "validity",
         _validity,
-        "find how far the robot can be displaced before the linear model or its regulator fails",
-        example="fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
-        common="joint inputs weights q r bryson sample reduce attitude offset spread samples seed "
+        "joint inputs weights q r bryson sample reduce attitude offset spread samples seed "
         "jobs limits frame plot",
     )
     options.add_point(validity)
@@ -61,12 +58,9 @@ def _add_validity(commands: parser.Commands) -> None:
 def _add_funnel(commands: parser.Commands) -> None:
     funnel = parser.command(
         commands,
-        "funnel",
         _funnel,
-        "find the initial errors from which the regulator along a trajectory reaches a goal",
-        example="fflin funnel arm.toml --schedule gains.npz --goal attitude=1",
-        common="trajectory schedule goal within weights q r knots samples seed threads "
-        "dt limits limit frame inputs output-file plot",
+        "trajectory schedule goal within weights q r knots samples seed threads dt limits "
+        "limit frame inputs output-file plot",
     )
     options.add_robot(funnel)
     options.add_system(funnel)
@@ -100,6 +94,10 @@ _FREE = "not saturated; use --limits urdf to saturate them"
 
 
 def _validity(arguments: argparse.Namespace) -> Report:
+    """Find how far the robot can be displaced before the linear model or its regulator fails.
+
+    example: fflin validity ets_vii --attitude 120 --samples 200 --jobs 2
+    """
     from fflin.base.process import Progress
     from fflin.campaign.validity import validity
 
@@ -132,6 +130,10 @@ def _validity(arguments: argparse.Namespace) -> Report:
 
 
 def _funnel(arguments: argparse.Namespace) -> Report:
+    """Find the initial errors from which the regulator along a trajectory reaches a goal.
+
+    example: fflin funnel arm.toml --schedule gains.npz --goal attitude=1
+    """
     from fflin.base.process import Progress
     from fflin.campaign.funnel import funnel
 

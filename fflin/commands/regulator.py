@@ -43,12 +43,9 @@ def add_commands(commands: parser.Commands) -> None:
 def _add_lqr(commands: parser.Commands) -> None:
     lqr = parser.command(
         commands,
-        "lqr",
         _lqr,
-        "design a linear quadratic regulator; show gain, poles, residual and margins",
-        example="fflin lqr canadarm2 -o gain.npz",
-        common="joint velocity equilibrium inputs frame weights q r bryson sample reduce "
-        "wheel-speeds output-file plot",
+        "joint velocity equilibrium inputs frame weights q r bryson sample reduce wheel- "
+        "speeds output-file plot",
     )
     options.add_point(lqr)
     add_weights(lqr)
@@ -60,12 +57,8 @@ def _add_lqr(commands: parser.Commands) -> None:
 def _add_tvlqr(commands: parser.Commands) -> None:
     tvlqr = parser.command(
         commands,
-        "tvlqr",
         _tvlqr,
-        "design a time-varying linear quadratic regulator along a trajectory",
-        example="fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 "
-        "-o gains.npz",
-        common="trajectory hold strict weights q r bryson sample qf inputs frame output-file",
+        "trajectory hold strict weights q r bryson sample qf inputs frame output-file",
     )
     options.add_robot(tvlqr)
     options.add_system(tvlqr)
@@ -83,13 +76,7 @@ def _add_tvlqr(commands: parser.Commands) -> None:
 
 
 def _add_export(commands: parser.Commands) -> None:
-    export = parser.command(
-        commands,
-        "export",
-        _export,
-        "write C99 code of a gain, compensator or gain schedule, with a test program",
-        example="fflin export gain.npz --robot servicer_7dof --limits urdf -o flight",
-    )
+    export = parser.command(commands, _export)
     what = "gain, compensator or gain schedule saved by fflin: .npz, .mat or .json"
     export.add_argument("file", metavar="FILE", type=parser.input_file, help=what)
     group = export.group(parser.OUTPUT)
@@ -274,6 +261,10 @@ _ALLOCATED = (
 
 
 def _lqr(arguments: argparse.Namespace) -> Report:
+    """Design a linear quadratic regulator; show gain, poles, residual and margins.
+
+    example: fflin lqr canadarm2 -o gain.npz
+    """
     from fflin.base.record import record_of
 
     robot, design, _, gain = designed(arguments)
@@ -287,6 +278,10 @@ def _lqr(arguments: argparse.Namespace) -> Report:
 
 
 def _export(arguments: argparse.Namespace) -> Report:
+    """Write C99 code of a gain, compensator or gain schedule, with a test program.
+
+    example: fflin export gain.npz --robot servicer_7dof --limits urdf -o flight
+    """
     from fflin.base.record import read_record, reading, text
     from fflin.control.gain import Gain
     from fflin.control.gain_schedule import GainSchedule
@@ -385,6 +380,11 @@ def checked(
 
 
 def _tvlqr(arguments: argparse.Namespace) -> Report:
+    """Design a time-varying linear quadratic regulator along a trajectory.
+
+    example: fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 -o
+    gains.npz
+    """
     refuse(
         arguments,
         ("reduce",),

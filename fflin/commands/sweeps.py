@@ -27,13 +27,8 @@ def add_commands(commands: parser.Commands) -> None:
     """Add sweep."""
     sweep = parser.command(
         commands,
-        "sweep",
         _sweep,
-        "linearise about many points and save all models",
-        example="fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 "
-        "-o grid.h5",
-        common="grid random seed range joint velocity inputs output frame engine "
-        "workers output-file",
+        "grid random seed range joint velocity inputs output frame engine workers output-file",
     )
     points = sweep.group(
         "points",
@@ -109,6 +104,10 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
 
 
 def _sweep(arguments: argparse.Namespace) -> Report:
+    """Linearise about many points and save all models.
+
+    example: fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5
+    """
     import pinocchio as pin
 
     from fflin.batch.files import part_of
