@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.tables import counted, folded, signals
 from fflin.commands import options, parser
-from fflin.commands.points import (
-    attitude,
-    linear_model,
-    load_robot,
-    once,
-    placed,
-    point_of,
-)
+from fflin.commands.points import attitude, linear_model, load_robot, once, placed, point_of, refuse
 from fflin.commands.results import Report, figure_of, plain
 
 if TYPE_CHECKING:
@@ -90,12 +83,7 @@ def _add_sensitivity(commands: parser.Commands) -> None:
 
 def _add_uncertain(commands: parser.Commands) -> None:
     uncertain = parser.command(commands, _uncertain)
-    point = uncertain.group(parser.POINT)
-    neutral = (
-        "position of a joint [rad|m]. The default is the position in robot.toml or, if there is "
-        "none, the neutral position"
-    )
-    point.add("--joint", neutral, parser.assignment, repeatable=True)
+    options.add_joint(uncertain.group(parser.POINT))
     options.add_robot(uncertain)
     options.add_system(uncertain)
     uncertain.group("parameters").add(
@@ -195,11 +183,7 @@ def _equilibrium(arguments: argparse.Namespace) -> Report:
     from fflin.linear.linearization import linearize
     from fflin.robot.fields import limits_of
 
-    if arguments.effort:
-        raise InputError(
-            "--effort sets inputs at the operating point, but this command computes the inputs; "
-            "remove --effort"
-        )
+    refuse(arguments, ("effort",), "this command computes the inputs at the operating point")
     robot, q, v, reference = point_of(arguments)
     if arguments.relative_equilibrium:
         q, reference = attitude(robot, q, arguments.relative_equilibrium, arguments.frame)

@@ -15,9 +15,9 @@ from fflin.base.errors import FflinError, FflinWarning, FileError, InputError
 from fflin.base.names import runs
 from fflin.base.tables import cut, grid, matrix, signals, width
 from fflin.base.writing import check_ending
-from fflin.commands import options, parser
-from fflin.commands.points import configuration_of, linear_model, load_robot, velocity_of
-from fflin.commands.regulator import add_trajectory, check_along, checked, linearize_along
+from fflin.commands import DONE, FELL_SHORT, options, parser
+from fflin.commands.points import configuration_of, linear_model, load_robot, refuse, velocity_of
+from fflin.commands.regulator import add_trajectory, models_along
 from fflin.commands.results import Report, figure_of
 
 if TYPE_CHECKING:
@@ -197,7 +197,11 @@ def _linearize(arguments: argparse.Namespace) -> Report:
     if arguments.output_file and (arguments.tool or arguments.trajectory):
         check_ending(arguments.output_file, parser.RECORD.endings)
     if arguments.trajectory:
-        return linearize_along(arguments)
+        refuse(arguments, ("plot",), "with --trajectory, the result is many models")
+        along = models_along(arguments)
+        if arguments.dt is not None:
+            along = along.discretize(arguments.dt)
+        return Report(along.robot.name, along, str(along), {arguments.output_file: along.save})
     _, lin = linear_model(arguments)
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
@@ -216,13 +220,19 @@ def _check(arguments: argparse.Namespace) -> Report:
 
     example: fflin check canadarm2 --rpy 20 0 0 --reference world --frame world
     """
-    if arguments.trajectory:
-        return check_along(arguments)
-    from fflin.linear.check import check
+    from fflin.linear.check import check, held_to
 
-    robot, lin = linear_model(arguments)
-    found = check(robot, lin, tolerance=arguments.tolerance)
-    return checked(robot, found, str(found), {arguments.plot: figure_of("plot_check", found)})
+    if arguments.trajectory:
+        along = models_along(arguments)
+        robot, found = along.robot, held_to(arguments.tolerance, along.check())
+        text = f"{found}\n\n{along}"
+    else:
+        robot, lin = linear_model(arguments)
+        found = check(robot, lin, tolerance=arguments.tolerance)
+        text = str(found)
+    result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
+    files = {arguments.plot: figure_of("plot_check", found)}
+    return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)
 
 
 # Rates [SI] below this value count as zero.

@@ -6,7 +6,6 @@ import argparse
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import (
@@ -17,17 +16,14 @@ from fflin.base.errors import (
     UnknownNameError,
 )
 from fflin.base.tables import folded
-from fflin.commands import DONE, FELL_SHORT, options, parser
+from fflin.commands import options, parser
 from fflin.commands.points import linear_model, load_robot, once, refuse
 from fflin.commands.results import Report, figure_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
     from fflin.control.gain import Gain
     from fflin.control.gain_schedule import GainSchedule
     from fflin.control.kalman import Compensator
-    from fflin.linear.check import Check
     from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
@@ -44,8 +40,8 @@ def _add_lqr(commands: parser.Commands) -> None:
     lqr = parser.command(
         commands,
         _lqr,
-        "joint velocity equilibrium inputs frame weights q r bryson sample reduce wheel- "
-        "speeds output-file plot",
+        "joint velocity equilibrium inputs frame weights q r bryson sample reduce "
+        "wheel-speeds output-file plot",
     )
     options.add_point(lqr)
     add_weights(lqr)
@@ -89,11 +85,7 @@ def _add_export(commands: parser.Commands) -> None:
         metavar="ROBOT",
         type=parser.input_name,
     )
-    limits = (
-        "saturate the inputs at the limits of the robot as `fflin simulate` does (urdf), or do "
-        "not saturate them (none, default)"
-    )
-    group.add("--limits", limits, choices=("urdf", "none"), default="none")
+    options.add_saturation(group)
     group.add("--name", "prefix of all names in the C code", metavar="NAME", default="controller")
     real = "floating-point type in the C code; double by default"
     group.add("--real", real, choices=("double", "float"), default="double")
@@ -339,44 +331,11 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
     from fflin.linear.trajectory import Trajectory
 
     point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
-    refuse(
-        arguments,
-        point,
-        "with --trajectory, the models are about the points of the trajectory, not about an "
-        "operating point",
-    )
+    refuse(arguments, point, "with --trajectory, the models are about the points of the trajectory")
     robot = robot or load_robot(arguments)
     settings = {"hold": arguments.hold, "frame": arguments.frame}
     motion = Trajectory.load(arguments.trajectory, robot, **settings)
     return linearize_trajectory(robot, motion, strict=arguments.strict)
-
-
-def linearize_along(arguments: argparse.Namespace) -> Report:
-    """Show or save the linear models along a trajectory."""
-    along = models_along(arguments)
-    if arguments.dt is not None:
-        along = along.discretize(arguments.dt)
-    return Report(along.robot.name, along, str(along), {arguments.output_file: along.save})
-
-
-def check_along(arguments: argparse.Namespace) -> Report:
-    """Check the linear models along a trajectory."""
-    from fflin.linear.check import held_to
-
-    along = models_along(arguments)
-    found = held_to(arguments.tolerance, along.check())
-    return checked(along.robot, found, f"{found}\n\n{along}")
-
-
-def checked(
-    robot: Robot,
-    found: Check,
-    text: str,
-    files: Mapping[Path | None, Callable[[Path], object] | None] = MappingProxyType({}),
-) -> Report:
-    """Return the report of a check, with the exit code."""
-    result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
-    return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)
 
 
 def _tvlqr(arguments: argparse.Namespace) -> Report:
@@ -385,12 +344,8 @@ def _tvlqr(arguments: argparse.Namespace) -> Report:
     example: fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 -o
     gains.npz
     """
-    refuse(
-        arguments,
-        ("reduce",),
-        "a regulator along a trajectory needs no reduced model, because its finite-horizon cost "
-        "always exists",
-    )
+    why = "along a trajectory no reduced model is needed, because the finite-horizon cost exists"
+    refuse(arguments, ("reduce",), why)
     along = models_along(arguments)
     schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
     return Report(along.robot.name, schedule, str(schedule), {arguments.output_file: schedule.save})
