@@ -22,14 +22,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.view.page import (
-    Recorder,
-    build_page,
-    corner_points,
-    rounded,
-    stage_info,
-    subtitle,
-)
+from fflin.view.page import Recorder, build_page, corner_points, rounded, stage_info, subtitle
 from fflin.view.playback import body_poses
 from fflin.view.scene import Drawing, Visualizer, body_paths
 
@@ -174,14 +167,11 @@ def _joints(robot: Robot) -> list[dict[str, Any]]:
     for joint in robot.joints:
         if joint.name in robot.wheels:
             continue
-        low, high = -np.pi, np.pi
+        high = 1.0 if joint.prismatic else np.pi
+        low = -high
         if not joint.unbounded:
-            low = max(
-                float(model.lowerPositionLimit[joint.idx_q]), -1.0 if joint.prismatic else -np.pi
-            )
-            high = min(
-                float(model.upperPositionLimit[joint.idx_q]), 1.0 if joint.prismatic else np.pi
-            )
+            low = max(float(model.lowerPositionLimit[joint.idx_q]), low)
+            high = min(float(model.upperPositionLimit[joint.idx_q]), high)
             if not low < high:
                 low, high = low - 1.0, low + 1.0
         found.append({"name": joint.name, "low": low, "high": high, "length": joint.prismatic})

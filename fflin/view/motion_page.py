@@ -24,14 +24,8 @@ from fflin.view.page import (
     thrusters,
 )
 from fflin.view.panel import panel
-from fflin.view.playback import (
-    Playback,
-    body_poses,
-    frame_indices,
-    payloads,
-    play_back,
-)
-from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
+from fflin.view.playback import Playback, body_poses, frame_indices, payloads, play_back
+from fflin.view.scene import Drawing, Visualizer, animation, body_paths
 
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
@@ -61,7 +55,8 @@ def motion_page(
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and notes about missing drawings; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
-    t, state = motion.t[shown], chart_of(robot, motion)
+    frame = cast("Frame", motion.frame)
+    t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(robot, state, t, motion.q[shown], motion.u[shown], tool)
     goal = _target(motion, state, shown) if target is None else target[None]
     data = robot.model.createData()
@@ -84,7 +79,7 @@ def motion_page(
     for each, poses in moving:
         each.place(poses[0])
         clips += each.tracks(t - t[0], poses)
-    window.send(Animation(clips))
+    window.record(animation(clips))
 
     # Robots of the phases, if known. After a capture, the robot includes the payload.
     flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
@@ -98,7 +93,7 @@ def motion_page(
         scene=scene,
         subtitle=about[0],
         tool=tool,
-        frame=motion.frame,
+        frame=frame,
         held=[each for each, _ in held.values()],
     )
     size = info["size"]
@@ -153,18 +148,9 @@ def _points(film: Playback, size: float, goal: Moving, held: Iterable[Moving]) -
     """Return corners (M, 3) of the robot, its target and its payloads at some frames."""
     points = [frame_points(goal[0], film, size)]
     for drawing, rows in (goal, *held):
-        points += [corner_points(drawing, poses) for poses in rows[:: _step(rows)]]
+        step = max(1, len(rows) // 24)
+        points += [corner_points(drawing, poses) for poses in rows[::step]]
     return np.concatenate(points)
-
-
-def _step(rows: Array) -> int:
-    """Return the step between rows that selects about 24 of them."""
-    return max(1, len(rows) // 24)
-
-
-def chart_of(robot: Robot, motion: Motion) -> StateMap:
-    """Return the state map with a motion's frame and reference."""
-    return StateMap(robot, reference=motion.reference, frame=cast("Frame", motion.frame))
 
 
 def _target(motion: Motion, state: StateMap, shown: Array) -> Array:

@@ -107,8 +107,11 @@ class Recorder:
         self._animation: Lowered | None = None
 
     def send(self, command: Any) -> None:
-        """Record and forward a meshcat command."""
-        lowered = command.lower()
+        """Record and forward a command of meshcat."""
+        self.record(command.lower())
+
+    def record(self, lowered: Lowered) -> None:
+        """Record and forward a command in the form that is sent."""
         kind, path = lowered["type"], lowered.get("path", "")
         # The browser ignores empty parts of a path.
         path = "/" + "/".join(part for part in path.split("/") if part)
@@ -122,27 +125,22 @@ class Recorder:
             key = f"{kind} {lowered.get('property', '')}"
             self._nodes.setdefault(path, {})[key] = lowered
         if self._forward:
-            self._forward(_message(lowered))
+            self._forward(umsgpack.packb(lowered))
 
     def commands(self) -> Iterator[bytes]:
         """Yield the messages with which meshcat's page builds the recorded scene."""
         for node in list(self._nodes.values()):
             # An object replaces the previous object, so it comes before its properties.
             for key in sorted(node, key=lambda key: key != "set_object "):
-                yield _message(node[key])
+                yield umsgpack.packb(node[key])
         if self._animation:
-            yield _message(self._animation)
+            yield umsgpack.packb(self._animation)
 
     def wait(self) -> None:
         """Do nothing, because no browser has to connect."""
 
     def close(self) -> None:
         """Do nothing, because nothing is open."""
-
-
-def _message(lowered: Lowered) -> bytes:
-    packed: bytes = umsgpack.packb(lowered)
-    return packed
 
 
 def subtitle(robot: Robot) -> str:

@@ -95,7 +95,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         frame = robot.model.frames[frame_id]
         if frame.parentJoint < ROOT:
             continue
-        joint, at = node_of(frame, bent)
+        joint, at = _node_of(frame, bent)
         for visual in link.find_all("visual"):
             try:
                 kind, size, mesh = _geometry(visual)
@@ -104,22 +104,18 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
             except (ValueError, LookupError):
                 odd.append(str(visual.line))
                 continue
-            file = None
-            if mesh is not None:
-                file = find_mesh(mesh, path, robot.package_dirs)
-                if file is None:
-                    missing.append(shown(mesh))
-                    continue
+            file = None if mesh is None else find_mesh(mesh, path, robot.package_dirs)
+            if mesh is not None and file is None:
+                missing.append(shown(mesh))
+                continue
+            if file is not None:
                 try:
                     load_mesh(file)
                 except ValueError:
                     unreadable.append(file.name)
                     continue
             yield Shape(joint, kind, size, placement, color, finish, file, frame.name)
-    yield from (
-        Shape(joint, kind, size, pin.SE3(np.eye(3), position))
-        for joint, kind, size, position in balls(robot, bent)
-    )
+    yield from _balls(robot, bent)
     if missing:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
         notes.append(
@@ -194,7 +190,7 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
         squares = 6.0 / inertia.mass * (moments.sum() - 2.0 * moments)
         sides = np.sqrt(np.maximum(squares, 0.0))
         sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
-        size = (float(sides[0]), float(sides[1]), float(sides[2]))
+        size = tuple(sides.tolist())
         placement = pin.SE3(axes, inertia.lever)
         link = "base" if joint == ROOT else robot.model.names[joint]
         yield Shape(joint, "box", size, placement, finish="inertia", link=link)
@@ -263,31 +259,27 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
     return found
 
 
-def node_of(frame: pin.Frame, bent: dict[str, Bending]) -> tuple[int, pin.SE3]:
+def _node_of(frame: pin.Frame, bent: dict[str, Bending]) -> tuple[int, pin.SE3]:
     """Return the Pinocchio joint whose node carries a link's frame, and the frame on this node."""
     if bending := bent.get(frame.name):
         return bending.node, bending.frame.actInv(frame.placement)
     return frame.parentJoint, frame.placement
 
 
-def balls(
-    robot: Robot, bent: dict[str, Bending]
-) -> list[tuple[int, str, tuple[float, ...], Array]]:
-    """Return joint, kind, size [m] and position of shapes that represent undrawn appendages."""
-    found: list[tuple[int, str, tuple[float, ...], Array]] = []
+def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
+    """Yield the shapes that represent undrawn appendages."""
     for item in robot.appendages:
         if isinstance(item, Slosh):
             joint = robot.model.getJointId(item.modes[1])
             lever = robot.model.inertias[joint].lever
-            found.append((joint, "sphere", (_radius(item.mass),), lever))
+            yield Shape(joint, "sphere", (_radius(item.mass),), pin.SE3(np.eye(3), lever))
         elif item.frame not in bent:
             bending = bendings(robot)[item.title]
             mass = float(np.square(item.participation[:3, 0]).sum())
             size = _radius(mass or 1.0)
             # Without mass, a box is drawn, because its rotation is visible.
             kind, sides = ("sphere", (size,)) if mass else ("box", (size,) * 3)
-            found.append((bending.node, kind, sides, bending.center))
-    return found
+            yield Shape(bending.node, kind, sides, pin.SE3(np.eye(3), bending.center))
 
 
 def _radius(mass: float) -> float:
