@@ -25,13 +25,8 @@ TASKS = {
         **{"uncertain": "analysis", "validity": "regions", "funnel": "regions"},
     },
     "design and simulate": {
-        **{
-            "lqr": "regulator",
-            "tvlqr": "regulator",
-            "plan": "simulation",
-            "simulate": "simulation",
-        },
-        "export": "regulator",
+        **{"lqr": "regulator", "tvlqr": "regulator", "plan": "simulation"},
+        **{"simulate": "simulation", "export": "regulator"},
     },
     "many models or simulations": {"sweep": "sweeps", "montecarlo": "simulation"},
 }

@@ -197,7 +197,7 @@ def _linearize(arguments: argparse.Namespace) -> Report:
     if arguments.output_file and (arguments.tool or arguments.trajectory):
         check_ending(arguments.output_file, parser.RECORD.endings)
     if arguments.trajectory:
-        refuse(arguments, ("plot",), "with --trajectory, the result is many models")
+        refuse(arguments, ("plot",), "with --trajectory, there is no single model to plot")
         along = models_along(arguments)
         if arguments.dt is not None:
             along = along.discretize(arguments.dt)
