@@ -54,7 +54,7 @@ def unknown_frame(frame: object) -> InputError:
 
 
 def frame_of(robot: Robot, frame: object) -> Frame:
-    """Return the requested or default frame; raise `InputError` if it does not fit the orbit."""
+    """Return the given or default frame; raise `InputError` if it contradicts the orbit."""
     if frame is None:
         return ORBITAL[0] if robot.orbit else "hybrid"
     if not isinstance(frame, str) or frame not in get_args(Frame):
@@ -295,9 +295,9 @@ def readout(
 def state_history(
     state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
 ) -> Array:
-    """Return the states (N, nx) of a motion, with angles unwrapped from `near` (nx,) on."""
-    # If the times t (N,) are given, the joint rates decide the number of turns between rows.
-    # Otherwise the step between rows is taken as less than half a turn.
+    """Return the states (N, nx) of a motion, with angles unwrapped, starting near `near` (nx,)."""
+    # If the times t (N,) are given, the joint rates determine how many turns lie between two rows.
+    # Otherwise, an angle is assumed to change by less than half a turn between rows.
     rates = state.velocities(v)
     x = states_of(state, q, rates)
     q_m = x[:, state.groups.q_m]
@@ -355,13 +355,13 @@ def moved_by(frame: str, target: Array, e: Array) -> Array:
 
 
 def _turned(x: Array) -> tuple[Array, Array]:
-    """Return the nonnegative scalar part (N, 1) and the rotation (N, 3, 3) of states' attitudes."""
+    """Return the nonnegative quaternion scalar (N, 1) and the rotation (N, 3, 3) of each state."""
     scalar = np.sqrt(1.0 - (x[:, :3] ** 2).sum(axis=1, keepdims=True))
     return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
 
 
 def _in_reference(frame: str, nx: int) -> list[Indices]:
-    """Return the indices of the base velocities that are in reference axes."""
+    """Return the indices of the base velocities that the frame expresses in reference axes."""
     velocities = np.arange(nx)[nx // 2 :]
     return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
 

@@ -33,7 +33,7 @@ class Sensed(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Robot with its base at the origin and without linear velocity, and the removed motion."""
+    """Robot with its base at the origin and no linear velocity, and the removed base motion."""
 
     model: pin.Model
     data: pin.Data
@@ -99,8 +99,8 @@ def _center(world: World) -> Array:
 
 
 def _momentum_derivatives(at: Point, to: Sensed) -> None:
-    # The function also differentiates the rate of momentum, which is not used here. So any value
-    # may stand for the acceleration.
+    # Pinocchio also differentiates the rate of momentum, which needs an acceleration. This
+    # derivative is not used here, so v is given in place of the acceleration.
     by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
     mass, h = pin.computeTotalMass(at.model), at.data.hg
     to.y[:3] = at.R.dot(h.angular)

@@ -17,15 +17,15 @@ from fflin.robot.mass_properties import coordinate_names
 
 # The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate, and grows
 # as the inertia of i alone vanishes. Coupling times machine epsilon is the relative error of
-# (M^-1)_ii. If the sum of all couplings exceeds _WARNING_COUPLING, M^-1 has fewer than nine correct
-# digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a sum below the
-# number of coordinates shows that pivots are round-off.
+# (M^-1)_ii. If the sum of all couplings exceeds _WARNING_COUPLING, M^-1 has fewer than nine
+# correct digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a
+# smaller sum than the number of coordinates shows that some pivots are only rounding errors.
 _EPS = float(np.finfo(float).eps)
 _WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
-# Pinocchio's articulated-body inverse sums inertias about the base's origin. The couplings with
-# M_ii replaced by `inertia_bounds` bound its rounding errors. If their sum exceeds this limit, a
-# Cholesky factor of M is used instead.
+# Pinocchio's articulated-body inverse sums inertias about the base's origin. With `inertia_bounds`
+# in place of M_ii, the couplings bound the rounding errors of this inverse. If their sum exceeds
+# this limit, a Cholesky factor of M is used instead.
 _QUICK_COUPLING = 1e-11 / _EPS
 
 STROKE = 1.0  # [m] largest displacement of a prismatic joint for which `inertia_bounds` holds
@@ -34,7 +34,8 @@ STROKE = 1.0  # [m] largest displacement of a prismatic joint for which `inertia
 _DENSE_SIZE = 64
 
 
-# Bound once, because looking up a name in a module takes as long as factorising a small matrix.
+# Looked up once, because looking up a name in a module takes as long as factorising a small
+# matrix.
 _crba, _decompose, _invert_factor, _compute_inverse = (
     pin.crba,
     pin.cholesky.decompose,
@@ -76,9 +77,9 @@ class Inertia:
     def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
         still = self.centred(q)
-        # Articulated bodies are used only if `quick`: their small rounding errors would appear in
-        # entries of M^-1 K that are exactly zero. The rounding of a Cholesky factor does not
-        # depend on the scaling of M.
+        # The articulated-body inverse is used only if `quick`, because its rounding errors would
+        # appear in entries of M^-1 K that should be exactly zero. The relative rounding errors of
+        # a Cholesky factor do not depend on the scaling of M.
         bounds = self._bounds if quick else None
         if bounds is not None and (
             not self._slides or np.abs(still.take(self._slides)).max() <= STROKE
@@ -197,8 +198,8 @@ class Gyroscopic(NamedTuple):
 
     wrenches: pin.StdVec_Force  # on every joint, in its frame
     force: Array  # generalised force (nv,) of the gyroscopic torques
-    # Derivatives (nv, nv) of `force`. `by_q` holds the Jacobian constant, because RNEA's
-    # derivatives with `wrenches` include its change.
+    # Derivatives (nv, nv) of `force`. In `by_q` the Jacobian is constant, because RNEA's
+    # derivatives with `wrenches` already include the change of the Jacobian.
     by_q: Array
     by_v: Array
 

@@ -114,7 +114,7 @@ class StateMap:
         joints = robot.joints
         # Index in Pinocchio's v of each velocity of the state.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
-        # The inverse map. Entries of mimic joints are written afterwards (`spread`).
+        # The inverse map. `spread` writes the entries of mimic joints afterwards.
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order

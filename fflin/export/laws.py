@@ -96,7 +96,7 @@ class StateLaw(Law):
     def _case(self, random: np.random.Generator, row: int, index: int) -> Case:
         state, n, about = self.state, self.state.robot.n, self.placements[row]
         world = StateMap(state.robot, frame=self.frame)
-        # A displaced state with the base at the reference; its pose is set afterwards.
+        # A random state near x0 with the base at the reference; the base's pose is set afterwards.
         x = self.x0[row] + random.normal(scale=10.0 ** random.uniform(-4, 0), size=state.nx)
         x[:6] = 0.0
         turns = np.zeros(n)
