@@ -290,7 +290,7 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
 
 
 def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
-    """Return the largest K d over base displacements in any direction and joint ones of any sign."""
+    """Return the largest K d over all directions of base displacements and joint signs."""
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
     scaled = K[..., : len(size)] * size
     total: Array = np.abs(scaled[..., ~np.isin(groups, ("q_b", "r_b"))]).sum(axis=-1)
