@@ -187,7 +187,7 @@ def controllability(lin: LinearModel) -> Controllability:
         names = tuple(combination(row, states, 1.0 / size[z]) for row in rows)
     others: Array = np.zeros((len(rows), len(lin.A)))
     others[:, z] = rows
-    # Prefer coordinates on which an input acts directly when the controllable states are named.
+    # When the controllable states are named, prefer coordinates on which an input acts directly.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
     basis, pivots = echelon(conserved.T @ part.controllable, size, np.tile(driven, 2))
     zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)

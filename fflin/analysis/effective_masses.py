@@ -18,8 +18,8 @@ from fflin.linear.model import LinearModel
 # Modes have the same frequency if their frequencies differ by less than this fraction.
 _EQUAL = 1e-9
 
-# Effective masses below this fraction of the total are rounding error. For singular values, the
-# limit is the square root of this fraction.
+# Effective masses below this fraction of the total are rounding error. An effective mass is the
+# square of a singular value, so the limit of singular values is the square root of this fraction.
 _ROUNDING = 1e-14
 
 
@@ -187,13 +187,14 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
 
 
 def _separated(frequencies: Array, L: Array) -> Array:
-    """Combine modes of equal frequency so that the first has the most mass; return L (6, k)."""
+    """Return L (6, k); modes of equal frequency are combined so that the first has most mass."""
     L, first = L.copy(), 0
     while first < len(frequencies):
         near = frequencies <= (1.0 + _EQUAL) * frequencies[first]
         last = int(np.count_nonzero(near))
         group = L[:, first:last]
-        # Modes are combined by their mass, and then modes without mass by their moment of inertia.
+        # Modes are first combined by their mass. Modes without mass are then combined by their
+        # moment of inertia.
         for rows in (slice(0, 3), slice(3, 6)):
             _, sizes, turned = np.linalg.svd(group[rows])
             group[:] = group @ turned.T

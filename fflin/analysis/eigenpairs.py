@@ -105,13 +105,13 @@ def nonzero_eigenpairs(
             pairs.append((complex(value), pairs[-1][1].conj(), error))
             continue
         for step in reversed(steps):
-            # Because A V_0 = 0, the eigenvector in the larger space is A V_1 x, up to a factor.
+            # An eigenvector x of V_1^T A V_1 gives the eigenvector A V_1 x of A, up to a factor.
             x = step @ x  # noqa: PLW2901 - the same vector in a larger space
         x /= np.linalg.norm(x)  # noqa: PLW2901
         # Slow modes lose accuracy in these steps; one inverse iteration restores it.
         if np.linalg.norm(whole @ x - value * x) > 1e2 * EPS * abs(value):
             near = whole - (value + EPS * size) * np.eye(n)
-            with suppress(np.linalg.LinAlgError):  # the shift is an eigenvalue exactly
+            with suppress(np.linalg.LinAlgError):  # singular if the shift is an eigenvalue
                 x = np.linalg.solve(near, x)  # noqa: PLW2901
         pairs.append((complex(value), x / np.linalg.norm(x), error))
     return pairs, nullity

@@ -51,7 +51,7 @@ _ALIASED = 1e-6
 # moves such a pair by the square root of the rounding error.
 _DECAY = 1e-7
 
-# A motion has died out if one sample reduces it below this fraction; the rest is rounding error.
+# If one sample reduces a motion below this fraction, only its rounding error remains.
 _DEAD = 1e4 * EPS
 
 
@@ -316,7 +316,7 @@ def _simple(system: SecondOrder, shapes: Values, pole: complex) -> bool:
 
 
 def _aliased(poles: Values, dt: float) -> bool:
-    """Return whether sampling maps two poles to one, or a vibration to z = 1."""
+    """Return whether sampling maps two poles to one, or a vibration to the pole z = 1."""
     s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
     apart = s[:, None] - s
     turns = np.round(apart.imag / (2.0 * np.pi))

@@ -25,7 +25,7 @@ from fflin.linear.model import LinearModel
 if TYPE_CHECKING:
     pass
 
-# Springs or dampers with a larger relative asymmetry count as not symmetric.
+# Springs or dampers count as not symmetric if their relative asymmetry exceeds this.
 _SYMMETRIC = 1e-8
 
 # If the relative residual of a momentum exceeds this, no coordinate has the momentum as its rate,
@@ -124,7 +124,7 @@ class SecondOrder:
 
     @cached_property
     def poles(self) -> tuple[Values, Margin]:
-        """Approximate nonzero poles, one of each conjugate pair, and the margin of their rank."""
+        """Approximate nonzero poles, one of each conjugate pair, and the margin of the ranks."""
         rigid, margin = self._null(self.K, self.D)
         unloaded, other = self._null(self.K)
         R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
@@ -230,7 +230,7 @@ class ConservedMomenta:
 
 def conserved(lin: LinearModel) -> ConservedMomenta:
     """Find the conserved momenta (9.2): :math:`W M [A_{21}, A_{22}, B_2] = 0`."""
-    lin = lin.generator or lin  # conserves the same momenta
+    lin = lin.generator or lin  # the continuous model conserves the same momenta
     nv, X, system = len(lin.M), rate_matrix(lin), second_order(lin)
     size = system.size
     pushes = stacked([[system.K.T], [system.D.T], [system.S.T]])

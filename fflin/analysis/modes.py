@@ -312,7 +312,8 @@ def modes(lin: LinearModel) -> Modes:
     shapes = []
     for pair in pairs:
         positions = np.abs(pair.shape[:nv])
-        # If several coordinates move equally, such as symmetric panels, the first is scaled to 1.
+        # A shape is scaled by its largest coordinate. If several coordinates are equal, such as
+        # those of symmetric panels, the shape is scaled by the first one.
         largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
         shapes.append(np.asarray(pair.shape / pair.shape[largest], dtype=complex))
     energies = energy_by_body(lin._robot, lin, shapes)

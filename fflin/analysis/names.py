@@ -96,7 +96,7 @@ def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
 
 
 def shape(lin: LinearModel, at: Values) -> str:
-    """Describe rates `at` (nv,), real or complex, by the coordinates that move most."""
+    """Describe a motion with rates `at` (nv,), real or complex, by its largest coordinates."""
     size = np.sqrt(lin.M.diagonal())
     largest = at[int(np.abs(at * size).argmax())]
     of_base = {"omega_b": "rotation about ", "v_b": "translation along "}

@@ -95,7 +95,7 @@ class FixedPoles(NamedTuple):
     settling: Margin = Margin()  # certainty that the slowest pole decays
 
     def transformed(self, change: Array) -> FixedPoles:
-        """Return the poles with the directions of their margins in other coordinates."""
+        """Return the poles, with the directions of the margins in transformed coordinates."""
         margin, settling = self.margin.transformed(change), self.settling.transformed(change)
         return self._replace(margin=margin, settling=settling)
 

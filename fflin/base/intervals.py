@@ -31,7 +31,7 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
 
 
 def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
-    """Return success statistics of runs (N,), sorted by the distance of their start.
+    """Return success statistics of runs (N,), which are sorted by the distance of their start.
 
     The statistics are the number of runs before the first failure, a lower bound on the success
     rate of these starts, and a confidence interval for the success rate of all runs.

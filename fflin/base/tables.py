@@ -81,7 +81,7 @@ def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
 
 
 def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
-    """Format a matrix with its names; "~0" is rounding error, and lines of zeros are left out."""
+    """Format a matrix with names; "~0" is rounding error, zero rows and columns are left out."""
     text = [
         [_number(x, below) for x, below in zip(row, limits, strict=True)]
         for row, limits in zip(values.tolist(), rounding(values).tolist(), strict=True)

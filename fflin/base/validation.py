@@ -134,7 +134,7 @@ def by_name(name: str, value: object, of_what: str) -> Mapping[str, object]:
 
 
 def untied(key: str, value: object) -> tuple[object, bool]:
-    """Return a range, and whether all names that its key matches get the same random value."""
+    """Return a range, and whether all names that match its key share one random value."""
     if not isinstance(value, Mapping):
         return value, False
     if value.keys() != {"range", "tied"}:
@@ -143,7 +143,7 @@ def untied(key: str, value: object) -> tuple[object, bool]:
 
 
 def numbers(name: str, value: object, of_what: str, each: str) -> dict[str, float]:
-    """Return {name: finite float} from a mapping; a message calls an entry `each`."""
+    """Return {name: finite float} from a mapping; messages call an entry `each`."""
     values = by_name(name, value, of_what)
     return {key: number(f"{each} '{key}'", entry) for key, entry in values.items()}
 

@@ -37,7 +37,7 @@ class Points(NamedTuple):
 
 
 def column(joint: Joint) -> Column:
-    """Return the indices and the scale of a joint in q."""
+    """Return the `Column` of a joint: its indices in q and its factor."""
     return joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1, joint.scale
 
 

@@ -1,7 +1,7 @@
-"""Application of a job to rows, chunk by chunk, into a store that may already contain chunks.
+"""Run a job on rows, chunk by chunk, into a store that may already contain chunks.
 
-Chunks run on threads of this process, or on the workers of an executor. The meaning of the rows and
-results is left to the job.
+Chunks run on threads of this process, or on the workers of an executor. The job defines the meaning
+of the rows and the results.
 """
 
 from __future__ import annotations

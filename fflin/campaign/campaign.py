@@ -44,7 +44,7 @@ _FACTORS = {  # from the unit of a condition to the unit of a figure
 
 
 class Bound(NamedTuple):
-    """Comparison in a condition, and the mask (N,) of runs that meet the condition."""
+    """Comparison in a condition, and the mask (N,) of runs that meet the comparison."""
 
     name: str
     sign: str

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from fflin.robot.equipment.appendages import Appendage
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
-_OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
+_OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # {property: axes}
 _AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
 _OF_SENSORS = ("sensor", "noise")
@@ -129,7 +129,7 @@ class Dispersions:
         self._refuse_same_mass()
 
     def _refuse_same_mass(self) -> None:
-        """Raise an error if the mass of a link is dispersed twice, also as part of a body."""
+        """Raise an error if a link's mass is dispersed twice, directly or as part of a body."""
         pieces = [*self._plant.robot.pieces.values()]
         masses = [*self._changed("mass"), *self._changed("density")]
         for (column, at), (other, of) in combinations(masses, 2):
@@ -185,7 +185,7 @@ class Dispersions:
         """Return {link or body: spread}, and {link or body: key} for keys without a wildcard."""
         robot, found, named = self._plant.robot, dict[str, object](), dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
-        for key in sorted(spreads, key=lambda key: key in alone):  # names go before patterns
+        for key in sorted(spreads, key=lambda key: key in alone):  # names override patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
                 if name in named:
                     raise InputError(
@@ -220,7 +220,7 @@ class Dispersions:
     def _uniform(self, column: Column, block: int) -> Array:
         key = (self._seed, zlib.crc32(column.name.encode()))
         stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
-        # The inverse may be infinite at 0 and 1.
+        # The inverse may be infinite at 0 and 1, so the values are kept between them.
         return np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
 
     def _drawn(self, column: Column, block: int, count: int) -> Array:

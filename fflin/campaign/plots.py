@@ -124,8 +124,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
         left, right = figure.subplots(1, 2)
         measured = np.isfinite(validity.prediction_error)
         levels, errors = (each[measured] for each in (validity.levels, validity.prediction_error))
-        # The figure shows the error relative to the displacement, so its order is one less than
-        # the order of the error.
+        # The figure shows the error relative to the displacement. Its order is therefore one less
+        # than the order of the absolute error.
         order = "relative error"
         if np.isfinite(validity.slope):
             order += f", ~ displacement^{validity.slope - 1.0:.2f}"

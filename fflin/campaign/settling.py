@@ -124,7 +124,7 @@ class Loop:
 def settling_runs(
     loop: Loop, predicts: bool, limits: object, joint: float, fine: int = 0
 ) -> CampaignJob:
-    """Return runs of a loop from displaced states that end when they settle, or at a horizon.
+    """Return runs of a loop from displaced states; a run ends if it settles, or at a horizon.
 
     With `predicts`, runs last three time constants and are compared with the linear loop. `joint`
     is the largest displacement of a joint. `fine` is the number of times that the steps have been

@@ -16,7 +16,7 @@ from fflin.base.toml_file import TomlFile, is_number
 from fflin.base.validation import Array, number
 from fflin.base.writing import as_path
 
-SEED = "noise"  # name of the drawn seed of a run's noise, which explains no result
+SEED = "noise"  # name of the seed of noise among the drawn values; a seed has no correlation
 
 _TABLE = "dispersions"
 _FORMS = ("normal", "uniform", "values", "distribution")

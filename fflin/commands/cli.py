@@ -40,7 +40,7 @@ _MODULES = {name: module for names in TASKS.values() for name, module in names.i
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return 0 if done, 1 if a check failed, 2 for invalid input."""
-    reported: set[str] = set()  # each warning once per command
+    reported: set[str] = set()  # each warning is shown only once
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
         if (text := str(message)) not in reported:
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if sys.stdout is not None:
             sys.stdout.flush()
         return code
-    except (FflinError, FflinWarning) as error:  # a warning if Python raises warnings
+    except (FflinError, FflinWarning) as error:  # Python may raise warnings as errors
         parser.print_error(f"fflin: error: {error}")
         return BAD_INPUT
     except BrokenPipeError:

@@ -277,7 +277,7 @@ def _lqr(arguments: argparse.Namespace) -> Report:
     from fflin.base.record import record_of
 
     robot, design, _, gain = designed(arguments)
-    # The warnings of the gain already appear on stderr.
+    # The report omits warnings, because they already appear on stderr.
     text = "\n\n".join(x for x in str(gain).split("\n\n") if not x.startswith("warning: "))
     if design is not robot:
         text += f"\n\n{folded([_ALLOCATED])}"

@@ -28,12 +28,12 @@ ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 # joints would swing by radians.
 _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
-# The effect of the inputs on a mode counts as at least this fraction of the effort that holds the
-# mode at rest. A mode on which the inputs have less effect keeps the decay that it has without
-# feedback.
+# The effect of the inputs on a mode, relative to the effort that holds the mode at rest, is set to
+# this if it is smaller. Such a mode keeps the decay that it has without feedback.
 _LEAST_REACH = 1e-3
 
-# An input has no effect on a coordinate if its effect, relative to the inertia, is below this.
+# If the effect of the inputs on a coordinate, relative to the inertia, is below this, it counts as
+# zero.
 _IDLE = 1e-12
 
 # The effect of a damper depends on the bandwidth, so the bandwidth of a robot with dampers is
@@ -104,7 +104,7 @@ def default_weights(
 def _damping(lin: LinearModel) -> Array:
     """Return the damping matrix B (m, m) of viscous dampers, zero if there are none."""
     m = len(lin.M)
-    if lin.dt or not lin.A[m:, m:].any():  # samples show springs as damping too
+    if lin.dt or not lin.A[m:, m:].any():  # in a sampled model, springs look like damping
         return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
@@ -375,7 +375,7 @@ def _slowed(
         slower = Limit(min(max(left, 0.3), 0.8) * limit.bandwidth, what)
         limit = max(slower, least)
     if not trials:
-        return limit, ""  # the regulator raises with the reason
+        return limit, ""  # the design of the regulator fails and reports the reason
     most = max(trial.left for trial in trials)
     trial = next(x for x in trials if x.left >= _IN_VAIN * most)
     limit, effort = trial.limit, trial.effort
@@ -383,7 +383,7 @@ def _slowed(
     where = "to return from the displacements of the default weights"
     required = trial.required[None]
     warn_beyond(lin.robot, where, lin.input_names, lin.input_units, required, -high, high)
-    held = limit.what == least.what  # a slower loop loses an unstable mode
+    held = limit.what == least.what  # a slower loop cannot control the unstable mode
     what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
     return limit._replace(what=what), _achieved(lin, trial)
 

@@ -141,7 +141,7 @@ class Receding:
         self.solves = self.softened = self.unfinished = self.exceeded = 0
         self._worst, self._said, self._over, self._met = 0.0, "", _OVER, ""
         self._due: tuple[Stage, Array] | None = None  # the last sample and its input
-        if horizon.limited:  # here, so that the first sample takes no longer than others
+        if horizon.limited:  # now, so that the first sample is not slower
             self._change(horizon.window(0.0))
 
     @property
@@ -183,7 +183,7 @@ class Receding:
         self.solves += 1
         self._judge(t, e)
         z, flag = self._solved(free)
-        if flag <= 0:  # once more, without a warm start
+        if flag <= 0:  # solve again without a warm start
             self._start()
             z, flag = self._solved(free)
         if flag > 0:

@@ -165,8 +165,7 @@ def plan(
     size[size == 0.0] = 1.0
     for name, point, which in (("start", start, slice(None)), ("goal", end, asked)):
         _require_within(shooting, bounds, name, point, which)
-    # A search without a solution may diverge; this is reported as an error instead of NumPy
-    # warnings.
+    # A search without a solution may diverge; an error is then raised instead of NumPy warnings.
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
         guess = shooting.guess(start, end)
         cost = cost_of_inputs(shooting, weights, guess[2])

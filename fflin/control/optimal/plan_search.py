@@ -161,7 +161,7 @@ class Search(NamedTuple):
             return None
         try:
             A, B, D, inside = self.shooting.jacobians(trial.q, trial.v, u, self.parts)
-        except InputError:  # it has diverged
+        except InputError:  # the motion has diverged
             return None
         k, part, state = np.nonzero(limited)
         least, largest = trial.inside[:, k, part, state]

@@ -14,7 +14,7 @@ from fflin.base.validation import Array, Values
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
-# A solution with a smaller residual is exact up to rounding error.
+# A solution whose residual is below this is exact up to rounding error.
 _SOUND = 1e-11
 _STEPS = 25
 
@@ -58,7 +58,7 @@ class Riccati:
     def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
         self.discrete = bool(dt)
-        # For a sampled system, use A - I, because the difference of P and A' P A would cancel.
+        # For a sampled system, use A - I, because P - A' P A would lose accuracy by cancellation.
         self.rate = A - np.eye(len(A)) if dt else A
         self.R_factor, indefinite = dpotrf(R, lower=1)
         self.definite = not indefinite
@@ -164,7 +164,7 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
-    """Return the continuous equation that has the same P (10.6)."""
+    """Return the continuous equation that has the solution P of a sampled one (10.6)."""
     A, B, Q = equation.A, equation.B, equation.Q
     N = np.zeros_like(B) if equation.N is None else equation.N
     F = np.linalg.inv(A + np.eye(len(A)))
