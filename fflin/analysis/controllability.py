@@ -250,8 +250,8 @@ def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | N
     found = unobservable(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
     if found is None:
         return None
-    # The system is symmetric. Each motion (s, v) that is unobservable from the output S^T s
-    # therefore gives a row on which no input acts.
+    # The system is symmetric. Each motion (s, v) that the output S^T s does not observe therefore
+    # gives a row, a combination of states on which no input acts.
     s, v = np.split(found.motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
     # The controllable subspace is orthogonal to these rows.

@@ -1,4 +1,4 @@
-"""Effective masses of the vibration modes of a robot with its base clamped."""
+"""Effective masses of the vibration modes of a robot whose base is fixed."""
 
 from __future__ import annotations
 
@@ -169,8 +169,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     kept = np.r_[:6, springs]
     floating = floating_inertia(M, kept, others)
     base, joints = np.arange(6), np.arange(6, len(kept))
-    # Coordinates are scaled by the springs so that K is the identity. The low frequencies are then
-    # as accurate as the high ones.
+    # Coordinates are scaled by the springs so that K is the identity. Low frequencies then have the
+    # same relative accuracy as high frequencies.
     soft = 1.0 / np.sqrt(stiffness[springs - 6])
     M_mm = floating[6:, 6:] * np.outer(soft, soft)
     squares, vectors = np.linalg.eigh((M_mm + M_mm.T) / 2.0)
@@ -204,7 +204,7 @@ def _separated(frequencies: Array, L: Array) -> Array:
 
 
 def _cells(values: Array, total: Array) -> list[str]:
-    """Return each value with its percentage of the total; a dot stands for rounding error."""
+    """Return each value with its percentage of the total, or dots if it is rounding error."""
     cells = []
     for value, whole in zip(values.tolist(), total.tolist(), strict=True):
         seen = abs(value) > 1e2 * _ROUNDING * whole

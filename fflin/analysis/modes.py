@@ -225,7 +225,7 @@ class Modes:
         return "\n\n".join((*parts, *self._of_appendages()))
 
     def _of_appendages(self) -> list[str]:
-        """Return tables of the appendage modes, free and clamped, and of their effective masses."""
+        """Return tables of the appendage modes (robot free, base fixed) and of effective masses."""
         robot = self.lin._robot
         if robot is None or not robot.modes:
             return []
@@ -335,7 +335,7 @@ def modes(lin: LinearModel) -> Modes:
 
 
 def _percents(energy: Mapping[str, float], room: int) -> str:
-    """Name the bodies with at least 1 % of the energy, and sum up all other bodies."""
+    """Name the bodies with at least 1 % of the energy, and add up the energy of the others."""
     words = [f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01]
     text = ""
     for count in range(len(words), 0, -1):

@@ -9,7 +9,8 @@ from fflin.analysis.ranks import Margin
 from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
-# For each group of velocities: its momenta, and the coordinates whose rates are these momenta.
+# For each group of velocities: name of the momentum, and name of the coordinate whose rate is the
+# momentum.
 _CONSERVED = {
     "omega_b": ("angular momentum", "base attitude"),
     "v_b": ("linear momentum", "base position"),
@@ -28,8 +29,8 @@ def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, 
         tuple(f"{_CONSERVED.get(group, _OTHER)[i]} {member}" for group, member in rates)
         for i in (0, 1)
     )
-    # The inputs cannot move such a coordinate alone, but they may move it together with the
-    # others.
+    # The inputs cannot move the named coordinate while the others are fixed, but they may move it
+    # together with the others.
     only_joints = all(rates[i][0] == "qdot_m" for i in conserved.kept)
     of_base = all(
         not row[i] for row in conserved.weights for i in range(nv) if rates[i][0] == "qdot_m"

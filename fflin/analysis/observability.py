@@ -14,7 +14,8 @@ from fflin.base.validation import Array, FrozenArrays, Values, instance, positiv
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.model import LinearModel
 
-# A slower decay, relative to the fastest pole, may be a pole at zero that rounding has moved.
+# A pole whose decay rate, relative to the fastest pole, is below this may be a pole at zero that
+# rounding has moved.
 _DECAY = 1e-7
 
 

@@ -44,7 +44,7 @@ def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[f
 
 
 def quantile(values: Array, p: float, confidence: float) -> Estimate:
-    """Return the p-quantile and its interval, infinite ends if there are too few draws."""
+    """Return the p-quantile and its interval; an end is infinite if there are too few draws."""
     from scipy.special import bdtr
 
     count = len(values)

@@ -47,7 +47,7 @@ _FORMER = {"turning": "omega_b", "moving": "v_b", "rates": "joint rates"}
 
 
 def kind_named(name: str) -> str:
-    """Replace the former name of a kind of error, as in ``worst turning``, by its present name."""
+    """Replace a former name of a kind of error, as in ``worst turning``, by its present name."""
     of, _, kind = name.rpartition(" ")
     kind = _FORMER.get(kind, kind) if of in ("", "worst", "settle") else kind
     return f"{of} {kind}".strip()
@@ -230,7 +230,7 @@ class RunStatistics:
         return self._over(first, errors_of(self._state, self._target, q, v)[1])
 
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
-        """Add rows (steps, count, ..) of q, nu, u, .. from step `first` on; `raw` has them too."""
+        """Add rows (steps, count, ..) of q, nu, u, .. from step `first` on, also given as `raw`."""
         take = kernel("loop", "take", "the run statistics")
         take(self._words, raw, first, len(rows[0]))
         self._last = [each[-1] for each in rows[:3]]

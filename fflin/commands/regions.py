@@ -16,7 +16,7 @@ from fflin.commands.results import Report, figure_of
 _ERRORS = "attitude [deg], position [m], joints, omega_b, v_b or joint rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
 
-# `along` refuses these options of other commands, so they need a value here.
+# `along` refuses these options, which only other commands have, so they need a value here.
 _NONE = "free mpc gain controller target_joint target_rpy target_position target_velocity effort"
 _NONE += " equilibrium"
 _NONE += " joint rpy position velocity"

@@ -186,8 +186,8 @@ def robot_of_design(
 ) -> Robot:
     """Return the robot of a design; with allocation, base torque and force replace the thrusters.
 
-    By default, thrusters are allocated if they can push in every direction, unless the law in a
-    file was designed for other inputs.
+    By default, thrusters are allocated if they can push in every direction, unless the controller
+    in a file was designed for other inputs.
     """
     from fflin.control.authority import thrusters_give_every_wrench
     from fflin.robot.inputs import BaseForce, BaseTorque, Thruster

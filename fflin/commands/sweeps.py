@@ -87,7 +87,7 @@ def add_commands(commands: parser.Commands) -> None:
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
-    """Split JOINT=A:B:... into the name and its values, as many as `form` has."""
+    """Split JOINT=A:B:... into the name and its values; `form` has the same number of values."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
     if not name or len(parts) != len(form.split(":")):
@@ -122,7 +122,7 @@ def _sweep(arguments: argparse.Namespace) -> Report:
     size = planned_bytes(robot, len(q), at_rest=v is None and u is None, **settings)
     part = part_of(path)
     resuming = f", resuming from {part}" * part.exists()
-    # All options are valid.
+    # Announce the sweep only now, because all options are known to be valid here.
     scale, unit = (1e9, "GB") if size >= 1e9 else (1e3, "kB")
     needs = f"{size / scale:,.1f} {unit}"
     said = (
