@@ -281,7 +281,7 @@ def _momentum_error(work, robot, nu, momentum):
 
 @inlined
 def impose(work, robot, reference, point, t):
-    """Set the base's position and velocity so that momentum and centre of mass equal the reference.
+    """Set the base's position and velocity so that momentum and centre of mass match the reference.
 
     M must be evaluated at the point. Only the deviation of the momentum is solved for, so the
     solution's rounding errors are relative to this small correction.

@@ -341,7 +341,7 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
 
 
 def along(motion: Any, robot: Robot | None) -> Trajectory:
-    """Convert a motion to a trajectory with constant or linear inputs, by the smaller residual."""
+    """Convert a motion to a trajectory with constant or linear inputs, whichever fits better."""
     if motion.phases:
         raise InputError(
             "the motion has several phases, each with its own robot; convert each phase separately"

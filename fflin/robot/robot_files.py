@@ -83,7 +83,7 @@ class RobotToml:
 
 
 def _flat(key: str, value: object) -> Any:
-    """Return the value of a key with flat tables: nested keys are joined by dots."""
+    """Return the value of a key as one flat table: nested keys are joined by dots."""
     if not isinstance(value, dict):
         return value
     if key in _OF_PARTS:

@@ -72,7 +72,7 @@ def welded(robot: Robot, lock: Lock) -> Robot:
 
 
 def _without(of: object, gone: Iterable[str], left: Iterable[str]) -> Any:
-    """Remove the keys that match only removed joints from a mapping and its nested mappings."""
+    """Remove keys that match only removed joints, from a mapping and its nested mappings."""
     if not isinstance(of, Mapping):
         return of
     removed, others = (
@@ -118,7 +118,7 @@ def locked_model(
 
 
 def requested(lock: Any) -> dict[str, float | None]:
-    """Return locks as {joint or pattern: value}, where None is the neutral value."""
+    """Return locks as {joint or pattern: value}; the value None means the neutral position."""
     try:
         names = [lock] if isinstance(lock, str) else list(lock)
     except TypeError:

@@ -19,7 +19,8 @@ from fflin.robot.robot import ROOT, Robot
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
-# Largest difference of rates and displacements between the end and the beginning of phases.
+# Largest difference of rates and displacements between the end of a phase and the next phase's
+# start.
 _MET = 1e-6
 
 

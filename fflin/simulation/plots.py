@@ -38,7 +38,7 @@ _GROUPS = {
 _WHEELS = {"speed": "wheel speeds", "wheel": "wheel torques", "momentum": "wheel momenta"}
 
 
-# A limit is drawn if a curve reaches this fraction of it.
+# A limit is drawn if the curve reaches this fraction of the limit.
 _NEAR = 1.0 / 3.0
 
 # A target that moves less than this between rows, in SI units, is at rest.
@@ -46,7 +46,7 @@ _STILL = 1e-12
 
 
 class Curve(NamedTuple):
-    """Values (N,) of a state or input, limits (2,), and prediction and reference (N,), if any."""
+    """Values (N,) of a state or input, limits (2,), and any prediction and reference (N,)."""
 
     key: str  # GROUP.NAME
     group: str  # "speed" and "momentum" of wheels
@@ -289,7 +289,7 @@ def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -
 
 
 def _drifts(axes: Axes, motion: Motion) -> None:
-    # Drifts below the rounding error of 1 are raised to it, since a logarithmic axis has no zero.
+    # A logarithmic axis has no zero, so smaller drifts are raised to the machine epsilon.
     drifts = {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift}
     shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}
     for color, (label, drift) in zip(COLORS, shown.items(), strict=False):

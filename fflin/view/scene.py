@@ -29,12 +29,12 @@ _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1
 # Extension types of msgpack-lite, which the page decodes as typed arrays.
 _TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
 
-# Placeholder for a mesh that the page has already.
+# Placeholder for a mesh that the page already has.
 _ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 
 class _Piece(MeshcatMesh):
-    """three.js mesh in the form that is sent; the page has its material and earlier geometry."""
+    """three.js mesh in the form sent to the page, which already has material and known geometry."""
 
     def __init__(
         self, geometry: dict[str, object], matrix: Array, about: dict[str, object]

@@ -25,7 +25,8 @@ from fflin.base.validation import Array, FrozenArrays, as_double, number, positi
 from fflin.robot.equipment.mounting import about_origin, inertia_of
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
-# First root of J_1'(x) = 0, which is k R of the first lateral mode in a circular cylinder.
+# First root of J_1'(x) = 0: the wavenumber times the radius of the first lateral mode in a
+# circular cylinder.
 _FIRST_ROOT = 1.8411837813406593
 _FASTEST = 1e12  # [Hz]
 
@@ -478,7 +479,7 @@ class Slosh(Appendage):
 
 
 def checked_appendages(value: object) -> tuple[Appendage, ...]:
-    """Return flexible appendages and slosh, or raise `InputError`."""
+    """Return the given flexible appendages and slosh if they are valid, or raise `InputError`."""
     if isinstance(value, Appendage):
         value = [value]
     if not isinstance(value, Sequence) or not all(isinstance(item, Appendage) for item in value):

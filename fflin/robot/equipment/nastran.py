@@ -21,11 +21,12 @@ MASSES = {
     "slug": 14.593902937206364,
     "lbf s^2/in": 175.12683524647636,
 }  # [kg]
-# Names of the mass and stiffness matrices in files of different origin.
+# Names that different programs give to the mass and stiffness matrices.
 _MASS, _STIFFNESS = ("mxx", "maa", "maax"), ("kxx", "kaa", "kaax")
 
-# Largest rounding error relative to the largest entry. A larger asymmetry, coupling stiffness of
-# boundary and modes, or stiffness of the rigid interface is refused.
+# Largest rounding error, relative to the largest entry of a matrix. If the asymmetry, the
+# stiffness that couples boundary and modes, or the stiffness of the rigid interface is larger, the
+# file is refused.
 _SHARE = 1e-6
 
 
