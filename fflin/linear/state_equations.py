@@ -126,7 +126,7 @@ def _over_rotations(
 
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
-    """Return the state derivative (.., nx) of a moving reference, see below (5.3)."""
+    """Return the state derivative (.., nx) of a moving reference; see below (5.3)."""
     weight = (gravity * gravity).sum(axis=-1, keepdims=True) if state.falls else np.zeros(1)
     if not np.count_nonzero(weight):
         return f0

@@ -21,7 +21,7 @@ ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
 _CONFIGURATION = "a configuration in Pinocchio's order"
 
-# Rounding error of the length of a normalised quaternion: two ulp of 1.
+# Largest rounding error of the length of a normalised quaternion: two ulp of 1.
 ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
 # pin.Data contains third-order tensors of nv^3 entries. It takes about 32 nv^3 bytes.

@@ -308,7 +308,7 @@ class Jacobi(Conserved):
         return found._replace(energy=found.energy + potential)
 
     def momentum_drift(self, history: Histories, expected: Array) -> Array:
-        """Return the relative difference between the integral and its start plus the work done."""
+        """Compare the integral with its initial value plus the work; return relative errors."""
         missing = np.abs(history.energy - history.energy[0] - expected[:, 0])
         return missing / (self._scale or 1.0)
 

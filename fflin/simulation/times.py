@@ -28,7 +28,8 @@ _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
 # If the step is chosen automatically, a larger number of steps than the first causes a warning
 # (half a minute of computing). A larger number than the second is refused (some hours).
 _MANY_STEPS, _ENDLESS = 50_000, 10_000_000
-# Rows above which only some steps are recorded, and the number of rows then.
+# With more rows than the first number, only some steps are recorded, in about as many rows as the
+# second.
 _MANY_ROWS, _FEW_ROWS = 100_000, 10_000
 _FOREVER = 1e100  # [s]; its inverse squared does not underflow
 

@@ -158,7 +158,7 @@ def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[in
 def mounted_wheels(
     model: pin.Model, bodies: list[pin.Inertia], inputs: Sequence[Input]
 ) -> list[Mounted]:
-    """Return the wheels with an inertia, and subtract each wheel from its body."""
+    """Return the wheels that have an inertia, and subtract each from the body that includes it."""
     parts = []
     for name, wheel in named_wheels(inputs):
         if not wheel.inertia:
