@@ -22,7 +22,7 @@ class Aba:
         self._weightless = robot.model
         self._model = robot.model.copy()
         self._model.gravity.linear = np.array(robot.gravity)
-        # M^-1 in base axes from ABA, at the point of the last call of `slopes`.
+        # M^-1 in base axes by ABA, at the point given in the last call of `slopes`.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
         self.field = state.field
         self._resists = bool(np.any(robot.springs))
@@ -42,7 +42,7 @@ class Aba:
         return self.field.relative(v, absolute, rate) if self.field else rate
 
     def accelerations(self, q: Array, v: Array, u: Array) -> Array:
-        """Return dv/dt (N, nv) of N points, see `acceleration`."""
+        """Return dv/dt (N, nv) at N points; see `acceleration`."""
         state = self.state
         if self.field or state.robot.followers or state.robot.stored_momentum:
             return np.array([self.acceleration(*point) for point in zip(q, v, u, strict=True)])
@@ -66,8 +66,8 @@ class Aba:
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return d(nudot)/d(tangent of q, nu, u) in state order, (6 + n, ...); `u` in base axes."""
-        # Wrenches of thrusters are constant in the frames of their links, so that the derivative
-        # over q includes d(B u)/dq. B comes from the accelerations of unit inputs at rest.
+        # Wrenches of thrusters are constant in the frames of their links, so the derivative over q
+        # includes d(B u)/dq. B comes from the accelerations of unit inputs at rest.
         state = self.state
         stiffness, damping, _ = state.robot.springs
         tau, field = state.lift(self.actuation.torques(u) + self._passive_force(q, v)), self.field

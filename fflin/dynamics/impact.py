@@ -203,7 +203,7 @@ def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
 
 
 def joint_called(robot: Robot, name: str) -> pin.JointModel:
-    """Return the joint of Pinocchio's model with a name."""
+    """Return the joint with a name in Pinocchio's model."""
     return robot.model.joints[robot.model.getJointId(name)]
 
 
@@ -365,7 +365,7 @@ def capture(
 
 
 def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tuple[Array, Array]:
-    """Return the checked configuration and velocity of a payload with its base at a placement."""
+    """Return a payload's checked configuration and velocity, with its base at a given placement."""
     configuration = other.neutral() if q is None else other.checked_configuration(q).copy()
     root = other.model.jointPlacements[ROOT]
     configuration[:7] = pin.SE3ToXYZQUAT(root.actInv(at))

@@ -93,7 +93,7 @@ class CommutatorFree4(Integrator):
 
 
 class SemiImplicitEuler(Integrator):
-    """Semi-implicit Euler: order 1, the new velocity moves the configuration."""
+    """Semi-implicit Euler: order 1; the configuration moves with the new velocity."""
 
     nodes, weights, moments = (0.0,), (1.0,), (1.0,)
     reach = 2.0
@@ -118,8 +118,8 @@ def integrator(name: str) -> type[Integrator]:
     return INTEGRATORS[name]
 
 
-# Commutator-free method of order four (10.3): its Gauss nodes, and their weights in the first of
-# its two exponentials. In the second exponential the weights are exchanged.
+# Commutator-free method of order four (10.3): its Gauss nodes, and the nodes' weights in the first
+# of the two exponentials. The second exponential has the weights in reverse order.
 GAUSS = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 HEAVY, LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
 

@@ -161,7 +161,7 @@ class OrbitField:
         return energy
 
     def _bodies(self, data: pin.Data) -> tuple[Array, Array]:
-        """Return the attitude (k, 3, 3) and the centre of mass (k, 3, 1) of each body."""
+        """Return the attitude (k, 3, 3) and the centre of mass (k, 3, 1) of each of k bodies."""
         placements = data.oMi.tolist()[ROOT:]
         R = np.array([placement.rotation for placement in placements])
         origins = np.array([placement.translation for placement in placements])

@@ -30,7 +30,7 @@ _QUICK_COUPLING = 1e-11 / _EPS
 
 STROKE = 1.0  # [m] largest displacement of a prismatic joint for which `inertia_bounds` holds
 
-# Above this size LAPACK is faster than a sparse factor.
+# If M has more rows than this, LAPACK is faster than a sparse factor.
 _DENSE_SIZE = 64
 
 
@@ -86,7 +86,7 @@ class Inertia:
         ):
             _compute_inverse(self._model, self._data, still)
             self._state.project(self._inverse, out)
-            # A zero pivot gives NaN, for which this comparison is false.
+            # A zero pivot gives NaN, which makes this comparison false.
             if self.least_coupling < bounds.dot(self._inverse_diagonal) < _QUICK_COUPLING:
                 return
         upper = _crba(self._model, self._data, still)
@@ -244,8 +244,8 @@ class Accelerations:
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
         # The base's placement and linear velocity are left out: in base axes c does not depend on
-        # them, and Pinocchio's derivatives would lose digits to large values. Gravity is left out
-        # as well, because it accelerates all parts of the robot alike (equivalence principle).
+        # them, and large values would cost Pinocchio's derivatives digits. Gravity is left out as
+        # well, because it accelerates all parts of the robot alike (equivalence principle).
         q_still, v_still = self._inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:

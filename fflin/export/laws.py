@@ -250,7 +250,7 @@ def _robot_of(given: Any, lin: LinearModel | None) -> Robot | None:
 
 
 def _model_of(gain: Gain, robot: Robot) -> LinearModel:
-    """Linearise the robot at the point and reference of a gain that was read from a file."""
+    """Linearise a robot at the point and reference stored with a gain that was read from a file."""
     if not gain.placement.size:
         raise InputError(
             "the file of the gain does not contain the reference pose, because the file was "
@@ -358,7 +358,7 @@ def _output_law(
 
 
 def _units_of(robot: Robot | None, *names: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Return the units of named inputs and outputs of a robot, "unknown" for other names."""
+    """Return the units of signals that are inputs or outputs of a robot, "unknown" for others."""
     known: dict[str, str] = {}
     if robot is not None:
         state = StateMap(robot)

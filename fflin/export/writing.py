@@ -199,7 +199,7 @@ class _Texts:
         return Template(text).substitute(self.words)
 
     def _vectors(self) -> dict[str, str]:
-        """Return the entries of the test program's template."""
+        """Return the values that fill the template of the test program."""
         law, rows, nu = self.law, [], len(self.law.low)
         for case in self.cases:
             out = case.out.copy()

@@ -1,9 +1,9 @@
 """Kernel arguments: nested named tuples of arrays, stored as one array of 64-bit words.
 
-numba compiles a function for each set of argument types, and passes a named tuple array by array.
-Here a call has one argument, an array of words. A `Struct` is a pointer into the array, and its
-fields are read when they are needed. So the argument types are always the same, and a call within
-compiled code passes one pointer. The words must not change during a call.
+numba compiles a function for each set of argument types, and passes a named tuple as separate
+arrays. Here a call has one argument, an array of words. A `Struct` is a pointer into the array, and
+its fields are read when they are needed. So the argument types are always the same, and a call
+within compiled code passes one pointer. The words must not change during a call.
 """
 
 from __future__ import annotations

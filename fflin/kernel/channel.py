@@ -62,7 +62,7 @@ CHANNEL = Struct(
 
 @inlined
 def clipped(value, low, high):
-    """Return a number within limits; NaN remains NaN."""
+    """Return a number clipped to limits; NaN remains NaN."""
     value = chosen(value, low, low, value)
     return chosen(high, value, high, value)
 
@@ -124,7 +124,7 @@ def _arrive(channel, step, u):
 
 @inlined
 def _begin_pulses(channel, step, u):
-    """Fire the pulse of a sample, and add the remaining impulse to the next sample."""
+    """Fire the pulse of a sample, and leave the remaining impulse to the next sample."""
     pulses, sample, fresh = channel.pulses, channel.sample, load(channel.fresh, 0)
     for index in range(len(pulses.at)):
         most, least = load(pulses.most, index), load(pulses.least, index)
@@ -147,7 +147,7 @@ def _begin_pulses(channel, step, u):
 
 @inlined
 def _limit_wheel_speeds(channel, nu, u):
-    """Reduce torques, at most to zero, that would exceed a wheel's speed limit in the step."""
+    """Reduce torques that would make a wheel exceed its speed limit in a step, at most to zero."""
     wheels = channel.wheels
     for index in range(len(wheels.at)):
         least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)

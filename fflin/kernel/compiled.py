@@ -27,7 +27,7 @@ _QUOTAS = (
 
 ENGINES = ("python", "compiled")
 
-# Part of the names of numba's cache files.
+# Version of Python, as in the names of numba's cache files.
 VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 
 # Time [s] to wait for another process's compilation before logging it, and the longest wait [s].

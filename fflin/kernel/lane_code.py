@@ -62,7 +62,7 @@ def _spread(builder: Any, value: Any) -> Any:
 
 
 def _alike(builder: Any, values: Any) -> list[Any]:
-    """Convert all values to lanes if one of them is lanes."""
+    """Convert all values to lanes if one of them has lanes."""
     if any(value.type == _VECTOR for value in values):
         return [_spread(builder, value) for value in values]
     return list(values)

@@ -18,7 +18,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 # {function of the kernel: name of the decorator that says how it is compiled}.
 HOW: dict[Callable[..., Any], str] = {}
-# {operation by NumPy: loop that is compiled in its place}.
+# {function that uses NumPy: loop that is compiled in its place}.
 LOOPS: dict[Callable[..., Any], Callable[..., Any]] = {}
 
 

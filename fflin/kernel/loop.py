@@ -130,7 +130,7 @@ def _act(work, channel, law, robot, point, step, stage, t):
 
 @inlined
 def _move(robot, method, stages, point, stage):
-    """Move the point from a stage with known acceleration to the next, or to the step's end."""
+    """Move the point from a stage with known acceleration to the next stage or the step's end."""
     rates, along = stages.rates, stages.along
     if stage == 1:
         vec.copy(point.q, 0, stages.second, 0, len(point.q))

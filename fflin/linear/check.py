@@ -238,7 +238,7 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
 
 
 def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
-    """Check many models, and return the largest ratio of error to tolerance for each row."""
+    """Check many models; return the largest ratio of error to tolerance in each row of errors."""
     worst: dict[tuple[str, str], Row] = {}
     aba: Aba | None = None
     for lin in models:
@@ -299,7 +299,7 @@ def _output_rows(
     of_x, of_u = (np.ones(len(each), dtype=bool) for each in (step_x, step_u))
     C = jacobian(lambda rows: np.array([y(x, lin.u0) for x in rows]), lin.x0, step_x, of_x)
     D = jacobian(lambda rows: np.array([y(lin.x0, u) for u in rows]), lin.u0, step_u, of_u)
-    # Derivatives smaller than the rounding error of y divided by the step are noise.
+    # A derivative is noise if it is smaller than the rounding error of y divided by the step.
     scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
     for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):

@@ -2,9 +2,9 @@
 
 A model in csv consists of several tables: one for each matrix, with names of rows and columns; one
 each for the states, inputs and outputs; one for the point in Pinocchio's order; and the table
-``info`` of texts and numbers, whose last line is the digest of all tables. The last column of a
-trajectory in csv repeats the digest of the other columns in every row. So other programs can read
-the columns by their names.
+``info`` of texts and numbers, whose last line is the digest of all tables. In a trajectory in csv,
+every row of the last column repeats the digest of the other columns. So the file has no extra
+lines, and other programs can read the columns by their names.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def _tables(entries: Record) -> dict[str, list[list[object]]]:
 
 
 def _columns_of(signal: str) -> list[str]:
-    """Return the entries that are the columns of a signal's table."""
+    """Return the entries of a model that form the columns of a signal's table."""
     vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
     return [f"{signal}_names", f"{signal}_units", *vectors]
 

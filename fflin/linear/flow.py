@@ -140,7 +140,7 @@ class Flow:
         return actuation.in_base_axes(state.charts(q), u) if actuation.held else u
 
     def rate(self, q: Array, v: Array, u: Array) -> Array:
-        """Return dv/dt (nv,) under inputs in the frame's axes."""
+        """Return dv/dt (nv,) for inputs u in the frame's axes."""
         return self._aba.acceleration(q, v, self._in_base_axes(q, u)).copy()
 
     @cached_property

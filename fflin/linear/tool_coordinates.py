@@ -150,7 +150,7 @@ class ToolCoordinates:
         return robot.checked_configuration(at), robot.checked_velocity(speed)
 
     def _rotation(self, attitude: Array) -> Array:
-        """Return the rotation (3, 3) of an attitude stored in q."""
+        """Return the rotation (3, 3) of the attitude that a tool's q stores."""
         if self.convention.stored == "euler":
             return pin.rpy.rpyToMatrix(*attitude)
         if self.convention.stored == "matrix":
@@ -253,7 +253,7 @@ def _centre(robot: Robot) -> pin.SE3:
 
 
 def _joint_path(robot: Robot, name: str) -> list[int]:
-    """Return the file indices of the joints from the root to a joint; unknown ones come last."""
+    """Return the file indices of the joints from the root to a joint; other joints come last."""
     frames, path, order = robot.model.frames, list[int](), robot.file_joints
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
     while at:
@@ -281,7 +281,7 @@ def _angles(R: Array) -> Array:
 
 
 def _of_angles(angles: Array, omega: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
-    """Return the G of angle rates = G omega, and the derivative of G omega over the angles."""
+    """Return G with (angle rates) = G omega, and the derivative of G omega over the angles."""
     (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
     G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
     _, pitch, yaw = G @ omega

@@ -68,11 +68,12 @@ def inertia_residual(M: Array, inverse: Array) -> float:
 def aba_route(
     state: StateMap, aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Return A and B from the derivatives of ABA, (4.9) and (15.3), and the M^-1 of ABA."""
+    """Return A and B from ABA's derivatives by (4.9) and (15.3), and M^-1 by ABA."""
     own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
-    # Pinocchio differentiates about the world's origin, where a distant base would cost digits. So
-    # the base is placed at the origin: no derivative depends on its position, not even in orbit.
+    # Pinocchio differentiates about the world's origin, and a base far from it would cost digits.
+    # So the base is placed at the origin: no derivative depends on its position, not even in
+    # orbit.
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
@@ -262,7 +263,7 @@ class Nonlinear:
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         rate = state.velocities(a)
         if state.axes[1]:
-            # Derivative of the components in reference axes.
+            # Add the term by which the derivative of the components in reference axes differs.
             rate[:, LINEAR] += times(skew(angular), linear)
         turning = chart.q0 * angular + times(skew(chart.q_b), angular)
         position_rate, rates = times(chart.R, linear), state.velocities(v)[:, 6:]

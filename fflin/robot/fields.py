@@ -1,4 +1,4 @@
-"""Checks of the fields of a robot that the user may set, and the limits of a robot."""
+"""Checks of the robot's fields that the user may set, and the limits of a robot."""
 
 from __future__ import annotations
 

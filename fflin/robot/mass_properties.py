@@ -273,7 +273,7 @@ def _squares(com: Array) -> Array:
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:
-    """Return the coordinates that can move together without moving mass; usually none."""
+    """Return the coordinates that can move together without moving mass; usually an empty tuple."""
     # A motion has no kinetic energy if it moves no mass, rotates no body about an axis with
     # inertia, and moves no joint with armature. This condition depends on geometry alone. Values
     # of masses are not used, because their rounding errors could hide it.
@@ -322,7 +322,7 @@ def massless_note(robot: Robot) -> str:
 
 
 def require_inertia(robot: Robot) -> None:
-    """Raise an error if M is singular at every configuration; its factors may not show this."""
+    """Raise an error if M is singular at every configuration; a factorisation may not show this."""
     if robot.idle_coordinates:
         raise SingularInertiaError(massless_note(robot))
 

@@ -121,7 +121,7 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
 
 
 def _inputs(whole: Motion, state: StateMap, motion: Motion, there: StateMap) -> Array:
-    """Return a motion's inputs (N, nu) in the order of the whole; missing inputs are zero."""
+    """Return a phase's inputs (N, nu) in the order of the whole motion; missing inputs are zero."""
     if more := [name for name in motion.input_names if name not in whole.input_names]:
         raise InputError(
             f"a phase has the input {more[0]}, which the first phase lacks; give the first robot "

@@ -153,7 +153,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
         said = f"target is a model in frame '{target.frame}', expected '{state.frame}'"
         raise InputError(f"{said}, the frame of the motion; q differs between orbital frames")
     goal = state.read(target.q, target.v)
-    # The base states of a model with another reference or frame cannot be copied.
+    # If the model has another reference or frame, its base states cannot be copied.
     same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)
     for name, value in zip(target.state_names, target.x0, strict=True):
         if same or group_of(name) == "q_m":

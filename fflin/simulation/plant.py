@@ -88,8 +88,8 @@ class Plant:
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
         """Return dv/dt (nv,), and the external wrench (6,) without gravity, in base axes.
 
-        In orbit, the wrench is replaced by zeros behind the power [W] of inputs, disturbance and
-        dampers.
+        In orbit, the wrench is replaced by the power [W] of inputs, disturbance and dampers,
+        followed by zeros.
         """
         if self._faulty:
             given = np.empty(len(u))
@@ -308,7 +308,7 @@ class Jacobi(Conserved):
         return found._replace(energy=found.energy + potential)
 
     def momentum_drift(self, history: Histories, expected: Array) -> Array:
-        """Return the relative error of the integral from its initial value plus the work done."""
+        """Return the relative difference between the integral and its start plus the work done."""
         missing = np.abs(history.energy - history.energy[0] - expected[:, 0])
         return missing / (self._scale or 1.0)
 

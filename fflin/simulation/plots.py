@@ -64,7 +64,7 @@ class Curve(NamedTuple):
 
     @property
     def near(self) -> list[float]:
-        """Limits that are close to the values."""
+        """Limits that the values come close to."""
         levels: list[float] = self.limits[np.isfinite(self.limits)].tolist()
         return [level for level in levels if level and (self.values / level).max() >= _NEAR]
 
@@ -195,7 +195,7 @@ def _draw_panels(
                 axes.margins(y=0.3)  # room for the names above the curves
             axes.legend(ncols=2 if many else 1, handlelength=1.6)
     if joints is not None:
-        # One legend below, because three panels share the joints, whose names are long.
+        # Put one legend below, because three panels show the same joints and joint names are long.
         limit = {"limit": lines.pop("limit")} if "limit" in lines else {}
         _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
 

@@ -324,7 +324,7 @@ def pushed(of: object) -> bool:
 
 
 def verdict(motion: Motion, kinds: list[ErrorHistory]) -> str:
-    """Return one line: whether a motion settled at its target, and why not."""
+    """Return one line: whether a motion settled at its target, and if not, why."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
@@ -397,5 +397,5 @@ def _largest_inputs(motion: Motion) -> str:
             key = (group_of(name), unit.replace(" ", "\u00a0"))
             kinds[key] = max(kinds.get(key, 0.0), float(value))
     shown = [f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()]
-    # Non-breaking spaces keep name, value and unit on one line.
+    # Non-breaking spaces keep a name, its value and the unit on one line.
     return folded([f"largest inputs: {', '.join(shown) or 'none'}"])

@@ -124,7 +124,7 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
 
 
 def _of_mode(joint: Joint, index: int, stiffness: float, damping: float) -> Iterator[Parameter]:
-    r"""Yield the frequency and damping ratio of a mode with inertia I and a clamped link.
+    r"""Yield the frequency and damping ratio of a mode with inertia I, for a link fixed in space.
 
     The stiffness is :math:`I \omega^2` and the damping :math:`2 \zeta I \omega`.
     """
@@ -185,7 +185,7 @@ class Variants:
         self.pieces = robot.pieces
 
     def refusal(self, values: Mapping[str, float]) -> str:
-        """Return why {parameter: value} are not physically realisable, or an empty string."""
+        """Return why {parameter: value} is not physically realisable; an empty string if it is."""
         try:
             changed = self._changed(values)
             if self._robot.wheels or self._robot.modes:  # a link may be too light for them
@@ -279,7 +279,7 @@ def _piece(piece: Piece, parts: Mapping[str, float]) -> tuple[Piece, float]:
 def _no_body(before: Piece, piece: Piece, name: str) -> str:
     """Return why a changed link is physically impossible, or an empty text if it is possible.
 
-    A link that was impossible before the change is accepted unless it becomes worse.
+    A link that was impossible before the change is accepted unless the change makes it worse.
     """
     if not piece.mass > 0.0:
         return f"the mass of '{name}' is {piece.mass:.4g} kg, expected above 0"

@@ -32,7 +32,8 @@ _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
 # Function of rows of deltas that returns a criterion; larger values are worse.
 Figure: TypeAlias = Callable[[Array], Array]
 
-# Largest number of signals for slycot, whose time grows with the fifth power of this number.
+# Largest number of signals for which slycot is used. Its time grows with the fifth power of this
+# number.
 _SIGNALS = 24
 # Number of frequencies in the first grid, number of frequencies checked inside an interval, and
 # largest number of divided intervals or slycot calls.
@@ -167,7 +168,7 @@ class Gain(NamedTuple):
 
 
 class Loops:
-    """Closed loops u = -K x of an LFT at rows of deltas (N, k)."""
+    """Closed loops of an LFT with u = -K x, at rows of deltas (N, k)."""
 
     def __init__(self, lft: LFT, K: Array) -> None:
         self.lft, self.K = lft, K
@@ -178,7 +179,7 @@ class Loops:
         return A - B @ self.K, B
 
     def undamped(self, rows: Array) -> Array:
-        """Return minus the least damping ratio (N,); it is 0 or more for an unstable loop."""
+        """Return the negative of the least damping ratio (N,); it is >= 0 for an unstable loop."""
         poles = np.linalg.eigvals(self.matrices(rows)[0])
         found: Array = (poles.real / np.maximum(np.abs(poles), 1e-300)).max(axis=-1)
         return found

@@ -33,8 +33,8 @@ _ARGUMENTS = (
     *("--disable-dev-shm-usage", "--disable-extensions"),
 )
 
-# Chromium reads commands from descriptor 3 and answers on descriptor 4. It ends when they are
-# closed, so it never outlives this process.
+# Chromium reads commands from file descriptor 3 and answers on file descriptor 4. It ends when
+# they are closed, so it never outlives this process.
 _WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 
 _PATIENCE = 120.0  # [s] time limit, long enough for a slow machine without a graphics card

@@ -189,7 +189,7 @@ def _joints(robot: Robot) -> list[dict[str, Any]]:
 
 
 class Server:
-    """Server of a page and its updates; it ends with its process."""
+    """Server of a page and its updates; it stops when its process ends."""
 
     def __init__(
         self,

@@ -134,10 +134,10 @@ class Recorder:
             yield _message(self._animation)
 
     def wait(self) -> None:
-        """Do nothing, because no browser has to connect."""
+        """Do nothing: a recorder does not wait for a browser."""
 
     def close(self) -> None:
-        """Do nothing, because nothing is open."""
+        """Do nothing: a recorder has no open connection."""
 
 
 def _message(lowered: Lowered) -> bytes:
@@ -190,7 +190,7 @@ def stage_info(
     sun, direction, orbit = np.array(SUN), np.array(VIEWS[scene]), dict[str, object]()
     field = field_of(robot, frame_of(robot, frame)) if scene == "space" else None
     if field and robot.orbit:
-        # z is away from the central body, and x along the orbit.
+        # The z axis points away from the central body, and the x axis along the orbit.
         radial, along, normal = field.axes.T
         sun, direction = (along * x + normal * y + radial * z for x, y, z in (sun, direction))
         far = robot.orbit.radius / robot.orbit.body_radius

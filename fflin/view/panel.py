@@ -16,7 +16,7 @@ from fflin.view.page import packed
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
-# Values below this, in SI units, are rounding errors.
+# Values below this, in SI units, count as rounding errors.
 _NOTHING = 1e-14
 
 # Lines below this fraction of the largest line of their plot are not drawn.

@@ -135,7 +135,7 @@ def _link(robot: Robot, shape: Shape) -> list[float]:
 
 
 class Animation(SetAnimation):
-    """Animation of all moving nodes, in the form that is sent."""
+    """Animation of all moving nodes, in the form that is sent to the page."""
 
     def __init__(self, clips: Sequence[dict[str, object]]) -> None:
         self._clips = list(clips)

@@ -243,7 +243,7 @@ def bendings(robot: Robot) -> dict[str, Bending]:
 
 
 def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
-    """Return {link: bending} of the links of a URDF that are fixed to an appendage's frame."""
+    """Return {link: bending} for the links of a URDF that are fixed to an appendage's frame."""
     children: dict[str, list[str]] = {}
     for joint in root.find_all("joint"):
         ends = [joint.find_all(end) for end in ("parent", "child")]
@@ -285,7 +285,8 @@ def balls(
             bending = bendings(robot)[item.title]
             mass = float(np.square(item.participation[:3, 0]).sum())
             size = _radius(mass or 1.0)
-            # Without mass, a box is drawn, because its rotation is visible.
+            # Without mass the appendage only rotates, so a box is drawn: unlike a sphere, it shows
+            # rotation.
             kind, sides = ("sphere", (size,)) if mass else ("box", (size,) * 3)
             found.append((bending.node, kind, sides, bending.center))
     return found

@@ -142,7 +142,7 @@ def _compare_inertia(item: _Modes, bodies: list[pin.Inertia], links: Mapping[str
 
 
 def _radius_of_gyration(mass: float, inertia: Array) -> float:
-    """Return the root mean square distance [m] of a body's mass from the origin of its inertia."""
+    """Return the root mean square distance [m] of a mass from the point that `inertia` is about."""
     return math.sqrt(max(float(np.trace(inertia)), 1e-300) / max(2.0 * mass, 1e-300))
 
 
@@ -282,7 +282,7 @@ def _balls(item: _Modes, body: pin.Inertia) -> list[_Ball]:
         center = np.zeros(3)
         if math.sqrt(square) * size > _NONE * float(np.linalg.norm(r)):
             center = np.cross(t, r) / square
-            # The ball's distance is at most the body's radius of gyration.
+            # Limit the ball's distance to the body's radius of gyration.
             center *= min(1.0, size / max(float(np.linalg.norm(center)), 1e-300))
         else:
             t, square = np.zeros(3), 0.0

@@ -1,7 +1,7 @@
 r"""Flexible appendages and slosh: passive degrees of freedom of a link, as bodies on joints.
 
-An appendage that is clamped to a frame with the twist V, and has modal amplitudes :math:`\eta` of
-unit modal mass and the participation L (6, k), has the kinetic energy
+Let an appendage be clamped to a frame that moves with the twist V. With modal amplitudes
+:math:`\eta` of unit modal mass and the participation L (6, k), its kinetic energy is
 
 .. math:: T = \tfrac12 V^T M_{rr} V + V^T L \dot\eta + \tfrac12 \dot\eta^T \dot\eta.
 
@@ -112,8 +112,8 @@ class FlexibleAppendage(Appendage):
     rotation: Any
     damping: Any = 0.005
     name: str | None = None
-    # M_rr (6, 6) from a file, about the frame's origin, with translation before rotation; `rigid`
-    # is true if it replaces the inertia of the URDF.
+    # M_rr (6, 6) from a file, about the frame's origin, with translation before rotation. `rigid`
+    # is true if this inertia replaces the inertia of the URDF.
     inertia: Array | None = field(default=None, kw_only=True)
     rigid: bool = field(default=False, kw_only=True)
 

@@ -82,7 +82,7 @@ def read_superelement(
 
 
 def _boundary(path: Path) -> tuple[Mask, Array, Array]:
-    """Return the mask of boundary degrees of freedom, the rigid motions of all, and the grids."""
+    """Return the mask of boundary degrees of freedom, all rigid motions, and the grid points."""
     try:
         with np.printoptions():  # pyYeti changes them for the whole process
             from pyyeti import nastran
@@ -92,7 +92,8 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
         ) from None
     punched = path.suffix == ".asm" and path.with_suffix(".pch").is_file()
     try:
-        # A .pch file lists the kept degrees of freedom of each grid; without it all six are kept.
+        # A .pch file lists the degrees of freedom that each grid point retains; without the file
+        # it retains all six.
         uset, _, boundary, *kept = nastran.asm2uset(
             str(path), try_rdextrn="pv_only" if punched else False
         )

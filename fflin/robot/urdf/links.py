@@ -19,12 +19,12 @@ _QUATERNION_SLACK = 1e-3
 # rounded. The tolerance is larger because CAD programs write fewer digits.
 _NEGATIVE_SLACK = 1e-9
 
-# The inertia of a point mass from a CAD program is a rounding error of either sign. It is as small
-# as the inertia of a body within this distance of its centre.
+# CAD programs give a point mass an inertia that is only a rounding error of either sign. It is no
+# larger than if the body extended this far from its centre.
 _POINT = 1e-6  # [m]
 
-# A negative moment below this fraction of the whole rigid body's moment is accepted. It changes M
-# less than the rounding of published numbers.
+# A negative moment is accepted below this fraction of the whole rigid body's moment. It changes M
+# by less than the rounding of published numbers does.
 _LOST_IN_BODY = 1e-6
 
 # Tolerance of the triangle inequality of principal moments. A flat plate fulfils it with equality,
@@ -114,7 +114,7 @@ def refuse_near_miss(element: Element, of: str, known: tuple[str, ...]) -> None:
 
 
 def is_impossible(mass: float, moments: Sequence[float]) -> bool:
-    """Return whether ascending principal moments [kg m^2] are negative beyond rounding."""
+    """Return whether any of the sorted principal moments [kg m^2] is negative beyond rounding."""
     # A body within the radius r of its centre has moments of at most mass r^2.
     return moments[0] < -max(_NEGATIVE_SLACK * moments[-1], mass * _POINT**2)
 

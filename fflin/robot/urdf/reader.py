@@ -41,7 +41,7 @@ XACRO_LIMIT = 60.0
 # modules from the working folder.
 _CHILD = str(Path(__file__).with_name("xacro_child.py"))
 
-# Elements that do not affect the model, so a "${" below them does not require xacro.
+# These elements do not affect the model, so a "${" inside them does not require xacro.
 _IGNORED = {
     *("visual", "collision", "material", "gazebo", "transmission", "ros2_control"),
     *("sensor", "plugin", "safety_controller", "calibration"),
@@ -227,7 +227,7 @@ def _numbers(values: tuple[float, ...]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return an attribute's value in quotes; the standard library's functions load many modules."""
+    """Quote an attribute's value; the standard library's functions would load many modules."""
     return f'"{text.translate(_ENTITIES)}"'
 
 

@@ -22,8 +22,8 @@ _TAG_LIMIT = 2**20  # bytes
 # No physical value is larger than this, and the product of two such numbers does not overflow.
 _LARGEST = 1e30
 
-# Least similarity of a misspelt name: xzy is near to xyz, and quat to quat_xyzw; unit and value
-# are not near.
+# Least similarity at which a name counts as misspelt. For example, xzy is near to xyz, and quat to
+# quat_xyzw, but unit is not near to value.
 _NEAR = 0.6
 
 _SPACE = " \t\r\n"
@@ -144,7 +144,7 @@ def decimal(text: str) -> float:
 
 
 def quoted(text: str) -> str:
-    """Return a text of a file for an error: quoted, short, printable and on one line."""
+    """Return text from a file for an error message: quoted, short, printable and on one line."""
     return repr(text if len(text) <= 60 else f"{text[:57]}...")
 
 
@@ -160,7 +160,7 @@ def named(kind: str, names: Sequence[str]) -> str:
 
 def notes_of(root: Element) -> list[str]:
     """Return the notes about a document, one line each."""
-    # Notes contain the file's name without its folder, because they are kept with the robot.
+    # Notes are saved with the robot, so they contain the file's name without its folder.
     origin = root.origin.rpartition(os.sep)[2]
     return [
         f"{origin}:{lines[0]}: {message}"
