@@ -39,7 +39,7 @@ def natural_modes(lin: LinearModel) -> NaturalModes:
     warn_of_stiffness(lin)
     nv, inertia = len(lin.M), np.sqrt(lin.M.diagonal())
     # Input forces that cancel each other leave rounding errors in the derivatives. Derivatives of
-    # that size are set to zero.
+    # this size are set to zero.
     A = lin.A.copy()
     by_position, rounding = A[nv:, :nv], np.abs(lin.B[nv:]) @ np.abs(lin.u0)
     by_position[np.abs(by_position) <= 1e2 * EPS * rounding[:, None]] = 0.0

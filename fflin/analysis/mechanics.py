@@ -102,7 +102,7 @@ class SecondOrder:
         return np.sqrt(self.M.diagonal())
 
     def restricted(self, R: Array) -> SecondOrder:
-        """Return the system restricted to motions R z by constraint forces that do no work."""
+        """Return the system restricted to the motions R z; constraint forces do no work."""
         M = R.T @ self.M @ R
         K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
         return SecondOrder(M, K, D, self.S.after(R.T))

@@ -353,7 +353,7 @@ def energy_by_body(
 ) -> list[Mapping[str, float]]:
     """Return {body: fraction of the kinetic energy} of shapes (nx,), see `Mode`.
 
-    Without a robot the mappings are empty.
+    Without a robot, the mappings are empty.
     """
     if robot is None:
         return [{} for _ in shapes]

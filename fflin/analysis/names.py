@@ -87,7 +87,7 @@ def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[
 
 
 def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
-    """Return a note if rounding error leaves undecided whether the slowest motion decays."""
+    """Return a note if rounding error hides whether the slowest motion decays."""
     return tuple(
         f"undecided: {shape(lin, at)} may or may not decay by itself, because its decay rate is "
         f"only {ratio:.1g} times its rounding error; the model may or may not be {what}"

@@ -328,7 +328,7 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
 
 
 def _balanced(lin: LinearModel) -> LinearModel:
-    """Return the model without stiffness and damping if they are only rounding errors of a spin."""
+    """Set stiffness and damping of a model to zero if they are only rounding errors of a spin."""
     nv, A, system = len(lin.M), lin.A.copy(), second_order(lin)
     if not lin.dt and not system.K.values.any():
         A[nv:, :nv] = 0.0

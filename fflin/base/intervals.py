@@ -69,7 +69,7 @@ def mean(values: Array, confidence: float) -> Estimate:
 
 
 def rank_correlations(columns: Array, values: Array) -> Array:
-    """Return Spearman's correlation of columns (N, k) with values (N,), which may be infinite."""
+    """Return Spearman's correlation of each column (N, k) with values (N,), also infinite ones."""
     ranks = np.column_stack([_ranks(column) for column in (*columns.T, values)])
     ranks -= ranks.mean(axis=0)
     size = np.linalg.norm(ranks, axis=0)

@@ -129,7 +129,7 @@ class ChunkJob:
 
 
 class BatchEquations:
-    """Equations of a robot's linear models about many points, for the arrays that vary."""
+    """Compiled equations for the arrays of linear models that vary between points."""
 
     def __init__(self, prepared: Prepared, *, only_inertia: bool) -> None:
         self._prepared, self._only_inertia = prepared, only_inertia

@@ -115,7 +115,8 @@ class LinearBatch(FrozenArrays):
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Fields of the models, by name, that are the same at all points or need the robot.
+    # Fields of the models that are not fields of the batch: the same at all points, or taken from
+    # the robot.
     _asked: Mapping[str, Any]
     verified: bool = True
 

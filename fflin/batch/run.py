@@ -110,9 +110,9 @@ def run_chunks(
     all_needed: bool = False,
 ) -> list[Done]:
     """Compute the missing chunks of a store, save the results, and return failed chunks."""
-    # `rows(start, stop)` returns a named tuple; the store saves those of its fields for which it
-    # has arrays. Only chunks that begin before `upto` are computed. Without an executor, the chunks
-    # run on `threads` threads of this process. If all chunks are needed, the run ends at the first
+    # `rows(start, stop)` returns a named tuple; the store saves the fields for which it has arrays.
+    # Only chunks that begin before `upto` are computed. Without an executor, the chunks run on
+    # `threads` threads of this process. If all chunks are needed, the run ends at the first
     # failure.
     size = store.chunk
     spans = [Span(at, min(at + size, store.count)) for at in range(0, store.count, size)]

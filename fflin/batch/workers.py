@@ -41,7 +41,8 @@ class OwnWorkers(Executor):
             warnings.warn(said, FflinWarning, stacklevel=5)
             count = cores
         self._max_workers = count
-        # With fork, a process would inherit locks that other threads hold.
+        # With fork, a process would inherit locks that other threads hold, and could wait for them
+        # forever.
         self._context = get_context("spawn")
         self._threads = ThreadPoolExecutor(count)
         self._mine = local()

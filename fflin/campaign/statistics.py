@@ -36,7 +36,8 @@ KINDS = {
 }
 # Attitude error [deg] at which a run is close to the end of the chart.
 EDGE = 176.0
-# Steps between checks of a stop condition, and steps per call without a stop condition.
+# LOOK is the number of steps between checks of a stop condition. _LONG is the number of steps per
+# call without a stop condition.
 LOOK, _LONG = 64, 2**20
 
 # Function of the state errors (N, nx) at the start and now; returns the mask (N,) of ended runs.

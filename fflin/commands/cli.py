@@ -72,8 +72,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_error(f"fflin: error: {error}")
         return BAD_INPUT
     except BrokenPipeError:
-        # The reader of the pipe, such as head, has closed it. With the old stdout, Python would
-        # report the closed pipe again at exit.
+        # The reader of the pipe, such as head, has closed it. Redirect the output, because Python
+        # would report the closed pipe again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:

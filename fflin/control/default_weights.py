@@ -28,8 +28,8 @@ ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 # joints would swing by radians.
 _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
-# The effect of the inputs on a mode, relative to the effort that holds the mode at rest, is set to
-# this if it is smaller. Such a mode keeps the decay that it has without feedback.
+# The effect of the inputs on a mode, relative to the effort that holds the mode at rest, is raised
+# to this if it is smaller. Such a mode keeps the decay that it has without feedback.
 _LEAST_REACH = 1e-3
 
 # If the effect of the inputs on a coordinate, relative to the inertia, is below this, it counts as

@@ -32,7 +32,7 @@ _LARGE = 9 * 18
 # Relative accuracy of the largest gain over frequency.
 ACCURACY = 1e-5
 
-# A loop with a smaller disk margin is called fragile.
+# A loop whose disk margin is below this is called fragile.
 _FRAGILE = 0.3
 
 

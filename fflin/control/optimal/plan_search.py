@@ -27,7 +27,8 @@ _MEETS = 1e-10
 # If the total error of a single motion exceeds half of this, the error is not corrected.
 _NEARLY = 1e-3
 
-# _SEEKS is the integration accuracy of interval ends during the search, and _FLIES at its end.
+# _SEEKS is the integration accuracy of interval ends during the search, and _FLIES is the accuracy
+# at the end of the search.
 _SEEKS, _FLIES = 1e-6, 1e-8
 
 # The search ends if an iteration saves less than the fraction _SAVED of the effort, or after _MOST
@@ -82,7 +83,7 @@ class Search(NamedTuple):
     report: Callable[[str], None]  # receives a line of text in each iteration
 
     def best(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return q, v and u at the knots with least effort, or closest to the end.
+        """Return the knots q, v and the inputs u of least effort, or closest to the end state.
 
         The search begins at the given knots and inputs.
         """

@@ -290,7 +290,7 @@ class OptimalLoop(NamedTuple):
 
 
 def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalLoop | None:
-    """Return a loop that is optimal without odd powers (10.5), or None for other systems."""
+    """Return a loop that is optimal if odd powers (10.5) are neglected, or None if impossible."""
     nx = len(A)
     m = nx // 2
     if nx != 2 * m or B[:m].any():
