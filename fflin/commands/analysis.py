@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
 
-_SLACK = 1e-9  # up to which a value is at its limit, in SI units
+_SLACK = 1e-9  # [SI]; a value counts as at its limit within this distance
 
 
 def add_commands(commands: parser.Commands) -> None:

@@ -99,7 +99,7 @@ def _robots(_: argparse.Namespace) -> Report:
     for name in list_robots():
         try:
             with warnings.catch_warnings():
-                # These warnings are left to `fflin info`.
+                # Do not show these warnings here; `fflin info` shows them.
                 warnings.simplefilter("ignore", FflinWarning)
                 entries.append((name, load(name), find_robot(name).origin))
         except FflinError as error:
@@ -253,7 +253,8 @@ def model_report(lin: LinearModel) -> str:
     head += f"; the operating point is {point}"
     parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # The poles of a model in motion do not show stability. If A A = 0, all poles are zero.
+    # Poles are reported only at a fixed point, because the poles of a model in motion do not show
+    # stability. If A A = 0, all poles are zero.
     if stays and not lin.dt and (lin.A @ lin.A).any():
         from fflin.analysis.modes import modes
 

@@ -24,7 +24,7 @@ from fflin.commands.parser import (
 
 
 class _FormerName(argparse.Action):
-    """Option under its former name; it warns that there is a new name."""
+    """Option under its former name; it sets the option of the new name and warns."""
 
     def __call__(
         self, _: object, given: argparse.Namespace, value: object, option: object = None

@@ -168,7 +168,7 @@ def refuse_pose(arguments: argparse.Namespace, prefix: str = "") -> None:
 def velocity_of(
     robot: Robot, arguments: argparse.Namespace, state: Mapping[str, Any], *options: str
 ) -> Array | None:
-    """Return the velocity (nv,) of a robot's state, overridden by the given options in turn."""
+    """Return the velocity (nv,) of a robot's state; each option overrides the values before it."""
     from fflin.base.names import rates_by_name
     from fflin.dynamics.points import velocity
 
@@ -205,7 +205,7 @@ def held_at(
 
 
 def attitude(robot: Robot, q: Array, number: int, frame: Frame) -> tuple[Array, pin.SE3]:
-    """Return q (nq,) and base placement of the relative equilibrium with a number from 1 to 24."""
+    """Return q (nq,) and the base placement of the relative equilibrium `number`, from 1 to 24."""
     import pinocchio as pin
 
     from fflin.analysis.relative_equilibria import relative_equilibria

@@ -165,8 +165,8 @@ def robot_of_design(
 ) -> Robot:
     """Return the robot of a design; with allocation, base torque and force replace the thrusters.
 
-    By default, thrusters are allocated if they can push in every direction, unless the law in a
-    file was designed for other inputs.
+    By default, thrusters are allocated if they can push in every direction, unless the controller
+    in a file was designed for other inputs.
     """
     from fflin.control.authority import thrusters_give_every_wrench
     from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
@@ -260,7 +260,7 @@ def _lqr(arguments: argparse.Namespace) -> Report:
     from fflin.base.record import record_of
 
     robot, design, _, gain = designed(arguments)
-    # The warnings of the gain already appear on stderr.
+    # The report omits warnings, because they already appear on stderr.
     text = "\n\n".join(x for x in str(gain).split("\n\n") if not x.startswith("warning: "))
     if design is not robot:
         text += f"\n\n{folded([_ALLOCATED])}"

@@ -55,8 +55,8 @@ def _add_plan(commands: parser.Commands) -> None:
     options.add_output_file(
         plan.group(parser.OUTPUT), "the trajectory", parser.TABLE, "Trajectory", "Motion"
     )
-    # The functions for start and target read these options of other commands, so they need a value
-    # here.
+    # The functions for start and target read these options, which only other commands have, so they
+    # need a value here.
     plan.set_defaults(relative_equilibrium=None)
 
 

@@ -74,7 +74,7 @@ def add_commands(commands: parser.Commands) -> None:
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
-    """Split JOINT=A:B:... into the name and its values, as many as `form` has."""
+    """Split JOINT=A:B:... into the name and its values; `form` has the same number of values."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
     if not name or len(parts) != len(form.split(":")):

@@ -93,7 +93,7 @@ class StateLaw(Law):
     def _case(self, random: np.random.Generator, row: int, index: int) -> Case:
         state, n, about = self.state, self.state.robot.n, self.placements[row]
         world = StateMap(state.robot, frame=self.frame)
-        # A displaced state with the base at the reference; its pose is set afterwards.
+        # A random state near x0 with the base at the reference; the base's pose is set afterwards.
         x = self.x0[row] + random.normal(scale=10.0 ** random.uniform(-4, 0), size=state.nx)
         x[:6] = 0.0
         turns = np.zeros(n)
@@ -243,7 +243,7 @@ def _robot_of(given: Any, lin: LinearModel | None) -> Robot | None:
 
 
 def _model_of(gain: Gain, robot: Robot) -> LinearModel:
-    """Linearise the robot at the point and reference of a gain that was read from a file."""
+    """Linearise a robot at the point and reference stored with a gain that was read from a file."""
     if not gain.placement.size:
         raise InputError(
             "the file of the gain does not contain the reference pose, because the file was "

@@ -23,7 +23,7 @@ from fflin.robot.robot import Robot
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
 _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
 
-# Largest rounding error in double precision, relative to the magnitudes of the terms.
+# Largest accepted rounding error in double precision, relative to the magnitudes of the terms.
 _DOUBLE_ERROR = 1e-14
 
 
@@ -123,7 +123,7 @@ def write_c(
 
 
 def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
-    """Return the digest that ties the description of a law to its code."""
+    """Return the digest that shows whether a law's description and code belong together."""
     parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
     return content_digest(parts)
 
@@ -133,7 +133,7 @@ class _Texts:
 
     def __init__(self, law: StateLaw | OutputLaw, name: str, real: str) -> None:
         self.law, self.name, self.real, self.cases = law, name, real, law.cases()
-        # Unit roundoff of a float times the number of operations.
+        # For single precision, the bound is the unit roundoff times the number of operations.
         self.error = _DOUBLE_ERROR if real == "double" else law.operations * 2.0**-24
         bounds = self.error * np.max([case.scale for case in self.cases], axis=0)
         sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, law.inputs[1], strict=False)]
@@ -193,7 +193,7 @@ class _Texts:
         return Template(text).substitute(self.words)
 
     def _vectors(self) -> dict[str, object]:
-        """Return the entries of the test program's template."""
+        """Return the values that fill the template of the test program."""
         law, rows, nu = self.law, [], len(self.law.inputs[0])
         for case in self.cases:
             out = case.out.copy()

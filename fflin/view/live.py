@@ -140,7 +140,7 @@ class Live:
         self.close()
 
     def _forward(self, command: bytes) -> None:
-        # Until the server exists, the recorder stores the commands.
+        # Until the server exists, the recorder only stores commands.
         if hasattr(self, "_server"):
             self._server.send(command)
 
@@ -179,7 +179,7 @@ def _joints(robot: Robot) -> list[dict[str, Any]]:
 
 
 class Server:
-    """Server of a page and its updates; it ends with its process."""
+    """Server of a page and its updates; it stops when its process ends."""
 
     def __init__(
         self,
@@ -274,7 +274,7 @@ def _listen(port: int) -> socket.socket:
 
 
 class _Guarded(RequestHandler):
-    """Handler that accepts only this machine's names as host, to refuse pages of other sites."""
+    """Handler that accepts only this machine's names as host, and so refuses other sites' pages."""
 
     def initialize(self, hosts: set[str], **fields: Any) -> None:
         self._hosts = hosts
@@ -295,7 +295,7 @@ class _Page(_Guarded):
 
 
 class _Socket(_Guarded, WebSocketHandler):
-    """Connection to one browser, which gets the newest state when the previous one has arrived."""
+    """Connection to one browser, which gets the newest state after the previous has arrived."""
 
     _busy = False
     _behind = False

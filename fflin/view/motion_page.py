@@ -37,8 +37,8 @@ Moving: TypeAlias = "tuple[Drawing, Array]"
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
 
-# Length of the arrow of the largest force, and the path length above which the camera follows the
-# base by default, both in robot sizes.
+# Length of the largest force's arrow. The camera follows the base by default if its path is longer
+# than _FAR. Both are in robot sizes.
 ARROW, _FAR = 0.62, 20.0
 
 
@@ -100,7 +100,7 @@ def motion_page(
     points = _points(film, size, (drawing, goals), held.values())
     info["floor"][2] = float(points[:, 2].min())
     if follow is None:
-        # If a long path were in view as a whole, the robot would be a dot.
+        # If the whole of a long path were in view, the robot would be only a dot.
         follow = bool(np.ptp(points, axis=0).max() > _FAR * size)
     if follow:
         points = frame_points(drawing, film, size, follow=True)
@@ -161,7 +161,7 @@ def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
 
 
 def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool = False) -> Array:
-    """Return points (M, 3) for the camera: body corners and tips of forces at some frames."""
+    """Return points (M, 3) that the camera must show: body corners and force tips."""
     chosen = np.unique(np.linspace(0, len(film.t) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []

@@ -27,12 +27,12 @@ _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1
 # Extension types of msgpack-lite, which the page decodes as typed arrays.
 _TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
 
-# Placeholder for a mesh that the page has already.
+# Placeholder for a mesh that the page already has.
 _ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 
 def _object(geometry: dict[str, Any], matrix: Array, about: dict[str, object]) -> dict[str, object]:
-    """Return a three.js mesh; the page has its material and earlier geometry."""
+    """Return a three.js mesh as sent to the page, which has its material and known geometry."""
     return {
         "metadata": {"version": 4.5, "type": "Object"},
         "geometries": [geometry],

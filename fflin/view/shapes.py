@@ -197,9 +197,10 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
 
 
 class Bending(NamedTuple):
-    """First-order motion of an appendage's links by its modes: a rotation about its frame.
+    """First-order motion of an appendage's links by its modes, as a rotation about its frame.
 
-    The rotation is the best fit to mode shapes with the given participation.
+    The rotation is the best fit to mode shapes with the given participation. If no mode has a
+    rotation part, the motion is a translation.
     """
 
     node: int  # Pinocchio joint of the first mode; its scene node carries the links
@@ -238,7 +239,7 @@ def bendings(robot: Robot) -> dict[str, Bending]:
 
 
 def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
-    """Return {link: bending} of the links of a URDF that are fixed to an appendage's frame."""
+    """Return {link: bending} for the links of a URDF that are fixed to an appendage's frame."""
     children: dict[str, list[str]] = {}
     for joint in root.find_all("joint"):
         ends = [joint.find_all(end) for end in ("parent", "child")]
@@ -260,7 +261,7 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
 
 
 def _node_of(frame: pin.Frame, bent: dict[str, Bending]) -> tuple[int, pin.SE3]:
-    """Return the Pinocchio joint whose node carries a link's frame, and the frame on this node."""
+    """Return the Pinocchio joint whose node carries a link's frame, and its placement there."""
     if bending := bent.get(frame.name):
         return bending.node, bending.frame.actInv(frame.placement)
     return frame.parentJoint, frame.placement
@@ -277,7 +278,8 @@ def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
             bending = bendings(robot)[item.title]
             mass = float(np.square(item.participation[:3, 0]).sum())
             size = _radius(mass or 1.0)
-            # Without mass, a box is drawn, because its rotation is visible.
+            # Without mass the appendage only rotates, so a box is drawn: unlike a sphere, it shows
+            # rotation.
             kind, sides = ("sphere", (size,)) if mass else ("box", (size,) * 3)
             yield Shape(bending.node, kind, sides, pin.SE3(np.eye(3), bending.center))
 
@@ -316,7 +318,7 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
 
 @lru_cache(maxsize=256)
 def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
-    # A changed time or size of the file is a new key of the cache, so a changed file is read again.
+    # The cache's key contains time and size of the file, so a changed file is read again.
     parts = _colored(path) if path.suffix.lower() == ".dae" else []
     parts = parts or [(*_triangles(path), None)]
     corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
@@ -381,7 +383,7 @@ def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    # Several triangles may have become the same.
+    # After the merge, several triangles may be equal.
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(kept)]
     used, compact = np.unique(faces, return_inverse=True)
