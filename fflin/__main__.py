@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# `_signal` is built in, so that a signal.py in the working folder is not imported instead.
+# `_signal` is built in, so a signal.py in the working folder cannot be imported in its place.
 import _signal as signal  # type: ignore[import-not-found]
 import gc
 import os
@@ -39,7 +39,7 @@ def main() -> int:
 
 def listen() -> None:
     """Make Ctrl-C end the process even in a callback, where `KeyboardInterrupt` would be lost."""
-    # If the parent process ignores SIGINT, as nohup does, it remains ignored.
+    # If the parent process ignores SIGINT, as nohup does, this process must ignore it too.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
         sys.unraisablehook = _unraisable
@@ -49,7 +49,7 @@ def leave(reason: BaseException) -> NoReturn:
     """Report the stop in one line, and exit without waiting for threads."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        # A single write, so that the output of other processes cannot split the line.
+        # The line is written at once, so that the output of other processes cannot split it.
         sys.stderr.write(f"fflin: {reason}\n" if reason.args else "fflin: stopped\n")
         if sys.stdout is not None:
             sys.stdout.flush()

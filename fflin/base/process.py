@@ -59,7 +59,7 @@ class Progress:
 
 
 def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
-    """Return `sys.path` without some folders, in whatever form its entries name them."""
+    """Return `sys.path` without the entries that refer to some folders, however they are spelt."""
     return [entry for entry in sys.path if not any(same_file(entry, each) for each in folders)]
 
 

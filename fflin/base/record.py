@@ -67,7 +67,7 @@ def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool)
 
 def read_record(path: Path) -> tuple[Record, bool]:
     """Return the record in a file, and whether its digest was verified; call within `reading`."""
-    # Arrays may return with another shape: .mat has no vectors and .json has no empty matrices.
+    # The shape of an array may change, because .mat has no vectors and .json has no empty matrices.
     check_ending(path, FORMATS)
     return decoded(path.suffix, read_file(path, path.suffix))
 
@@ -79,7 +79,7 @@ def decoded(suffix: str, content: bytes) -> tuple[Record, bool]:
 
 @contextmanager
 def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
-    """Turn all errors in reading a file that program `by` saved into one `FileError`."""
+    """Convert any error in reading a file to one `FileError`; program `by` saved the file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SciPy takes damaged headers for old ones
@@ -159,7 +159,8 @@ def _to_npz(record: Mapping[str, object], checksummed: bool) -> bytes:
 def _from_npz(content: bytes) -> tuple[Record, bool]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         record = {key: file[key] for key in file.files}
-    # The archive ends with its number of entries. A damaged length field can hide some entries.
+    # The archive ends with its number of entries. This number reveals entries that a damaged length
+    # field hides.
     end = content[-22:]
     if end[:4] == b"PK\5\6" and int.from_bytes(end[10:12], "little") != len(record):
         raise ValueError(DAMAGED)
@@ -167,7 +168,7 @@ def _from_npz(content: bytes) -> tuple[Record, bool]:
 
 
 def verify_checksum(record: Record) -> bool:
-    """Remove the digest from the entries of a .npz file; return whether there was a valid one."""
+    """Remove and verify the digest of .npz entries; return False if there is no digest."""
     checksum = record.pop(CHECKSUM, None)
     if checksum is not None and text(checksum) != content_digest(record):
         raise ValueError(DAMAGED)
@@ -207,7 +208,7 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
 
 
 def _of_mat(value: object) -> Any:
-    """Convert a MATLAB variable to an array, string, list of cells or rows, or dict (struct)."""
+    """Convert a MATLAB variable: text to str, cells or text rows to a list, a struct to a dict."""
     if not isinstance(value, np.ndarray):
         return value
     if value.dtype.names:
@@ -302,7 +303,7 @@ class Design(FrozenArrays):
 
     @classmethod
     def _read(cls: type[Kind], path: str | Path, **given: object) -> Kind:
-        """Read a file as `load` does; `given` holds the fields that no file contains."""
+        """Read a file as `load` does; `given` are the fields that files do not contain."""
         source, name = as_path(path), cls.__name__
         with reading(source, name):
             record, verified = read_record(source)

@@ -132,7 +132,7 @@ class GivenConfigurations:
         return self.q[start:stop]
 
 
-# Configurations that `sweep` accepts instead of an array; their rows are generated on demand.
+# Configurations of a sweep; the rows of a grid and random rows are generated on demand.
 Configurations: TypeAlias = Grid | RandomConfigurations | GivenConfigurations
 
 

@@ -15,8 +15,8 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# Position of a joint in q: (index, -1), or the indices of (cos, sin) for a continuous joint. The
-# factor is the entry of q for a joint value of 1.
+# Two indices of a joint in q, and a factor. A continuous joint has the indices of (cos, sin); any
+# other joint has -1 as its second index. The factor is the entry of q for a joint value of 1.
 Column: TypeAlias = tuple[int, int, float]
 
 # Number of rows that are checked together, which limits the memory for intermediate results.
@@ -37,7 +37,7 @@ class Points(NamedTuple):
 
 
 def column(joint: Joint) -> Column:
-    """Return the indices and the scale of a joint in q."""
+    """Return the `Column` of a joint: its indices in q and its factor."""
     return joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1, joint.scale
 
 
@@ -63,7 +63,7 @@ def away(q: Array, column: Column, value: float) -> Array:
 
 
 def follow_rows(robot: Robot, q: Array) -> None:
-    """Set the mimic joints of configurations (N, nq) from their leaders."""
+    """Set the mimic joints of configurations (N, nq) from the joints that they follow."""
     for joint, leader, multiplier, offset in robot.followers:
         at: Any = multiplier * values(q, column(leader)) + offset
         joint.place(q.T, at)
@@ -80,7 +80,7 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
                 excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
             # A finite sum shows that all entries are finite.
             finite = np.isfinite(block.sum()) or np.isfinite(block).all(axis=1)
-        # Comparisons with NaN are false, so rows with NaN are doubtful.
+        # Comparisons with NaN are false, so rows with NaN count as doubtful.
         doubtful = ~((excess <= ROUND_OFF) & finite)
         if robot.followers:
             followed = block.copy()

@@ -156,7 +156,7 @@ def jam(
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> tuple[dict[str, Any], Array]:
-    """Join robots at (q, v) to one (13.1); return the fields of `Impact`, and the impulses."""
+    """Join robots at (q, v) to one robot (13.1); return the fields of `Impact` and the impulses."""
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))
@@ -203,7 +203,7 @@ def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
 
 
 def joint_called(robot: Robot, name: str) -> pin.JointModel:
-    """Return the joint of Pinocchio's model with a name."""
+    """Return the joint with a name in Pinocchio's model."""
     return robot.model.joints[robot.model.getJointId(name)]
 
 
@@ -365,7 +365,7 @@ def capture(
 
 
 def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tuple[Array, Array]:
-    """Return the checked configuration and velocity of a payload with its base at a placement."""
+    """Return a payload's checked configuration and velocity, with its base at a given placement."""
     configuration = other.neutral() if q is None else other.checked_configuration(q).copy()
     root = other.model.jointPlacements[ROOT]
     configuration[:7] = pin.SE3ToXYZQUAT(root.actInv(at))

@@ -1,4 +1,4 @@
-"""Checks of the fields of a robot that the user may set, and the limits of a robot."""
+"""Checks of the robot's fields that the user may set, and the limits of a robot."""
 
 from __future__ import annotations
 
@@ -82,13 +82,13 @@ def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[st
 
 
 def _input_keys(inputs: Sequence[Input]) -> tuple[str, ...]:
-    """Return the names of inputs with their groups, as `fflin.base.names.input_keys` does."""
+    """Return input names with groups, such as "thrust.NAME"; see `fflin.base.names.input_keys`."""
     pairs = ((item.GROUP, name) for item, names in named_inputs(inputs) for name in names)
     return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
 
 
 def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) -> dict[str, Range]:
-    """Return {input or state: (least, largest)} from one magnitude, or from limits by name."""
+    """Convert limits by name, or one for all inputs, to {input or state: (least, largest)}."""
     keys, states, named = _input_keys(inputs), state_keys(joints), named_inputs(inputs)
     names = [*(name for _, own in named for name in own), *states]
     floors = [0.0 if not item.PULLS else -math.inf for item, own in named for _ in own]
@@ -98,7 +98,7 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) 
     ranges = {str(key): range_of(key, value) for key, value in given.items()}
     of_inputs = {key: ranges[key] for key in ranges if stands_for_any(key, keys)}
     of_states = {key: ranges[key] for key in ranges if key not in of_inputs}
-    # A limit for all joints excludes wheels, because they are much faster than joints.
+    # A limit for all joints does not apply to wheels, because wheels are much faster.
     wheels = {f"{group}.{name}" for group in _OF_JOINTS for name, _ in named_wheels(inputs)}
     whole = {key: of_states.pop(key) for key in _OF_JOINTS if key in of_states}
     found = by_name("input or state", whole, (*keys, *states))
@@ -245,8 +245,8 @@ _OPEN: Range = (-math.inf, math.inf)
 
 def limits_of(robot: Robot) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} for all limits."""
-    # Limits of the URDF come first; a limit of zero means none, as exporters write it. Limits of
-    # the inputs replace them, and `Robot.limits` replaces both.
+    # Start with the limits of the URDF, where exporters write zero for no limit. Limits of the
+    # inputs replace them, and `Robot.limits` replaces both.
     found: dict[str, Range] = {}
     for joint in robot.joints:
         low, high = travel_of(robot.model, joint)
@@ -267,7 +267,7 @@ def limits_of(robot: Robot) -> dict[str, Range]:
 def magnitudes_of(robot: Robot) -> dict[str, float]:
     """Return {input or state: magnitude} of all finite limits.
 
-    The magnitude of a joint position is its whole travel, and of a one-sided input its range.
+    For a joint position the magnitude is the whole travel, and for a one-sided input the range.
     """
     sizes = {
         name: largest - least if name.startswith("q_m.") or least >= 0.0 else min(-least, largest)

@@ -67,8 +67,8 @@ class Input:
     def names(self, count: int) -> tuple[str, ...]:
         """Return the names of this input's entries in u.
 
-        `count` is the number of this input among the inputs of its type; the default names of
-        thrusters and wheels contain it.
+        `count` numbers the inputs of one type; the default names of thrusters and wheels contain
+        this number.
         """
         return tuple(f"{self.GROUP}.{entry}" for entry in self.ENTRIES)
 

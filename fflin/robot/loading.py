@@ -105,7 +105,8 @@ def load(
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     if loaded.idle_coordinates:
-        # A note instead of a warning, because every function that inverts M raises this error.
+        # Add a note instead of a warning, because every function that inverts M raises an error
+        # anyway.
         notes.append(massless_note(loaded))
     return replace(loaded, notes=tuple(notes))
 
@@ -113,14 +114,15 @@ def load(
 def _load(
     found: RobotFile, lock: Lock | None, package_dirs: tuple[Path, ...]
 ) -> tuple[Robot, tuple[Advice, ...]]:
-    """Return the robot of a URDF, and warnings that fields of the robot may make unnecessary."""
+    """Return the robot of a URDF, and warnings that fields of the robot can resolve."""
     description = read_urdf(found.path)
     loaded = _robot(description.model, found.name, lock, description.mimics)
     dirs = (*package_dirs, *found.package_dirs)
-    # Meshes are read when the robot is drawn, so output files must not overwrite them before.
+    # Meshes are read only when the robot is drawn, so output files must not overwrite them.
     remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in description.meshes)))
     damping = {name: description.damping.get(name, 0.0) for name in loaded.joint_names}
-    # Damping of a mimic joint is added to its leader with equal dissipated power.
+    # Damping of a mimic joint is added to its leader so that the dissipated power remains the
+    # same.
     for joint, leader, multiplier, _ in loaded.followers:
         damping[leader.name] += multiplier**2 * description.damping.get(joint.name, 0.0)
     loaded = replace(

@@ -124,7 +124,7 @@ class CircularOrbit:
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
-            # No warning for a saved orbit, or for another body that is named earth.
+            # Do not warn if `mu` is given: the orbit was saved, or "earth" names another body.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
                 warnings.warn(
                     f"an altitude of {altitude:.8g} m over earth is too low for an orbit; "

@@ -150,10 +150,10 @@ class Robot(Coordinates):
     appendages: tuple[Appendage, ...] = ()
     # The same robot without wheels and modes; None if no joint is a wheel or mode.
     _unequipped: Robot | None = None
-    # Wheels and modes that were removed when inputs or appendages were replaced.
+    # Names of wheels and modes that no longer exist, because inputs or appendages were replaced.
     _removed: tuple[str, ...] = ()
-    # The model, and a copy of it that shows whether the model was changed since this robot, or the
-    # robot that it derives from, was made.
+    # The model, and a copy of it. The copy shows whether the model has changed since it was
+    # copied.
     _as_made: tuple[pin.Model, pin.Model] | None = None
 
     def __post_init__(self) -> None:
@@ -369,7 +369,8 @@ class Robot(Coordinates):
     @cached_property
     def pieces(self) -> dict[str, Piece]:
         """Mass properties {name: piece} of all links, and of all bodies with several links."""
-        # The joint indices of the bare robot change, because wheels are inserted between joints.
+        # Wheels are inserted between the joints, so the joints' indices differ from the bare
+        # robot's.
         names, at = self._bare.model.names, self.model.getJointId
         now = [at(name) if joint > ROOT else joint for joint, name in enumerate(names)]
         found = self._links_and_bodies[0]
@@ -466,7 +467,7 @@ class Robot(Coordinates):
 
     @property
     def _bare(self) -> Robot:
-        """The robot without wheels and modes."""
+        """The robot without its wheels and modes; itself if it has none."""
         return self._unequipped or self
 
     def _without_motors(self, passive: object) -> Robot:

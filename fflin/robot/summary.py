@@ -188,7 +188,7 @@ def _lines(mark: str, values: Mapping[str, str]) -> str:
 
 
 def _order(model: pin.Model) -> Callable[[int], list[tuple[float, str]]]:
-    """Return a key that sorts frames by name, with the numbers in names by value."""
+    """Return a sort key for frames: by name, with numbers in the names compared by value."""
 
     def key(index: int) -> list[tuple[float, str]]:
         parts = re.split(r"([0-9]+)", model.frames[index].name)
@@ -198,7 +198,7 @@ def _order(model: pin.Model) -> Callable[[int], list[tuple[float, str]]]:
 
 
 def _candidate(robot: Robot, index: int) -> tuple[str, str]:
-    """Return the input that a link's name suggests, as TOML comments, and a wheel's joint."""
+    """Return the input that a link's name suggests, as TOML comments, and the joint of a wheel."""
     model, frame = robot.model, robot.model.frames[index]
     kind = next((kind for kind, look in _LOOKS.items() if look.search(frame.name)), "")
     if not kind or frame.type != pin.FrameType.BODY or frame.parentJoint < ROOT:

@@ -68,7 +68,7 @@ def welded(robot: Robot, lock: Lock) -> Robot:
 
 
 def _without(of: object, gone: Iterable[str], left: Iterable[str]) -> Any:
-    """Remove the keys that match only removed joints from a mapping and its nested mappings."""
+    """Remove keys that match only removed joints, from a mapping and its nested mappings."""
     if not isinstance(of, Mapping):
         return of
     removed, others = (
@@ -84,7 +84,7 @@ def _without(of: object, gone: Iterable[str], left: Iterable[str]) -> Any:
 def locked_model(
     model: pin.Model, lock: Lock, mimics: Mapping[str, Mimic]
 ) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
-    """Weld joints and their mimic joints; return model, other mimic joints and welded joints."""
+    """Weld joints and their mimic joints; return model, remaining mimic joints, welded joints."""
     movable = list(model.names)[ROOT + 1 :]
 
     def found(name: str) -> str:
@@ -114,7 +114,7 @@ def locked_model(
 
 
 def requested(lock: Any) -> dict[str, float | None]:
-    """Return locks as {joint or pattern: value}, where None is the neutral value."""
+    """Return locks as {joint or pattern: value}; the value None means the neutral position."""
     try:
         names = [lock] if isinstance(lock, str) else list(lock)
     except TypeError:
@@ -201,7 +201,7 @@ def _require_new_names(robot: Robot, prefix: str) -> None:
 def _joined(
     model: pin.Model, joint: int, other: pin.Model, placement: pin.SE3, prefix: str
 ) -> pin.Model:
-    """Return a model that has the other's joints after all joints carried by `joint`."""
+    """Return a model with the other model's joints inserted after all joints carried by `joint`."""
     bodies = model.inertias.tolist()
     bodies[joint] = bodies[joint] + placement.act(other.inertias[ROOT])
     names = [f"{prefix}.{name}" for name in other.names]

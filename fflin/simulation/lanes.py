@@ -1,6 +1,6 @@
-"""Choice of the engine, and the compiled loop, which simulates eight runs of a plan at once.
+"""Choice of the engine; the compiled loop, which simulates eight runs of a plan at once.
 
-Each run has a lane. A single run fills all lanes.
+Each run has a lane. If there is only one run, all lanes compute it.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 # Number of steps above which a single run uses the compiled loop, if its machine code is stored.
 LONG = 20_000
-# After a run in Python of more than _LONG_RUN seconds, a message recommends the compiled loop. It
-# takes about the given fraction of the time, and is compiled once in _COMPILING seconds.
+# After a run in Python of more than _LONG_RUN seconds, a message recommends the compiled loop. The
+# compiled loop takes about _FRACTION of the time. Compiling it takes about _COMPILING seconds,
+# once.
 _LONG_RUN, _FRACTION, _COMPILING = 20.0, 0.1, 30.0
 
 _log = logging.getLogger("fflin")
@@ -53,7 +54,7 @@ def noise_generator(seed: float) -> np.random.Generator:
 
 
 def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]:
-    """Return the samples (k,) between two steps, and the policy's noise (k, size) in them."""
+    """Return the samples (k,) between two steps, and the policy's noise (k, size) at them."""
     times, noise = plan.times, noise_of(plan)
     at = np.arange(-(-step // times.sample), -(-last // times.sample))
     rows = np.zeros((len(at), size))
@@ -78,8 +79,8 @@ class Statistics(Protocol):
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Add rows (count, LANES, ..) of q, nu, u, momentum and centre of mass.
 
-        The first row is at step `first`. `raw` (count * width, LANES) contains the same values. The
-        same row may be added twice.
+        The first row is at step `first`. `raw` (count * width, LANES) contains the values of
+        `rows`. The same row may be added twice.
         """
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
@@ -226,7 +227,7 @@ class LaneLoop:
         return sense if self._noisy else lambda *_: None
 
     def _end(self, statistics: Statistics, ending: Mask, stop: Array, out: Runs) -> None:
-        """Write the outcomes of the runs that end at the current step."""
+        """Write into `out` the outcomes of the runs that end at the current step."""
         count = len(ending)
         diverged = (stop == STOPS.index("diverged"))[:count]
 
@@ -238,7 +239,7 @@ class LaneLoop:
         if (ending & diverged).any():
             write(ending & diverged)
         if (ending & ~diverged).any():
-            # The last state is added, unless the run diverged and the state is not finite.
+            # The last state is added, except for diverged runs, whose state may not be finite.
             last = self.last_row()
             statistics.add(self.done, self.split(last), last)
             write(ending & ~diverged)
@@ -260,7 +261,7 @@ class LaneRows:
         self.every, self.kept = every, np.empty((loop.steps // every + 2, loop.width))
 
     def over(self, q: Array, v: Array) -> Mask:
-        """Return that no run ends early."""
+        """Return False for each run: no run ends early."""
         return np.zeros(len(q), dtype=bool)
 
     def reset(self) -> None:

@@ -35,7 +35,7 @@ Event: TypeAlias = Callable[[float, Array, Array], float]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 Limits: TypeAlias = "float | str | Mapping[str, Any] | Sequence[Any]"
 
-# Fraction of a step by which the last stage is evaluated earlier if inputs jump at knots.
+# If inputs jump at knots, the last stage is evaluated earlier by this fraction of a step.
 _BEFORE = 1e-6
 
 
@@ -93,7 +93,7 @@ class Plan:
 
     @property
     def last_node(self) -> float:
-        """Time of the last stage, relative to the step; below 1 if inputs jump at knots."""
+        """Time of the last stage as a fraction of the step; below 1 if inputs jump at knots."""
         return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
 
     def channel(self) -> Channel | None:
@@ -144,7 +144,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
         said = f"target is a model in frame '{target.frame}', expected '{state.frame}'"
         raise InputError(f"{said}, the frame of the motion; q differs between orbital frames")
     goal = state.read(target.q, target.v)
-    # The base states of a model with another reference or frame cannot be copied.
+    # If the model has another reference or frame, its base states cannot be copied.
     same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)
     for name, value in zip(target.state_names, target.x0, strict=True):
         if same or group_of(name) == "q_m":
@@ -153,7 +153,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
 
 
 def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
-    """Bind the policy to the robot, and return the law, which checks its commands."""
+    """Bind the policy to the robot; return the law, which checks the policy's commands."""
     if policy is None:
         return None
     within = (limits.low, limits.high)
@@ -243,10 +243,10 @@ def _state_of(robot: Robot, policy: object, options: SimulationOptions) -> State
 
 
 def _initial_inputs(policy: Any, plant: Plant, limits: Saturation) -> Array:
-    """Return the inputs (nu,) before the first command; warn if the policy's exceed the limits."""
+    """Return the inputs (nu,) before the first command; warn if they exceed the limits."""
     robot, actuation, (lin, _) = plant.robot, plant.actuation, feedback_of(policy)
     along = tracking_of(policy)
-    # With allocation, the model's inputs differ from the robot's inputs.
+    # With allocation, the inputs of the policy's model are not the inputs of the robot.
     if lin is not None and lin.input_names == actuation.names:
         where, inputs, initial = "at its target", lin.u0[None], np.asarray(lin.u0)
     elif along is policy is not None:
@@ -271,10 +271,10 @@ def _checked_functions(events: Sequence[Event], callback: Callback | None) -> tu
 
 
 def _rotating(robot: Robot) -> Array:
-    """Return the indices in v of the angular velocities of the base and of all joints but rotors.
+    """Return the indices in v of the rotation rates of the base and of all joints except rotors.
 
-    Their rotation within a step is bounded. Rotors may spin fast, because nothing depends on their
-    angle.
+    The rotation of the base and of these joints within a step is bounded. Rotors may spin fast,
+    because nothing depends on their angle.
     """
     rotors = rotor_names(robot)
     joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]

@@ -61,7 +61,7 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
 
 
 def _with_rigid(bare: Robot, item: FlexibleAppendage) -> Robot:
-    """Return a robot whose link at an appendage's frame has the inertia of the appendage's file."""
+    """Return a robot in which the appendage's link has the inertia from the appendage's file."""
     assert item.inertia is not None
     joint, placement = find_frame(bare.model, item.frame)
     of_file, body = rigid_inertia(item.inertia), bare.model.inertias[joint]

@@ -21,11 +21,12 @@ MASSES = {
     "slug": 14.593902937206364,
     "lbf s^2/in": 175.12683524647636,
 }  # [kg]
-# Names of the mass and stiffness matrices in files of different origin.
+# Names that different programs give to the mass and stiffness matrices.
 _MASS, _STIFFNESS = ("mxx", "maa", "maax"), ("kxx", "kaa", "kaax")
 
-# Largest rounding error relative to the largest entry. A larger asymmetry, coupling stiffness of
-# boundary and modes, or stiffness of the rigid interface is refused.
+# Largest rounding error, relative to the largest entry of a matrix. If the asymmetry, the
+# stiffness that couples boundary and modes, or the stiffness of the rigid interface is larger, the
+# file is refused.
 _SHARE = 1e-6
 
 
@@ -79,7 +80,7 @@ def read_superelement(
 
 
 def _boundary(path: Path) -> tuple[Mask, Array, Array]:
-    """Return the mask of boundary degrees of freedom, the rigid motions of all, and the grids."""
+    """Return the mask of boundary degrees of freedom, all rigid motions, and the grid points."""
     try:
         with np.printoptions():  # pyYeti changes them for the whole process
             from pyyeti import nastran
@@ -89,7 +90,8 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
         ) from None
     punched = path.suffix == ".asm" and path.with_suffix(".pch").is_file()
     try:
-        # A .pch file lists the kept degrees of freedom of each grid; without it all six are kept.
+        # A .pch file lists the degrees of freedom that each grid point retains; without the file
+        # it retains all six.
         uset, _, boundary, *kept = nastran.asm2uset(
             str(path), try_rdextrn="pv_only" if punched else False
         )
