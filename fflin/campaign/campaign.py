@@ -46,7 +46,7 @@ _FACTORS = {  # from the unit of a condition to the unit of a figure
 
 
 class Bound(NamedTuple):
-    """Comparison in a condition, and the mask (N,) of runs that meet the condition."""
+    """Comparison in a condition, and the mask (N,) of runs that meet the comparison."""
 
     name: str
     sign: str
@@ -375,8 +375,8 @@ class Campaign(FrozenArrays):
         write_atomically({path: content.getvalue()})
 
     def _save(self, path: Path, **texts: str) -> None:
-        """Write the campaign with further strings, such as the request that identifies its call."""
-        arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in _ARRAYS}
+        """Write the campaign and further strings, such as the request that identifies the call."""
+        arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in ARRAYS}
         rest = {key: getattr(self, key) for key in _HEADER}
         texts["header"] = json.dumps({"kind": "Campaign", **rest})
         write_rows(path, arrays, texts, checksummed=True)
@@ -407,7 +407,7 @@ class Campaign(FrozenArrays):
         """Return a campaign from its header and arrays; rows of missing runs are left out."""
         run = np.asarray(arrays["stop"]) != NOT_RUN
         values: dict[str, Any] = {
-            key: arrays[key] if run.all() else arrays[key][run] for key in _ARRAYS
+            key: arrays[key] if run.all() else arrays[key][run] for key in ARRAYS
         }
         for key in _HEADER:
             values[key] = tuple(header[key]) if isinstance(header[key], list) else header[key]
@@ -415,4 +415,4 @@ class Campaign(FrozenArrays):
 
 
 _NAMES = [item.name for item in fields(Campaign)]
-_ARRAYS, _HEADER = _NAMES[: _NAMES.index("names")], _NAMES[_NAMES.index("names") : -1]
+ARRAYS, _HEADER = _NAMES[: _NAMES.index("names")], _NAMES[_NAMES.index("names") : -1]

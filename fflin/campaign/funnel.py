@@ -45,11 +45,11 @@ _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance
 _MOST = 1_000_000
 _ROUNDING = 1e-12  # eigenvalues of P, relative to the largest, that count as zero
 
-# Number of runs per trial level in the search for the largest level, and largest number of
-# halvings.
+# _PILOTS is the number of runs per trial level in the search for the largest level. _HALVINGS is
+# the largest number of halvings.
 _PILOTS, _HALVINGS = 16, 40
-# The largest attitude error [deg], joint error [rad] and position or sliding joint error [m] of a
-# start.
+# Largest errors of a start: attitude [deg], revolute joint [rad], and position or prismatic joint
+# [m].
 _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
 
 
@@ -429,7 +429,7 @@ def _beyond(sizes: Mapping[str, Array], bounds: Mapping[str, float]) -> Array:
 
 
 def _starts(center: Array, P: Array, axes: Array, rng: np.random.Generator, roots: Array) -> Array:
-    """Return random deviations (N, nx) from `center` whose levels have square roots (N,).
+    """Return random initial deviations e (N, nx) from `center` with sqrt(e' P e) equal to `roots`.
 
     P (nx, nx) is the matrix of the level, and `axes` are its `ellipsoid_axes`.
     """
@@ -461,7 +461,7 @@ def runs_from(
 
 
 def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
-    """Return the square root of the largest level to test, where about one run in sixteen fails."""
+    """Return the square root of the largest level to test; about one run in 16 fails there."""
     root = widest
     if simulate(np.zeros(1)).any():
         return root  # the goal is missed even without an error
@@ -474,7 +474,7 @@ def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
 
 
 def _bounds(name: str, given: Any, kinds: Collection[str]) -> dict[str, float]:
-    """Return {kind: largest error}, or raise `InputError`."""
+    """Return {kind: largest error} from a given mapping, or raise `InputError`."""
     given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
     require_known(f"kind of error in {name}", given, kinds)
     if name == "goal" and not given:
@@ -512,7 +512,7 @@ def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int
 
 
 def _widest(W: Array, robot: Robot) -> float:
-    """Return the square root of the largest level whose errors a start may have."""
+    """Return the square root of the largest level that keeps a start within its largest errors."""
     largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in robot.joints]
     reach = [
         np.linalg.norm(W[:3], 2) / np.sin(np.radians(_LARGEST_ATTITUDE / 2.0)),

@@ -274,7 +274,7 @@ def _goals(
 
 
 def _complete(store: FileStore, done: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Complete a file in which the runs from `done` on are not needed."""
+    """Complete a file whose runs from `done` on are not needed."""
     for start in range(done, store.count, store.chunk):
         stop = min(start + store.chunk, store.count)
         unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}

@@ -16,7 +16,7 @@ from fflin.view.page import packed
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
-# Values below this, in SI units, are rounding errors.
+# Values below this, in SI units, count as rounding errors.
 _NOTHING = 1e-14
 
 # Lines below this fraction of the largest line of their plot are not drawn.
@@ -24,7 +24,7 @@ _UNSEEN = 1e-6
 
 _NONE = np.zeros(0)
 
-# {(group, unit): title of its plot}. In plots of one dictionary, a name has one colour.
+# {(group, unit): title of the plot}. A name has the same colour in all plots of one dictionary.
 _CHARTS: tuple[dict[tuple[str, str], str], ...] = (
     {("tau_b", "N m"): "base torque"},
     {("F_b", "N"): "base force"},
@@ -134,7 +134,7 @@ def _size(curve: Curve) -> float:
 def _plot(
     title: str, unit: str, lines: list[tuple[str, Curve]], family: int = -1
 ) -> dict[str, Any]:
-    """Return a plot of labelled curves, with the limits that a curve comes near."""
+    """Return a plot of labelled curves, with each limit that a curve comes near."""
     return {
         "title": title,
         "unit": unit,

@@ -299,7 +299,7 @@ def _pictures(
 
     start, end = float(motion.t[0]), float(motion.t[-1])
     if times is None:
-        # A motion that settles is fastest at the beginning; tracking moves all the time.
+        # A motion that settles is fastest at the beginning, but a tracking motion never stops.
         fractions = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
         times = [start + fraction * (end - start) for fraction in fractions]
     times = check_times(times, start, end)
