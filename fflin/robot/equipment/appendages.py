@@ -22,7 +22,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, FrozenArrays, as_double, number, positive, shaped
-from fflin.robot.equipment.mounting import about_origin, inertia_of
+from fflin.robot.equipment.mounting import inertia_of, point_inertia
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
 # First root of J_1'(x) = 0: the wavenumber times the radius of the first lateral mode in a
@@ -478,9 +478,7 @@ def rigid_inertia(M: Array) -> pin.Inertia:
     """Convert a rigid-body mass matrix (6, 6), translation before rotation, to an inertia."""
     mass = float(M[0, 0])
     lever = np.array([M[1, 5], M[2, 3], M[0, 4]]) / mass
-    return inertia_of(
-        mass, lever, M[3:, 3:] - about_origin(inertia_of(mass, lever, 0.0 * M[3:, 3:]))
-    )
+    return inertia_of(mass, lever, M[3:, 3:] - point_inertia(mass, lever))
 
 
 def _text(what: str, value: Any) -> str:
