@@ -9,7 +9,7 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from fflin.base.process import import_path_without, same_folder
+from fflin.base.process import import_path_without, same_file
 from fflin.commands import INTERRUPTED
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def main() -> int:
     """Run the command line on the arguments of this process, and return its exit code."""
     # `python -m fflin` puts the working folder first on the import path. It is removed before
     # further imports, unless fflin itself is imported from there.
-    if not same_folder(os.path.join(os.path.dirname(__file__), os.pardir), ""):
+    if not same_file(os.path.join(os.path.dirname(__file__), os.pardir), ""):
         sys.path[:] = import_path_without("")
     listen()
     gc.set_threshold(50_000)  # a command keeps most of its objects until it ends

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 # _CONTROL matches control characters, which could break a line or control the terminal. _LONG_NAME
@@ -245,6 +246,15 @@ class FflinWarning(UserWarning):
 
     def __str__(self) -> str:
         return one_line(super().__str__())
+
+
+@contextmanager
+def located(where: str) -> Iterator[None]:
+    """Begin the message of an error with the place where it occurs."""
+    try:
+        yield
+    except FflinError as error:
+        raise type(error)(f"{where}: {error}") from None
 
 
 def listed(names: Iterable[str]) -> str:

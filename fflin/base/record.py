@@ -54,13 +54,8 @@ _BLOCK = 2**22
 _LARGEST = 1e300
 _JSON_CHECKSUM = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
 _MAT_TEXT, _MAT_CHECKSUM = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
-_MAT_NEARLY = re.compile(
-    rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE
-)  # remains of a damaged header with a digest
-
-
-class NoRoomError(FileError):
-    """Error for a file whose content does not fit into memory."""
+# Remains of a damaged header with a digest.
+_MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)
 
 
 def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool) -> None:
@@ -95,7 +90,7 @@ def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
         raise FileError(f"{path}: No such file{missing(path)}") from None
     except Exception as error:  # each decoder raises its own types
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
-            raise NoRoomError(f"{shown(path)}: does not fit into memory") from None
+            raise FileError(f"{shown(path)}: does not fit into memory") from None
         raise FileError(f"{shown(path)}: not a {what} saved by {by} ({reason(error)})") from None
 
 

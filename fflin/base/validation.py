@@ -95,9 +95,8 @@ def share(name: str, value: object) -> float:
 
 def refuse_masked(name: str, value: object) -> None:
     """Raise `InputError` if an entry is masked, because NumPy may ignore the mask."""
-    ma: ModuleType | None = sys.modules.get(
-        "numpy.ma"
-    )  # a masked array exists only if this is loaded
+    # A masked array exists only if this module is loaded.
+    ma: ModuleType | None = sys.modules.get("numpy.ma")
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fflin.base.errors import FileError, InputError
+from fflin.base.process import same_file
 
 # In folders with more names than this, no similar names are searched for.
 _MANY = 1000
@@ -99,16 +100,9 @@ def remember(*paths: str | Path) -> None:
 
 def _require_other(target: Path, inputs: Iterable[str | Path]) -> None:
     for path in inputs:
-        if _same_file(path, target):
+        if same_file(path, target):
             said = f"output {target} is the input file {os.path.abspath(path)}"
             raise FileError(f"{said}; give another output file")
-
-
-def _same_file(path: str | Path, other: Path) -> bool:
-    try:
-        return os.path.samefile(path, other)
-    except (OSError, ValueError):  # one of them does not exist
-        return False
 
 
 def csv_table(rows: Iterable[Iterable[object]]) -> bytes:
@@ -199,7 +193,7 @@ def check_distinct(*targets: Path | None) -> None:
     for target in filter(None, targets):
         for first in seen:
             same = os.path.realpath(first) == os.path.realpath(target)
-            if same or _same_file(first, target):
+            if same or same_file(first, target):
                 said = f"outputs {target} and {first} are the same file"
                 raise FileError(f"{said}; give each output its own file")
         seen.append(target)

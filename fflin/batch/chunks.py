@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from fflin.base.errors import FflinError, FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.validation import Array
 from fflin.batch.rows import Points
 from fflin.batch.run import ChunkResult
@@ -86,13 +86,11 @@ class ChunkJob:
         with _TURN, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", FflinWarning)
             for row in left.tolist():
-                try:
+                with located(f"configuration {start + row}"):
                     if self.only_inertia:
                         self._write_at_rest(points.q[row], out["B_lower"][row])
                     else:
                         self._write(row, points, out)
-                except FflinError as error:
-                    raise type(error)(f"configuration {start + row}: {error}") from None
         return ChunkResult(dict(out), [str(note.message) for note in caught])
 
     def _write(self, row: int, points: Points, out: Mapping[str, Array]) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import FflinError, InputError
+from fflin.base.errors import InputError, located
 from fflin.base.validation import NORM_TOLERANCE, Array, as_double, dimension, vector
 from fflin.robot.joints import ROUND_OFF, Joint
 from fflin.robot.robot import Robot
@@ -87,9 +87,8 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
             follow_rows(robot, followed)
             doubtful |= ~(np.abs(followed - block) <= NORM_TOLERANCE).all(axis=1)
         for row in np.flatnonzero(doubtful).tolist():
-            block[row] = _checked(
-                robot.checked_configuration, "configuration", start + row, block[row]
-            )
+            with located(f"configuration {start + row}"):
+                block[row] = robot.checked_configuration(block[row])
         if robot.followers:
             follow_rows(robot, block)
     rows.setflags(write=False)
@@ -102,7 +101,8 @@ def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
         return np.broadcast_to(robot.checked_velocity(v).copy(), (count, robot.nv))
     rows = _rows("v", v, robot.nv, "one velocity in Pinocchio's order per row", count)
     for row in range(count) if robot.followers else _not_finite(rows):
-        _checked(robot.checked_velocity, "velocity", row, rows[row])
+        with located(f"velocity {row}"):
+            robot.checked_velocity(rows[row])
     rows.setflags(write=False)
     return rows
 
@@ -137,10 +137,3 @@ def _rows(name: str, value: ArrayLike, size: int, of_what: str, count: int | Non
     if not len(array):
         raise InputError(f"{name} has no rows; give at least one row")
     return np.ascontiguousarray(array)
-
-
-def _checked(check: Callable[[Array], Array], what: str, row: int, value: Array) -> Array:
-    try:
-        return check(value)
-    except FflinError as error:
-        raise type(error)(f"{what} {row}: {error}") from None

@@ -17,7 +17,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -242,21 +242,16 @@ def _run_on_workers(
 
 def _reason(error: Exception) -> str:
     """Return the reason why a chunk failed."""
-    if isinstance(error, FflinError):
-        return str(error)
-    if isinstance(error, WorkerDied | NoWorkers):
+    if isinstance(error, FflinError | WorkerDied | NoWorkers):
         return str(error)
     return f"the executor failed: {type(error).__name__}: {error}".rstrip(": ")
 
 
-@contextmanager
-def executor_of(executor: Executor | None, workers: int | None) -> Iterator[Executor | None]:
-    """Yield the given executor, or an executor whose processes end with this context."""
-    if not workers:
-        yield executor
-        return
-    with OwnWorkers(workers) as pool:
-        yield pool
+def executor_of(
+    executor: Executor | None, workers: int | None
+) -> AbstractContextManager[Executor | None]:
+    """Return a context with the given executor, or with an executor whose processes end with it."""
+    return OwnWorkers(workers) if workers else nullcontext(executor)
 
 
 def work(job: bytes, rows: Rows, start: int) -> ChunkResult:

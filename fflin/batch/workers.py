@@ -38,7 +38,7 @@ class OwnWorkers(Executor):
         cores = available_cores()
         if count > cores:
             said = f"{count} workers requested, but only {cores} cores are available; using {cores}"
-            warnings.warn(said, FflinWarning, stacklevel=5)
+            warnings.warn(said, FflinWarning, stacklevel=4)
             count = cores
         self._max_workers = count
         # With fork, a process would inherit locks that other threads hold, and could wait for them

@@ -93,7 +93,7 @@ def assignment(text: str) -> tuple[str, float]:
 
 
 def joint_or_all(text: str) -> tuple[str | None, float | str]:
-    """Read NAME=VALUE, or VALUE (or urdf) with the name None, which means all joints."""
+    """Read NAME=VALUE, or for all joints VALUE or urdf alone, with None as the name."""
     if "=" in text:
         return assignment(text)
     return None, text if text == "urdf" else number(text)

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FflinError, FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, located
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def load_robot(arguments: argparse.Namespace) -> Robot:
     """Load the robot with the joints, inputs, outputs, gravity and orbit of the arguments."""
-    from fflin.robot.loading import load, with_fields
+    from fflin.robot.loading import load
 
     lock, passive = once("--lock", arguments.lock), getattr(arguments, "passive", [])
     first: dict[str, Any] = {"passive": passive} if passive else {}
@@ -41,15 +41,13 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
             fields[name] = for_all[0] if for_all else once(f"--{name}", values)
     if getattr(arguments, "inputs", None) is not None:
         inputs = _inputs(robot, arguments.inputs)
-        try:
+        with located(arguments.inputs):  # a name or an inertia that this robot does not accept
             robot = robot.replace(inputs=inputs)
-        except FflinError as error:  # a name or an inertia that this robot does not accept
-            raise type(error)(f"{arguments.inputs}: {error}") from None
     if getattr(arguments, "output", []):
         from fflin.robot.outputs import parse_output
 
         fields["outputs"] = [output for text in arguments.output for output in parse_output(text)]
-    return with_fields(robot, fields)
+    return robot.merged(fields)
 
 
 def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:

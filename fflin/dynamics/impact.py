@@ -15,7 +15,7 @@ from fflin.base.validation import Array, FrozenArrays, dimension, instance, vect
 from fflin.base.validation import placement as checked_placement
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT, by_joint, find_frame
-from fflin.robot.loading import body_alone, inertia_of
+from fflin.robot.loading import body_alone
 from fflin.robot.robot import Robot
 from fflin.robot.welding import joined, welded
 
@@ -333,7 +333,7 @@ def capture(
     """
     instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     if isinstance(payload, pin.Inertia):
-        alone = body_alone(inertia_of(payload), prefix)
+        alone = body_alone(payload, prefix)
         other = replace(alone, gravity=robot.gravity, orbit=robot.orbit)
     else:
         instance("payload", payload, Robot, "a pin.Inertia or a fflin.Robot").require_unchanged()

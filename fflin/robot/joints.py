@@ -35,10 +35,10 @@ class Joint(NamedTuple):
     """Joint with one degree of freedom."""
 
     name: str  # in the model
-    idx_q: int  # index of its first entry in Pinocchio's q
-    idx_v: int  # index of its entry in Pinocchio's v
-    unbounded: bool  # continuous: two entries (cos, sin) of q, but one angle in the state
-    prismatic: bool  # position is a length [m] instead of an angle [rad]
+    idx_q: int = 0  # index of its first entry in Pinocchio's q
+    idx_v: int = 0  # index of its entry in Pinocchio's v
+    unbounded: bool = False  # continuous: two entries (cos, sin) of q, but one angle in the state
+    prismatic: bool = False  # position is a length [m] instead of an angle [rad]
     # "joint", "slosh", or "modal" for the amplitude of a mode.
     kind: str = "joint"
     scale: float = 1.0  # entry of q per unit of q_m; 1 except for modal amplitudes
@@ -97,6 +97,10 @@ class Follower(NamedTuple):
     def place(self, q: Array) -> None:
         """Write the mimic joint's value, which follows from its leader's value, into q (nq,)."""
         self.joint.place(q, self.multiplier * self.leader.value(q) + self.offset)
+
+    def within(self, model: pin.Model) -> Follower:
+        """Return this mimic joint with the indices of its joints in another model."""
+        return self._replace(joint=self.joint.within(model), leader=self.leader.within(model))
 
 
 # Function that returns the joint with a given name, or raises an error that explains the problem.

@@ -107,20 +107,15 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
     for index in range(ROOT, model.njoints):
         drawn = draw.uniform(-1.0, 1.0, (1, 7))
         if any(checked.values()):
-            sizes = checked["mass"], checked["com"], checked["inertia"]
-            parts = (size * x for size, x in zip(sizes, np.split(drawn, (1, 4), 1), strict=True))
-            heavier, shift, wider = parts
+            heavier, shift, wider = np.split(drawn, (1, 4), 1)
             body = model.inertias[index]
-            mass, com, about = stretched(body, heavier, shift * _radii(body), wider)
+            # Root mean square distances [m] of the body's mass from its centre, per axis.
+            second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
+            radii = np.sqrt(np.abs(second) / (body.mass or np.inf))
+            heavier, shift = checked["mass"] * heavier, checked["com"] * shift * radii
+            mass, com, about = stretched(body, heavier, shift, checked["inertia"] * wider)
             new[index] = pin.Inertia(float(mass[0]), com[0], about[0])
     return new
-
-
-def _radii(body: pin.Inertia) -> Array:
-    """Return the root mean square distances (3,) [m] of a body's mass from its centre, per axis."""
-    second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
-    radii: Array = np.sqrt(np.abs(second) / (body.mass or np.inf))
-    return radii
 
 
 def stretched(

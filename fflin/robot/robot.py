@@ -17,7 +17,7 @@ from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import with_appendages, with_inputs
 from fflin.robot.equipment.mounting import difference, stored_momentum
-from fflin.robot.fields import Range, Scope, checked_fields, checked_passive
+from fflin.robot.fields import Range, checked_fields, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
 from fflin.robot.mass_properties import (
@@ -237,6 +237,15 @@ class Robot(Coordinates):
             If the robot's Pinocchio model (``robot.model``) was modified after the robot was
             created.
         """
+        return self._replaced(fields, merged=False)
+
+    def merged(self, fields: Mapping[str, object]) -> Robot:
+        """Return a copy with other fields; joints and limits that are not named keep theirs."""
+        if self.passive and isinstance(given := fields.get("passive"), list | tuple):
+            fields = {**fields, "passive": [*self.passive, *given]}
+        return self._replaced({**fields}, merged=True)
+
+    def _replaced(self, fields: dict[str, object], *, merged: bool) -> Robot:
         self.require_unchanged()
         robot = self
         if "passive" in fields:
@@ -245,13 +254,12 @@ class Robot(Coordinates):
             robot = with_inputs(robot, fields.pop("inputs"))
         if "appendages" in fields:
             robot = with_appendages(robot, fields.pop("appendages"))
-        joints, own = robot.joint_names, robot._bare.joint_names
-        scope = Scope(robot.joint, joints, own, robot.inputs, self.urdf_damping)
-        checked = checked_fields(fields, scope)
-        for key in ("stiffness", "damping"):
-            if key in checked:  # modes keep their values unless they are named
-                old = getattr(robot, key)
-                kept = {joint.name: old[joint.name] for joint in robot.modes if joint.name in old}
+        checked = checked_fields(fields, robot)
+        # Without `merged`, only modes keep their values unless they are named.
+        modes = {joint.name for joint in robot.modes}
+        for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
+            if key in checked:
+                kept = {k: x for k, x in getattr(robot, key).items() if merged or k in modes}
                 checked[key] = kept | checked[key]
         robot = replace(robot, **checked)
         if robot.orbit and any(robot.gravity):
@@ -451,6 +459,11 @@ class Robot(Coordinates):
     def modes(self) -> tuple[Joint, ...]:
         """Joints of the robot that represent modes of flexible appendages or slosh."""
         return tuple(joint for joint in self.joints if joint.mode)
+
+    @property
+    def own_joints(self) -> tuple[str, ...]:
+        """Names of the independent joints except wheels and modes."""
+        return self._bare.joint_names
 
     @property
     def _bare(self) -> Robot:

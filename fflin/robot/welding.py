@@ -59,11 +59,7 @@ def welded(robot: Robot, lock: Lock) -> Robot:
         robot,
         **{"model": model, "locked": (*robot.locked, *locked), "_unequipped": None},
         joints=tuple(joint.within(model) for joint in bare.joints if joint.name not in gone),
-        followers=tuple(
-            f._replace(joint=f.joint.within(model), leader=f.leader.within(model))
-            for f in bare.followers
-            if f.joint.name in left
-        ),
+        followers=tuple(f.within(model) for f in bare.followers if f.joint.name in left),
         passive=tuple(name for name in robot.passive if name not in gone),
         outputs=tuple(x for x in outputs if getattr(x, "joints", None) != ()),
         **fields,
@@ -164,14 +160,12 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     own = [each.within(model) for each in bare.joints]
     theirs = [renamed(each) for each in other.joints]
     followers = [
-        *(
-            f._replace(joint=f.joint.within(model), leader=f.leader.within(model))
-            for f in bare.followers
-        ),
+        *(f.within(model) for f in bare.followers),
         *(Follower(renamed(f.joint), renamed(f.leader), *f[2:]) for f in other.followers),
     ]
     both: dict[str, Any] = {
-        name: {**getattr(robot, name), **_prefixed(getattr(other, name), prefix)}
+        name: getattr(robot, name)
+        | {f"{prefix}.{key}": value for key, value in getattr(other, name).items()}
         for name in ("stiffness", "damping", "rest", "urdf_damping", "links")
     }
     if not other.links:  # a single body, whose mass properties get the name of the prefix
@@ -194,10 +188,6 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     return with_inputs(whole, robot.inputs)
 
 
-def _prefixed(values: Mapping[str, object], prefix: str) -> dict[str, Any]:
-    return {f"{prefix}.{name}": value for name, value in values.items()}
-
-
 def _require_new_names(robot: Robot, prefix: str) -> None:
     if not prefix or "." in prefix:
         raise InputError(f"prefix is {prefix!r}, expected a word without dots, such as 'payload'")
@@ -218,17 +208,9 @@ def _joined(
     parts = []
     for index in range(ROOT + 1, other.njoints):
         parent, at = other.parents[index], other.jointPlacements[index]
-        on_root = parent == ROOT
+        carrier, at = (joint, placement * at) if parent == ROOT else (names[parent], at)
         moved = joint_of(other, index)._replace(name=names[index])
-        parts.append(
-            Mounted(
-                moved,
-                joint if on_root else names[parent],
-                placement * at if on_root else at,
-                other.joints[index],
-                other.inertias[index],
-            )
-        )
+        parts.append(Mounted(moved, carrier, at, other.joints[index], other.inertias[index]))
     new = with_mounted(model, bodies, parts)
     on = new.getJointId(model.names[joint])
     others = {ROOT: on} | {

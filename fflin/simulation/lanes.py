@@ -154,11 +154,8 @@ class LaneLoop:
         span = max(1, min((len(space) // self.width - 1) * every, statistics.span))
         if self._noisy:
             span = min(span, SLOTS * times.sample)
-        clock, going, messages = (
-            np.zeros(1, dtype=np.intp),
-            np.ones(count, dtype=bool),
-            [""] * count,
-        )
+        clock, messages = np.zeros(1, dtype=np.intp), [""] * count
+        going = np.ones(count, dtype=bool)
         bar = Progress(self._plan.progress)
         try:
             while clock[0] < steps and going.any():
@@ -256,22 +253,12 @@ class LaneLoop:
 
 
 class LaneRows:
-    """Recorded rows of runs, one for each `every` steps, and the ends of the runs.
-
-    The rows of run k before its end are ``kept[:counts[k], :, k]``, with the columns of the loop.
-    """
+    """Recorded rows of a single run, one for each `every` steps, with the columns of the loop."""
 
     span = _SPAN
 
-    def __init__(self, loop: LaneLoop, every: int, count: int) -> None:
-        self.every, self._count = every, count
-        self.kept = np.empty((loop.steps // every + 2, loop.width, count))
-        self.ends = {"steps": np.zeros(count), "last": np.zeros((count, loop.width))}
-
-    @property
-    def counts(self) -> list[int]:
-        """Number of rows of each run before its end."""
-        return [-(-int(steps) // self.every) for steps in self.ends["steps"]]
+    def __init__(self, loop: LaneLoop, every: int) -> None:
+        self.every, self.kept = every, np.empty((loop.steps // every + 2, loop.width))
 
     def over(self, q: Array, v: Array) -> Mask:
         """Return False for each run: no run ends early."""
@@ -282,22 +269,20 @@ class LaneRows:
 
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Store rows; see `Statistics`."""
-        begin, self._next = -(-first // self.every), -(-first // self.every) + len(rows[0])
-        by_row = np.concatenate(rows, axis=2)[:, : self._count]
-        self.kept[begin : self._next] = by_row.transpose(0, 2, 1)
+        begin = -(-first // self.every)
+        self.kept[begin : begin + len(rows[0])] = np.concatenate(rows, axis=2)[:, 0]
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the step at which runs end, and the last added row."""
-        last = self.kept[self._next - 1].T
-        return {"steps": np.full(self._count, float(done)), "last": last}
+        """Return the step at which the run ends."""
+        return {"steps": np.full(LANES, float(done))}
 
 
 def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
     """Simulate a plan, or a single dispersed run of it (`runs`), with the compiled loop."""
     every, dt, loop = plan.times.every, plan.times.dt, LaneLoop(plan, plant, runs)
-    rows = LaneRows(loop, every, 1)
+    rows = LaneRows(loop, every)
     try:
-        [stopped] = loop.fly(rows, rows.ends, runs)
+        [stopped] = loop.fly(rows, {"steps": np.zeros(1)}, runs)
     except KeyboardInterrupt:
         if not loop.done:
             raise
@@ -308,7 +293,7 @@ def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
     count = -(-loop.done // every)
     t = np.append(every * np.arange(count) * dt, loop.done * dt)
     count += not stopped.startswith(("diverged", "interrupted"))
-    q, nu, u, momentum, center = (rows.kept[:count, part, 0] for part in loop.columns)
+    q, nu, u, momentum, center = (rows.kept[:count, part] for part in loop.columns)
     v = plant.state.spread(nu)
     return Recording(t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled")
 

@@ -15,12 +15,7 @@ from fflin.base.validation import Array, instance, truth, vector
 from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
 from fflin.control.linear_controller import growing
 from fflin.control.policies import axes_of, bound, fed_back, feedback_of
-from fflin.control.tracking import (
-    Reference,
-    followed,
-    reference_of,
-    tracking_of,
-)
+from fflin.control.tracking import Reference, followed, reference_of, tracking_of
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import Integrator, integrator
@@ -116,11 +111,7 @@ class Plan:
 
 
 def start_of(
-    state: StateMap,
-    x0: ArrayLike | None,
-    q0: ArrayLike | None,
-    v0: ArrayLike | None,
-    reference: Reference | None,
+    state: StateMap, options: SimulationOptions, reference: Reference | None
 ) -> tuple[Array, Array]:
     """Return the initial configuration (nq,) and velocity (nv,)."""
 
@@ -130,7 +121,7 @@ def start_of(
             return q.copy(), v.copy()
         return points.start_of(state.robot)
 
-    q, v = points.point_of(state, x0, q0, v0, default)
+    q, v = points.point_of(state, options.x0, options.q0, options.v0, default)
     points.require_slow("the initial velocity", v)
     return q, v
 
@@ -176,9 +167,9 @@ def planned(robot: Robot, policy: object, options: SimulationOptions) -> tuple[P
     policy = followed(policy, robot, held=times.sample * times.dt)
     lin, _ = feedback_of(policy)
     follows = reference_of(policy)
-    state = _state_of(robot, policy, options.frame, options.reference)
+    state = _state_of(robot, policy, options)
     plant = Plant(state, options.disturbance)
-    foresees = None if options.linear is False else predictor(plant, policy, options.linear)
+    foresees = predictor(plant, policy, options.linear)
     method = integrator(options.method)
     if times.fastest * times.dt > method.reach:
         raise InputError(
@@ -186,7 +177,7 @@ def planned(robot: Robot, policy: object, options: SimulationOptions) -> tuple[P
             f"{times.fastest:.4g} 1/s; take at most {method.reach / times.fastest:.2g} s, or "
             "give `sample`"
         )
-    q, v = start_of(state, options.x0, options.q0, options.v0, follows)
+    q, v = start_of(state, options, follows)
     if plant.field:
         plant.field.require_near(q)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=options.dt is None)
@@ -225,10 +216,9 @@ def planned(robot: Robot, policy: object, options: SimulationOptions) -> tuple[P
     return plan, plant
 
 
-def _state_of(
-    robot: Robot, policy: object, frame: Frame | None, reference: pin.SE3 | None
-) -> StateMap:
+def _state_of(robot: Robot, policy: object, options: SimulationOptions) -> StateMap:
     """Return the state map of a motion, with the frame and reference of its policy if known."""
+    frame, reference = options.frame, options.reference
     lin, _ = feedback_of(policy)
     own_frame, own_reference = axes_of(policy)
     if lin is not None and (frame is not None or reference is not None):
@@ -248,11 +238,8 @@ def _state_of(
             f"the policy was designed {made}, frame '{own_frame}', but '{robot.name}' is {flown}in "
             "orbit; design it for the robot that is simulated"
         )
-    return StateMap(
-        robot,
-        reference=own_reference if reference is None else reference,
-        frame=own_frame if frame is None else frame,
-    )
+    reference = own_reference if reference is None else reference
+    return StateMap(robot, reference=reference, frame=own_frame if frame is None else frame)
 
 
 def _initial_inputs(policy: Any, plant: Plant, limits: Saturation) -> Array:

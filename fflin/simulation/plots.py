@@ -68,12 +68,6 @@ class Curve(NamedTuple):
         levels: list[float] = self.limits[np.isfinite(self.limits)].tolist()
         return [level for level in levels if level and (self.values / level).max() >= _NEAR]
 
-    def momentum(self, inertia: float) -> Curve:
-        """Convert the speed of a wheel to its momentum [N m s]."""
-        linear, reference = (None if x is None else inertia * x for x in self[6:])
-        scaled = inertia * self.values, inertia * self.limits, linear, reference
-        return Curve(self.key, "momentum", self.name, "N m s", *scaled)
-
 
 def curves(motion: Motion, wheels: Mapping[str, float]) -> Iterator[Curve]:
     """Yield curves of states, inputs, and speed and momentum of wheels {name: inertia or 0}."""
@@ -89,10 +83,10 @@ def curves(motion: Motion, wheels: Mapping[str, float]) -> Iterator[Curve]:
         if group not in ("q_m", "qdot_m") or entry not in wheels:
             yield Curve(name, group, name, unit, *values)
         elif group == "qdot_m":
-            speed = Curve(name, "speed", name, unit, *values)
-            yield speed
-            if wheels[entry]:
-                yield speed.momentum(wheels[entry])
+            yield Curve(name, "speed", name, unit, *values)
+            if size := wheels[entry]:
+                momenta: Any = (None if x is None else size * x for x in values)
+                yield Curve(name, "momentum", name, "N m s", *momenta)
     inputs = zip(
         input_keys(motion), motion.input_names, motion.input_units, motion.u.T, strict=True
     )

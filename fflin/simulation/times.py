@@ -119,10 +119,7 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
     steps = max(1, round(duration / dt))
     if abs(steps * dt - duration) > 1e-6 * duration:
         if sample or delay:
-            raise InputError(
-                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s, "
-                "because the input is sampled or delayed; choose dt accordingly"
-            )
+            _in_steps("duration", duration, dt)  # raises an error
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
     if sample is None:

@@ -252,16 +252,8 @@ class _Ball(NamedTuple):
             origin, motion = self.center, pin.JointModelPZ()
         R = turned_to(axis)
         own = inertia_of(mass, R.T @ (self.center - origin), sphere)
-        mode = Joint(
-            self.name,
-            idx_q=0,
-            idx_v=0,
-            unbounded=False,
-            prismatic=not turning,
-            kind="modal",
-            scale=scale,
-            rotation=self.rotation,
-        )
+        pure = not turning
+        mode = Joint(self.name, prismatic=pure, kind="modal", scale=scale, rotation=self.rotation)
         if abs(rotor) < 1e-13:
             rotor = 0.0
         return Mounted(mode, joint, pin.SE3(R, origin), motion, own, rotor / scale**2), removed
@@ -310,17 +302,9 @@ def _liquid(slosh: Slosh, item: _Modes, bodies: list[pin.Inertia]) -> list[Mount
     slides = slosh.length is None
     arm = (slosh.length or 0.0) * z
     first, second = (turned_to(axis) for axis in ((x, y) if slides else (-y, x)))
+    inertia, rotation = slosh.modal_mass, float(not slides)
     across = [
-        Joint(
-            name,
-            idx_q=0,
-            idx_v=0,
-            unbounded=False,
-            prismatic=slides,
-            kind="slosh",
-            inertia=slosh.modal_mass,
-            rotation=0.0 if slides else 1.0,
-        )
+        Joint(name, prismatic=slides, kind="slosh", inertia=inertia, rotation=rotation)
         for name in slosh.modes
     ]
     motion = pin.JointModelPZ if slides else pin.JointModelRZ

@@ -92,10 +92,7 @@ def _equipped(robot: Robot, inputs: object, appendages: Sequence[Appendage]) -> 
             model.addJointFrame(model.getJointId(part.name))
         placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
-        followers = tuple(
-            each._replace(joint=each.joint.within(model), leader=each.leader.within(model))
-            for each in followers
-        )
+        followers = tuple(each.within(model) for each in followers)
     names = [joint.name for joint in joints]
     own = {joint.name for joint in robot.joints if joint.mode}
     by_joint: dict[str, Any] = {

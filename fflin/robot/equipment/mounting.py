@@ -181,7 +181,7 @@ def mounted_wheels(
         bodies[joint] = rest
         placement = pin.SE3(turned_to(axis), np.zeros(3))
         own = pin.Inertia(0.0, np.zeros(3), float(wheel.inertia) * np.outer(_Z, _Z))
-        turning = Joint(name, 0, 0, unbounded=True, prismatic=False)
+        turning = Joint(name, unbounded=True)
         parts.append(Mounted(turning, joint, placement, pin.JointModelRUBZ(), own))
     return parts
 

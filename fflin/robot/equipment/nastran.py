@@ -10,7 +10,7 @@ import numpy as np
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array, Mask, vector, whole
-from fflin.base.writing import as_path, remember
+from fflin.base.writing import as_path, reason, remember
 
 LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254, "ft": 0.3048}  # [m]
 MASSES = {
@@ -31,7 +31,10 @@ _SHARE = 1e-6
 
 
 class Superelement(NamedTuple):
-    """Modes clamped at a rigid interface, about its origin, in SI units and basic axes."""
+    """Modes with a fixed interface, in SI units and the axes of Nastran's basic frame.
+
+    `L` and `inertia` are about the origin of the interface, which is rigid.
+    """
 
     frequency: Array  # (k,) [Hz]
     L: Array  # (6, k): translation [kg^0.5] before rotation [kg^0.5 m]
@@ -50,11 +53,9 @@ def read_superelement(
     boundary, rigid, points = _boundary(files[1])
     M, K = _matrices(files[0], len(boundary))
     rigid = rigid[boundary]
-    center = (
-        points.mean(axis=0)
-        if origin is None
-        else vector("origin", origin, 3, "a point") / (LENGTHS[length])
-    )
+    center = points.mean(axis=0)
+    if origin is not None:
+        center = vector("origin", origin, 3, "a point") / LENGTHS[length]
     # Convert rigid motions about the file's basic origin to motions about the interface's origin.
     x, y, z = center
     shift = np.eye(6)
@@ -102,7 +103,7 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
     except Exception as error:  # pyYeti raises whatever its parsing meets
         raise InputError(
             f"{path} cannot be read as the assembly file (.asm) of an external superelement: "
-            f"{_line(error)}"
+            f"{reason(error)}"
         ) from None
     keep = kept[0] if kept else np.ones(len(rigid), dtype=bool)
     boundary = np.asarray(boundary, dtype=bool)
@@ -121,9 +122,8 @@ def _matrices(path: Path, size: int) -> tuple[Array, Array]:
     try:
         found: Mapping[str, object] = op4.read(str(path), sparse=False)
     except Exception as error:  # pyYeti raises whatever its parsing meets
-        raise InputError(f"{path} cannot be read as an output4 file (.op4): {_line(error)}") from (
-            None
-        )
+        said = f"{path} cannot be read as an output4 file (.op4): {reason(error)}"
+        raise InputError(said) from None
     by_name = {str(name).lower(): value for name, value in found.items()}
     matrices = []
     for what, names in (("mass", _MASS), ("stiffness", _STIFFNESS)):
@@ -179,8 +179,3 @@ def _eigenpairs(path: Path, K: Array, M: Array) -> tuple[Array, Array]:
             "independent modes that are clamped at the boundary"
         )
     return np.asarray(squares), np.asarray(shapes)
-
-
-def _line(error: Exception) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 200 else f"{text[:200]}..."
