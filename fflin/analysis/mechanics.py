@@ -172,7 +172,7 @@ def second_order(lin: LinearModel) -> SecondOrder:
     noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(size, size) * spin
     forces = Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
-    # The forces of an input are compared with the norm of its column.
+    # To find rounding errors, each entry of S is compared with the norm of its own column.
     each = np.linalg.norm(S.values / size[:, None], axis=0)
     return SecondOrder(
         M=M,

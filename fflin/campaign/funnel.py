@@ -447,7 +447,7 @@ class Starts(NamedTuple):
     rng: np.random.Generator
 
     def drawn(self, roots: Array) -> Array:
-        """Return random initial deviations (N, nx) whose levels have these square roots (N,)."""
+        """Return random initial deviations e (N, nx) with sqrt(e' P e) equal to `roots` (N,)."""
         e = self.rng.normal(size=(len(roots), len(self.P))) @ self.axes.T
         # Directions in which P is zero do not contribute to the level.
         e *= (roots / np.sqrt(((e @ self.P) * e).sum(axis=1)))[:, None]

@@ -117,8 +117,9 @@ class CampaignJob:
     def digest(self, first: Draws) -> str:
         """Return a digest of the robot, the policy, the options and the first run.
 
-        The arrays that the compiled loop reads contain all of these, so nothing is compiled. In
-        Python, a policy may be any function, so the outcome of the first run represents it.
+        For the compiled engine, the arrays that its loop reads contain all of these, so nothing is
+        compiled. For the Python engine, a policy may be any function, whose content cannot be
+        hashed. Then the digest contains the outcome of the first run instead.
         """
         if self.engine == "python":
             return content_digest(self.run(first, 0).arrays)

@@ -93,7 +93,7 @@ def assignment(text: str) -> tuple[str, float]:
 
 
 def joint_or_all(text: str) -> tuple[str | None, float | str]:
-    """Read NAME=VALUE, or VALUE (or urdf) with the name None, which means all joints."""
+    """Read NAME=VALUE, or for all joints VALUE or urdf alone, with None as the name."""
     if "=" in text:
         return assignment(text)
     return None, text if text == "urdf" else number(text)
@@ -216,7 +216,7 @@ def command(
     The docstring of the function is the help of the command: a summary, and an example at the end.
     ``--help`` lists --json and the `common` options, or all options if `common` is empty.
     """
-    summary, _, example = (run.__doc__ or ".").partition("\n\n")
+    summary, _, example = (run.__doc__ or "").partition("\n\n")
     command = commands.add_parser(
         run.__name__.removeprefix("_"),
         add_help=False,

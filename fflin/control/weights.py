@@ -346,7 +346,7 @@ def _of_regulated(
 
 
 class _Given(NamedTuple):
-    """Given weight, and whether it was given as a largest value."""
+    """A weight from the user, and whether it was given as a largest value (Bryson's rule)."""
 
     value: float
     largest: bool

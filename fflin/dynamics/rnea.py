@@ -15,8 +15,9 @@ from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.state import StateMap
 from fflin.robot.mass_properties import coordinate_names
 
-# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate, and grows
-# as the inertia of i alone vanishes. Coupling times machine epsilon is the relative error of
+# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. It
+# grows as 1 / (M^-1)_ii, the inertia of i while all other coordinates are free, becomes small
+# relative to M_ii. Coupling times machine epsilon is the relative error of
 # (M^-1)_ii. If the sum of all couplings exceeds _WARNING_COUPLING, M^-1 has fewer than nine
 # correct digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a
 # smaller sum than the number of coordinates shows that some pivots are only rounding errors.

@@ -34,7 +34,7 @@ def joint_axis(work, tree, body):
 
 @inlined
 def motion_cross(velocity, along):
-    """Return velocity x along, the rate of a motion vector `along` that is fixed in a body."""
+    """Return `velocity` x `along`: the rate of a motion vector that is fixed in a body."""
     w, v = velocity
     return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
 

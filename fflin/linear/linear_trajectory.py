@@ -306,7 +306,7 @@ def _agree(whole: Array, coarse: Array) -> bool:
 
 
 def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:
-    """Return steps and transition matrices of samples, with `parts` steps between their cuts."""
+    """Return the steps and the transition matrix of each sample, `parts` steps between cuts."""
     fraction = np.arange(parts) / parts
     start = [(t[:-1, None] + np.diff(t)[:, None] * fraction).ravel() for t in cuts]
     h = np.concatenate([np.repeat(np.diff(t) / parts, parts) for t in cuts])

@@ -19,7 +19,7 @@ from fflin.robot.welding import requested
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
-# Fields of a robot that are arrays of tables in a file: {field: names of the arrays}.
+# Fields that a TOML file writes as arrays of tables ([[input]]): {field: names of the arrays}.
 _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
 # Tables of a robot file in which entries may be tables.

@@ -194,8 +194,8 @@ class Search(NamedTuple):
                 last = one.outside(limited)
                 if last <= _ENDS:
                     return one
-                # If errors grow too much along a single motion, its end cannot be corrected. The
-                # trial before it is then returned.
+                # If all intervals integrated as one motion do not at least halve the violation,
+                # errors grow too much along this motion. The trial before it is then returned.
                 if not last <= 0.5 * before:
                     return trial
                 trial = one

@@ -31,7 +31,10 @@ _SHARE = 1e-6
 
 
 class Superelement(NamedTuple):
-    """Modes clamped at a rigid interface, about its origin, in SI units and basic axes."""
+    """Modes with a fixed interface, in SI units and the axes of Nastran's basic frame.
+
+    `L` and `inertia` are about the origin of the interface, which is rigid.
+    """
 
     frequency: Array  # (k,) [Hz]
     L: Array  # (6, k): translation [kg^0.5] before rotation [kg^0.5 m]

@@ -122,7 +122,7 @@ def is_impossible(mass: float, moments: Sequence[float]) -> bool:
 def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[str]:
     """Return notes about unusual inertias.
 
-    Raise an error for negative moments that are not negligible in the link's rigid body.
+    Raise an error for a negative moment that is not negligible beside the fixed links.
     """
     unequal, weightless, negligible = [], [], []
     for link in links:
