@@ -216,7 +216,7 @@ def command(
     The docstring of the function is the help of the command: a summary, and an example at the end.
     ``--help`` lists --json and the `common` options, or all options if `common` is empty.
     """
-    summary, _, example = (run.__doc__ or ".").partition("\n\n")
+    summary, _, example = (run.__doc__ or "").partition("\n\n")
     command = commands.add_parser(
         run.__name__.removeprefix("_"),
         add_help=False,

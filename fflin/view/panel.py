@@ -90,13 +90,9 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     lines = _lines(robot, motion, shown, followed=len(target) > 1)
     for family, charts in enumerate(_CHARTS):
         for key, title in charts.items():
-            found_here = lines.get(key, [])
-            sizes = [_size(curve) for curve in found_here]
-            seen = [
-                (curve.key.partition(".")[2], curve)
-                for curve, size in zip(found_here, sizes, strict=True)
-                if size > _UNSEEN * max(sizes)
-            ]
+            near = lines.get(key, [])
+            least = _UNSEEN * max(map(_size, near), default=0.0)
+            seen = [(each.key.partition(".")[2], each) for each in near if _size(each) > least]
             plot = _plot(title, key[1], seen, family)
             # Plots of rates are shown only if a limit is near.
             if any(each["limits"] or not title.endswith("rates") for each in plot["lines"]):

@@ -153,10 +153,9 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
         ]
     color = shape.color or PLAIN
     if shape.kind == "box":
-        width, height, depth = shape.size
-        sides = {"width": width, "height": height, "depth": depth}
+        sides = dict(zip(("width", "height", "depth"), shape.size, strict=True))
         box = {"uuid": "box", "type": "BoxGeometry", **sides}
-        return [(box, unit, color, _symmetric(width / 2.0, height / 2.0, depth / 2.0))]
+        return [(box, unit, color, _symmetric(*(side / 2.0 for side in shape.size)))]
     radius = shape.size[0]
     fineness: dict[str, Any] = {"widthSegments": 32, "heightSegments": 20}
     ball = {"uuid": "sphere", "type": "SphereGeometry", "radius": radius, **fineness}
@@ -169,8 +168,7 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
     pieces = [(tube, _Y_TO_Z, color, _symmetric(radius, length / 2.0, radius))]
     if shape.kind == "capsule":
         for end in (-length / 2.0, length / 2.0):
-            lifted = unit.copy()
-            lifted[2, 3] = end
+            lifted = pin.SE3(np.eye(3), np.array((0.0, 0.0, end))).homogeneous
             pieces.append((ball, lifted, color, around))
     return pieces
 
