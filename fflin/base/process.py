@@ -15,6 +15,7 @@ T = TypeVar("T")
 _PATIENCE = 1.0  # seconds before a bar is shown
 _WORTH = 10.0  # seconds of work from which an estimate is shown
 _INTERVAL = 0.1
+LONG_RUN = 20.0  # seconds of a run after which a faster engine is recommended
 
 
 class Progress:
@@ -37,8 +38,8 @@ class Progress:
         on = f"{cores} core{'s' * (cores != 1)}"
         print(f"fflin: about {float(f'{size:.2g}'):g} {unit} on {on}", file=sys.stderr)
 
-    def __call__(self, done: int, total: int, what: str = "") -> None:
-        """Update the bar: `done` of `total` steps of `what`."""
+    def __call__(self, done: int, total: int, what: str = "", hint: str = "") -> None:
+        """Update the bar: `done` of `total` steps of `what`; a long run also shows `hint`."""
         self.done, self.total = done, total
         if not self._shown or (now := time.monotonic()) < self._next:
             return
@@ -48,6 +49,7 @@ class Progress:
         bar = "#" * round(30 * share)
         self._drawn = True
         said = f"\r{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left "
+        said += hint if now - self._start > LONG_RUN else ""
         print(said, end="", file=sys.stderr, flush=True)
 
     def say(self, text: str) -> None:

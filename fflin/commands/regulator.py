@@ -176,8 +176,9 @@ def add_allocation(group: parser.Group) -> None:
         "--allocate",
         "design the regulator with base torque and force as inputs, and allocate its commands to "
         "the thrusters, which produce the nearest possible wrench. Allocation is the default if "
-        "the thrusters can push in every direction. With --no-allocate, the regulator commands "
-        "each thruster itself, and negative thrust is cut at zero",
+        "the thrusters can push in every direction, but not along a trajectory. With "
+        "--no-allocate, the regulator commands each thruster itself, and negative thrust is cut at "
+        "zero",
     )
 
 
@@ -270,6 +271,12 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace, *, allocated: bool 
 _ALLOCATED = (
     "allocation: tau_b and F_b are realised by the thrusters, in `fflin simulate --gain` too; "
     "--no-allocate designs the thrusts themselves"
+)
+
+
+_NOT_ALLOCATED = (
+    "no allocation: the gains command each thruster, in `fflin simulate` too, and negative thrust "
+    "is cut at zero"
 )
 
 
@@ -385,6 +392,8 @@ def checked(
 
 
 def _tvlqr(arguments: argparse.Namespace) -> Report:
+    from fflin.robot.inputs import Thruster
+
     refuse(
         arguments,
         ("reduce",),
@@ -393,7 +402,10 @@ def _tvlqr(arguments: argparse.Namespace) -> Report:
     )
     along = models_along(arguments)
     schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
-    return Report(along.robot.name, schedule, str(schedule), {arguments.output_file: schedule.save})
+    text = str(schedule)
+    if any(isinstance(each, Thruster) for each in along.robot.inputs):
+        text += f"\n{folded([_NOT_ALLOCATED])}"
+    return Report(along.robot.name, schedule, text, {arguments.output_file: schedule.save})
 
 
 def schedule_of(
