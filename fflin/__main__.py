@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-# `_signal` is built in, so that a signal.py in the working folder is not imported instead.
+# `_signal` is built in, so a signal.py in the working folder cannot be imported in its place.
 import _signal as signal  # type: ignore[import-not-found]
 import gc
 import os
 import sys
 from typing import TYPE_CHECKING
 
-from fflin.base.process import import_path_without, same_folder
+from fflin.base.process import import_path_without, same_file
 from fflin.commands import INTERRUPTED
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def main() -> int:
     """Run the command line on the arguments of this process, and return its exit code."""
     # `python -m fflin` puts the working folder first on the import path. It is removed before
     # further imports, unless fflin itself is imported from there.
-    if not same_folder(os.path.join(os.path.dirname(__file__), os.pardir), ""):
+    if not same_file(os.path.join(os.path.dirname(__file__), os.pardir), ""):
         sys.path[:] = import_path_without("")
     listen()
     gc.set_threshold(50_000)  # a command keeps most of its objects until it ends
@@ -39,7 +39,7 @@ def main() -> int:
 
 def listen() -> None:
     """Make Ctrl-C end the process even in a callback, where `KeyboardInterrupt` would be lost."""
-    # If the parent process ignores SIGINT, as nohup does, it remains ignored.
+    # If the parent process ignores SIGINT, as nohup does, this process must ignore it too.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
         sys.unraisablehook = _unraisable
@@ -49,7 +49,7 @@ def leave(reason: BaseException) -> NoReturn:
     """Report the stop in one line, and exit without waiting for threads."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        # A single write, so that the output of other processes cannot split the line.
+        # The line is written at once, so that the output of other processes cannot split it.
         sys.stderr.write(f"fflin: {reason}\n" if reason.args else "fflin: stopped\n")
         if sys.stdout is not None:
             sys.stdout.flush()

@@ -187,7 +187,7 @@ def controllability(lin: LinearModel) -> Controllability:
         names = tuple(combination(row, states, 1.0 / size[z]) for row in rows)
     others: Array = np.zeros((len(rows), len(lin.A)))
     others[:, z] = rows
-    # Prefer coordinates on which an input acts directly when the controllable states are named.
+    # When the controllable states are named, prefer coordinates on which an input acts directly.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
     basis, pivots = echelon(conserved.T @ part.controllable, size, np.tile(driven, 2))
     zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
@@ -250,8 +250,8 @@ def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | N
     found = unobservable(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
     if found is None:
         return None
-    # The system is symmetric. Each motion (s, v) that is unobservable from the output S^T s
-    # therefore gives a row on which no input acts.
+    # The system is symmetric. Each motion (s, v) that the output S^T s does not observe therefore
+    # gives a row, a combination of states on which no input acts.
     s, v = np.split(found.motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
     # The controllable subspace is orthogonal to these rows.

@@ -1,4 +1,4 @@
-"""Effective masses of the vibration modes of a robot with its base clamped."""
+"""Effective masses of the vibration modes of a robot whose base is fixed."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from fflin.linear.model import LinearModel
 # Modes have the same frequency if their frequencies differ by less than this fraction.
 _EQUAL = 1e-9
 
-# Effective masses below this fraction of the total are rounding error. For singular values, the
-# limit is the square root of this fraction.
+# Effective masses below this fraction of the total are rounding error. An effective mass is the
+# square of a singular value, so the limit of singular values is the square root of this fraction.
 _ROUNDING = 1e-14
 
 
@@ -168,8 +168,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     kept = np.r_[:6, springs]
     floating = floating_inertia(M, kept, others)
     base, joints = np.arange(6), np.arange(6, len(kept))
-    # Coordinates are scaled by the springs so that K is the identity. The low frequencies are then
-    # as accurate as the high ones.
+    # Coordinates are scaled by the springs so that K is the identity. Low frequencies then have the
+    # same relative accuracy as high frequencies.
     soft = 1.0 / np.sqrt(stiffness[springs - 6])
     M_mm = floating[6:, 6:] * np.outer(soft, soft)
     squares, vectors = np.linalg.eigh((M_mm + M_mm.T) / 2.0)
@@ -186,13 +186,14 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
 
 
 def _separated(frequencies: Array, L: Array) -> Array:
-    """Combine modes of equal frequency so that the first has the most mass; return L (6, k)."""
+    """Return L (6, k); modes of equal frequency are combined so that the first has most mass."""
     L, first = L.copy(), 0
     while first < len(frequencies):
         near = frequencies <= (1.0 + _EQUAL) * frequencies[first]
         last = int(np.count_nonzero(near))
         group = L[:, first:last]
-        # Modes are combined by their mass, and then modes without mass by their moment of inertia.
+        # Modes are first combined by their mass. Modes without mass are then combined by their
+        # moment of inertia.
         for rows in (slice(0, 3), slice(3, 6)):
             _, sizes, turned = np.linalg.svd(group[rows])
             group[:] = group @ turned.T
@@ -203,7 +204,7 @@ def _separated(frequencies: Array, L: Array) -> Array:
 
 
 def _cells(values: Array, total: Array) -> list[str]:
-    """Return each value with its percentage of the total; a dot stands for rounding error."""
+    """Return each value with its percentage of the total, or dots if it is rounding error."""
     cells = []
     for value, whole in zip(values.tolist(), total.tolist(), strict=True):
         seen = abs(value) > 1e2 * _ROUNDING * whole

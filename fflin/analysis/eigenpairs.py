@@ -12,8 +12,8 @@ from fflin.analysis.ranks import EPS
 from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
-# A stiffness below this fraction of the largest counts as zero, with coordinates scaled to unit
-# inertias. Modes below 3e-7 of the highest frequency are therefore rigid-body modes.
+# With coordinates scaled to unit inertias, a stiffness below this fraction of the largest stiffness
+# counts as zero. Modes below 3e-7 of the highest frequency are therefore rigid-body modes.
 _NO_STIFFNESS = 1e-13
 
 
@@ -39,11 +39,11 @@ def natural_modes(lin: LinearModel) -> NaturalModes:
     warn_of_stiffness(lin)
     nv, inertia = len(lin.M), np.sqrt(lin.M.diagonal())
     # Input forces that cancel each other leave rounding errors in the derivatives. Derivatives of
-    # that size are set to zero.
+    # this size are set to zero.
     A = lin.A.copy()
     by_position, rounding = A[nv:, :nv], np.abs(lin.B[nv:]) @ np.abs(lin.u0)
     by_position[np.abs(by_position) <= 1e2 * EPS * rounding[:, None]] = 0.0
-    # Scale the states so that the largest entries of A are about the fastest rate.
+    # Scale the states and the time so that the largest entries of A are about 1.
     rates = np.abs(np.tile(inertia, 2)[:, None] * A / np.tile(inertia, 2))
     turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
     fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
@@ -69,11 +69,11 @@ def nonzero_eigenpairs(
 
     A is repeatedly replaced by :math:`V_1^T A V_1`, where the columns of :math:`V_1` are
     orthonormal and orthogonal to the null space of A. Each step removes zero eigenvalues only. The
-    steps end when A is regular.
+    steps end when A is nonsingular.
     """
-    # Round-off moves the k zero eigenvalues of a Jordan block by its k-th root, so zeros are
-    # removed before eigenvalues are computed. The caller scales A to comparable entries. Singular
-    # values below n times the tolerance count as zero.
+    # Rounding moves the k zero eigenvalues of a Jordan block by the k-th root of the rounding
+    # error. Zeros are therefore removed before eigenvalues are computed. The caller scales A to
+    # comparable entries. Singular values below n times the tolerance count as zero.
     n, whole = len(A), A
     size = float(np.linalg.norm(A))
     nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
@@ -87,8 +87,8 @@ def nonzero_eigenpairs(
                 break
             complement = np.asarray(transposed[:rank].T)
         else:
-            # Columns that are exactly zero are removed without a rotation, which would add
-            # round-off.
+            # Columns that are exactly zero are removed directly, because a rotation would add
+            # rounding errors.
             complement = np.eye(len(A))[:, used]
         steps.append(A @ complement)
         A = complement.T @ steps[-1]
@@ -105,13 +105,13 @@ def nonzero_eigenpairs(
             pairs.append((complex(value), pairs[-1][1].conj(), error))
             continue
         for step in reversed(steps):
-            # Because A V_0 = 0, the eigenvector in the larger space is A V_1 x, up to a factor.
+            # An eigenvector x of V_1^T A V_1 gives the eigenvector A V_1 x of A, up to a factor.
             x = step @ x  # noqa: PLW2901 - the same vector in a larger space
         x /= np.linalg.norm(x)  # noqa: PLW2901
         # Slow modes lose accuracy in these steps; one inverse iteration restores it.
         if np.linalg.norm(whole @ x - value * x) > 1e2 * EPS * abs(value):
             near = whole - (value + EPS * size) * np.eye(n)
-            with suppress(np.linalg.LinAlgError):  # the shift is an eigenvalue exactly
+            with suppress(np.linalg.LinAlgError):  # singular if the shift is an eigenvalue
                 x = np.linalg.solve(near, x)  # noqa: PLW2901
         pairs.append((complex(value), x / np.linalg.norm(x), error))
     return pairs, nullity

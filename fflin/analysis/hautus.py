@@ -28,29 +28,30 @@ from fflin.analysis.ranks import (
 )
 from fflin.base.validation import Array, Values
 
-# A singular value above _SUSPICIOUS is not zero. Singular values are computed only for suspicious
-# eigenvectors: their product with unit input columns is below _SUSPICIOUS, or another eigenvalue
-# is closer than _SUSPICIOUS.
+# A singular value above _SUSPICIOUS counts as nonzero. Singular values are computed only for
+# suspicious eigenvectors. An eigenvector is suspicious if its product with the unit input columns
+# is below _SUSPICIOUS, or if another eigenvalue is closer than _SUSPICIOUS to its eigenvalue.
 _SUSPICIOUS = 1e-3
 
-# Eigenvalues closer than _SAME_POLE are the same, because rounding moves a defective eigenvalue by
-# the square root of the rounding error. Second-order poles closer than _DEFECTIVE count as
-# defective. Their eigenvectors are not sufficient for the test.
+# Eigenvalues closer than _SAME_POLE count as equal, because rounding moves a defective eigenvalue
+# by the square root of the rounding error. Second-order poles closer than _DEFECTIVE count as
+# defective. A defective pole has too few eigenvectors for the test.
 _SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
 
-# The Rayleigh quotient of a singular vector converges quadratically to the pole, in few steps.
-# Second-order poles may take twice as many steps, each smaller than _NEAR times the pole.
+# The Rayleigh quotient of a singular vector refines a pole and converges quadratically, in few
+# steps. Refining a second-order pole may take twice as many steps, each smaller than _NEAR times
+# the pole.
 _REFINEMENTS, _NEAR = 4, 0.1
 
-# Two poles are aliased if sampling brings them closer than this. A state that the continuous model
-# shows may then be unobservable.
+# Two poles are aliased if sampling brings them closer than this. A state that is observable in the
+# continuous model may then be unobservable in the sampled one.
 _ALIASED = 1e-6
 
-# A pole with a slower decay may belong to a defective pair at zero, which rounding moves by the
-# square root of the rounding error.
+# A pole whose decay rate is below this may belong to a defective pair at zero, because rounding
+# moves such a pair by the square root of the rounding error.
 _DECAY = 1e-7
 
-# A motion has died out if one sample reduces it below this fraction; the rest is rounding error.
+# If one sample reduces a motion below this fraction, only its rounding error remains.
 _DEAD = 1e4 * EPS
 
 
@@ -83,8 +84,8 @@ def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
     # Without forces, the unit of time is arbitrary.
     unit = 1.0 / rate if rate > 0.0 else 1.0
     if dt:
-        # If the sample time is the period of the only vibration, the forces in X are rounding
-        # errors, and a unit of time derived from them would be too long.
+        # If the sample time is the period of the only vibration, X contains rounding errors instead
+        # of forces. The unit of time derived from X would then be too long.
         unit = min(unit, 100.0 * dt)
     # Positions are divided by the unit of time, which gives positions and velocities the same
     # units.
@@ -108,10 +109,10 @@ class Split(NamedTuple):
 
 def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False) -> Split:
     """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s."""
-    # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair. Left null
-    # vectors are split off by orthogonal transformations until none remain, which also removes the
-    # whole chain of a defective eigenvalue. A staircase algorithm would carry the rounding error
-    # of an ill-conditioned step into the next step.
+    # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair. Orthogonal
+    # transformations split off left null vectors until none remain. This also removes the whole
+    # chain of a defective eigenvalue. A staircase algorithm would carry the rounding error of an
+    # ill-conditioned step into the next step.
     pair = _scaled(X, M, dt)
     A, to = (pair.A.T, pair.to_x.T) if dual else (pair.A, pair.from_x)
     B = unit_columns(to @ drive)
@@ -138,7 +139,7 @@ def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = 
     least, most = int(decay.argmin()), int(decay.argmax())
     settling = decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least]).halved()
     if dt and abs(poles[most]) < _DEAD:
-        # Motions that decay to rounding error within one sample cannot be distinguished.
+        # Two motions cannot be distinguished if both decay to rounding error within one sample.
         margin &= decided(1.0, shapes[:, most]).halved()
     return split._replace(fixed=FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling))
 
@@ -210,7 +211,7 @@ def unobservable(
     """
     # At the pole zero, Jordan chains have at most two vectors, s and v. They satisfy
     # K s = K v = D v = C_s v = 0 and C_s s + C_v v = 0.
-    # The uncontrollable motions are, by symmetry, the unobservable motions of C_s = S^T, C_v = 0.
+    # By symmetry, the uncontrollable motions are the unobservable motions of C_s = S^T, C_v = 0.
     if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
         return None
     at_zero, margin = _missed_at_zero(system, position, velocity)
@@ -265,8 +266,8 @@ def _missed_shapes_at(
     """Return the unobservable shapes (nv, k) at a pole, the refined pole, and the margin."""
     M, K, D = system.M, system.K.values, system.D.values
     for step in range(2 * _REFINEMENTS):
-        # Scale each row by the size of its terms, so that a slow mode keeps its accuracy beside a
-        # fast one.
+        # Scale each row by the size of its terms, so that a slow mode keeps its accuracy next to a
+        # fast mode.
         s = pole if pole.imag else pole.real
         size = abs(s)
         weight = np.sqrt(
@@ -290,7 +291,7 @@ def _missed_shapes_at(
 
 
 def _root(system: SecondOrder, shape: Values, near: complex) -> complex:
-    """Return the root nearest to a pole of the scalar quadratic equation of a mode shape."""
+    """Solve the quadratic equation of a mode shape for the pole nearest to `near`."""
     left = shape
     if abs(shape @ system.M @ shape) < 0.1 * abs(shape.conj() @ system.M @ shape):
         left = shape.conj()  # shape^T M shape may vanish if poles are equal
@@ -315,7 +316,7 @@ def _simple(system: SecondOrder, shapes: Values, pole: complex) -> bool:
 
 
 def _aliased(poles: Values, dt: float) -> bool:
-    """Return whether sampling maps two poles to one, or a vibration to z = 1."""
+    """Return whether sampling maps two poles to one, or a vibration to the pole z = 1."""
     s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
     apart = s[:, None] - s
     turns = np.round(apart.imag / (2.0 * np.pi))

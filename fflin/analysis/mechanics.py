@@ -25,18 +25,18 @@ from fflin.linear.model import LinearModel
 if TYPE_CHECKING:
     pass
 
-# Springs or dampers with a larger relative asymmetry count as not symmetric.
+# Springs or dampers count as not symmetric if their relative asymmetry exceeds this.
 _SYMMETRIC = 1e-8
 
-# If the relative residual is larger, no coordinate has the momentum as its rate, because the
-# operating point is in motion.
+# If the relative residual of a momentum exceeds this, no coordinate has the momentum as its rate,
+# because the operating point is in motion.
 _CONSISTENT = 1e-8
 
-# Rounding error in units of energy: of springs per squared spin rate, of dampers per spin rate.
+# Rounding error of springs per squared spin rate and of dampers per spin rate, in units of energy.
 _OF_SPIN = 1e-15
 
-# If the ratio of the orbital rate to the fastest vibration is below this, its square is close to
-# rounding error.
+# If the orbital rate, relative to the fastest vibration, is below this, the square of the ratio is
+# close to rounding error.
 _SLOWEST = 3e-6
 
 
@@ -102,7 +102,7 @@ class SecondOrder:
         return np.sqrt(self.M.diagonal())
 
     def restricted(self, R: Array) -> SecondOrder:
-        """Return the system restricted to motions R z by constraint forces that do no work."""
+        """Return the system restricted to the motions R z; constraint forces do no work."""
         M = R.T @ self.M @ R
         K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
         return SecondOrder(M, K, D, self.S.after(R.T))
@@ -124,7 +124,7 @@ class SecondOrder:
 
     @cached_property
     def poles(self) -> tuple[Values, Margin]:
-        """Approximate nonzero poles, one of each conjugate pair, and the margin of their rank."""
+        """Approximate nonzero poles, one of each conjugate pair, and the margin of the ranks."""
         rigid, margin = self._null(self.K, self.D)
         unloaded, other = self._null(self.K)
         R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
@@ -153,9 +153,9 @@ class SecondOrder:
 
 def second_order(lin: LinearModel) -> SecondOrder:
     """Return the second-order form of a model, continuous or sampled."""
-    # The product with M leaves rounding errors where there is no spring, damper or input. Entries
-    # below a threshold are set to zero. All springs share one threshold and all dampers another,
-    # per unit of energy; each input has its own.
+    # The product with M leaves rounding errors in entries without a spring, damper or input, so
+    # entries below a threshold are set to zero. All springs share one threshold and all dampers
+    # another, in units of energy. Each input has its own threshold.
     nv, M, X = len(lin.M), lin.M, rate_matrix(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
@@ -164,15 +164,15 @@ def second_order(lin: LinearModel) -> SecondOrder:
         # Every entry of a matrix exponential has the rounding error of the largest entry.
         spread[:, : 2 * nv] += 4.0 * nv * EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
     noise = np.abs(M) @ spread
-    # Forces that balance during a spin leave rounding errors. There may be no other force to
-    # compare them with, so the errors are estimated from the spin rate.
+    # Forces that balance during a spin leave rounding errors. The model may have no other force
+    # that gives a scale for these errors, so they are estimated from the spin rate.
     turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
     spin = float(np.abs(turns).max(initial=0.0))
     noise[:, :nv] += _OF_SPIN * np.outer(size, size) * spin**2
     noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(size, size) * spin
     forces = Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
-    # The forces of an input are compared with the norm of its column.
+    # To find rounding errors, each entry of S is compared with the norm of its own column.
     each = np.linalg.norm(S.values / size[:, None], axis=0)
     return SecondOrder(
         M=M,
@@ -183,7 +183,7 @@ def second_order(lin: LinearModel) -> SecondOrder:
 
 
 def at_rest(lin: LinearModel) -> LinearModel | None:
-    """Return the model whose second-order structure applies to `lin`, or None if there is none."""
+    """Return `lin` or its continuous model if that model is a second-order system, else None."""
     # The continuous model has this structure if the rates of the positions depend on the
     # velocities alone. The structure then also applies to a model sampled from it. A sampled model
     # without its continuous model has this structure only if there are no forces.
@@ -205,14 +205,14 @@ def rates_of_positions(X: Array) -> Array:
 class ConservedMomenta:
     """Conserved momenta, which no input, spring or damper changes, and the kept coordinates."""
 
-    # W (k, nv): W M nu is conserved. W is in echelon form, so a unit vector stands for the
-    # momentum of a single coordinate.
+    # W (k, nv): W M nu is conserved. W is in echelon form, so the row for the momentum of a single
+    # coordinate is a unit vector.
     weights: Array
     # L1, L2 (k, nx) with L1 A = 0, L2 A = L1 and L1 B = L2 B = 0. For a sampled model, A is
     # replaced by (A - I)/dt.
     momenta: Array
     coordinates: Array
-    # (r,): kept coordinates. They and their rates determine all other states if L1 x = L2 x = 0.
+    # (r,): kept coordinates. If L1 x = L2 x = 0, they and their rates determine all other states.
     kept: Indices
     T: Array  # (nx, 2 r): maps kept coordinates and rates to the state, if L1 x = L2 x = 0
     margin: Margin  # margin of the rank decision on r
@@ -230,7 +230,7 @@ class ConservedMomenta:
 
 def conserved(lin: LinearModel) -> ConservedMomenta:
     """Find the conserved momenta (9.2): :math:`W M [A_{21}, A_{22}, B_2] = 0`."""
-    lin = lin.generator or lin  # conserves the same momenta
+    lin = lin.generator or lin  # the continuous model conserves the same momenta
     nv, X, system = len(lin.M), rate_matrix(lin), second_order(lin)
     size = system.size
     pushes = stacked([[system.K.T], [system.D.T], [system.S.T]])

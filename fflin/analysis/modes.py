@@ -225,7 +225,7 @@ class Modes:
         return "\n\n".join((*parts, *self._of_appendages()))
 
     def _of_appendages(self) -> list[str]:
-        """Return tables of the appendage modes, free and clamped, and of their effective masses."""
+        """Return tables of the appendage modes (robot free, base fixed) and of effective masses."""
         robot = self.lin._robot
         if robot is None or not robot.modes:
             return []
@@ -312,7 +312,8 @@ def modes(lin: LinearModel) -> Modes:
     shapes = []
     for pair in pairs:
         positions = np.abs(pair.shape[:nv])
-        # If several coordinates move equally, such as symmetric panels, the first is scaled to 1.
+        # A shape is scaled by its largest coordinate. If several coordinates are equal, such as
+        # those of symmetric panels, the shape is scaled by the first one.
         largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
         shapes.append(np.asarray(pair.shape / pair.shape[largest], dtype=complex))
     energies = energy_by_body(lin._robot, lin, shapes)
@@ -335,7 +336,7 @@ def modes(lin: LinearModel) -> Modes:
 
 
 def _percents(energy: Mapping[str, float], room: int) -> str:
-    """Name the bodies with at least 1 % of the energy, and sum up all other bodies."""
+    """Name the bodies with at least 1 % of the energy, and add up the energy of the others."""
     words = [f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01]
     text = ""
     for count in range(len(words), 0, -1):
@@ -352,7 +353,7 @@ def energy_by_body(
 ) -> list[Mapping[str, float]]:
     """Return {body: fraction of the kinetic energy} of shapes (nx,), see `Mode`.
 
-    Without a robot the mappings are empty.
+    Without a robot, the mappings are empty.
     """
     if robot is None:
         return [{} for _ in shapes]

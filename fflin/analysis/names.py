@@ -9,7 +9,8 @@ from fflin.analysis.ranks import Margin
 from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
-# For each group of velocities: its momenta, and the coordinates whose rates are these momenta.
+# For each group of velocities: name of the momentum, and name of the coordinate whose rate is the
+# momentum.
 _CONSERVED = {
     "omega_b": ("angular momentum", "base attitude"),
     "v_b": ("linear momentum", "base position"),
@@ -28,8 +29,8 @@ def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, 
         tuple(f"{_CONSERVED.get(group, _OTHER)[i]} {member}" for group, member in rates)
         for i in (0, 1)
     )
-    # The inputs cannot move such a coordinate alone, but they may move it together with the
-    # others.
+    # The inputs cannot move the named coordinate while the others are fixed, but they may move it
+    # together with the others.
     only_joints = all(rates[i][0] == "qdot_m" for i in conserved.kept)
     of_base = all(
         not row[i] for row in conserved.weights for i in range(nv) if rates[i][0] == "qdot_m"
@@ -86,7 +87,7 @@ def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[
 
 
 def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
-    """Return a note if rounding error leaves undecided whether the slowest motion decays."""
+    """Return a note if rounding error hides whether the slowest motion decays."""
     return tuple(
         f"undecided: {shape(lin, at)} may or may not decay by itself, because its decay rate is "
         f"only {ratio:.1g} times its rounding error; the model may or may not be {what}"
@@ -95,7 +96,7 @@ def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
 
 
 def shape(lin: LinearModel, at: Values) -> str:
-    """Describe rates `at` (nv,), real or complex, by the coordinates that move most."""
+    """Describe a motion with rates `at` (nv,), real or complex, by its largest coordinates."""
     size = np.sqrt(lin.M.diagonal())
     largest = at[int(np.abs(at * size).argmax())]
     of_base = {"omega_b": "rotation about ", "v_b": "translation along "}

@@ -14,7 +14,8 @@ from fflin.base.validation import Array, FrozenArrays, Values, instance, positiv
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.model import LinearModel
 
-# A slower decay, relative to the fastest pole, may be a pole at zero that rounding has moved.
+# A pole whose decay rate, relative to the fastest pole, is below this may be a pole at zero that
+# rounding has moved.
 _DECAY = 1e-7
 
 
@@ -147,7 +148,7 @@ def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
         if found is not None:
             motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
             return motions, found.fixed, "eigenvalues" if system.acting else "closed form"
-    # The unobservable subspace belongs to the uncontrollable part of the dual pair (A^T, C^T).
+    # The unobservable subspace is the uncontrollable part of the dual pair (A^T, C^T).
     part = split_by_poles(mechanics.rate_matrix(lin), lin.C.T, lin.M, lin.dt, dual=True)
     return part.outside, part.fixed, "eigenvalues"
 

@@ -14,15 +14,16 @@ if TYPE_CHECKING:
 
 EPS = float(np.finfo(float).eps)
 
-# Smaller coefficients of an echelon form, relative to the pivot 1, are rounding errors.
+# A coefficient of an echelon form below this, relative to the pivot 1, is rounding error.
 _CLEAN = 1e-10
 
 # A tolerance is SAFETY times the rounding error. A singular value between LOST and CLEAR times its
 # tolerance is undecided.
 SAFETY, CLEAR, LOST = 10.0, 30.0, 0.01
 
-# A force below _FLOOR times the largest force of its kind, per unit of energy, may be rounding
-# error. A force below _ROUNDING times this limit is set to zero.
+# The threshold of a force is _FLOOR times the largest force of the same kind, per unit of energy. A
+# force below the threshold may be rounding error. A force below _ROUNDING times the threshold is
+# set to zero.
 _FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 
@@ -51,7 +52,7 @@ class Margin(NamedTuple):
         return self.left_out.ratio
 
     def __and__(self, other: Margin) -> Margin:
-        """Combine two margins: keep the smaller counted value and the larger dropped value."""
+        """Combine two margins: keep the smallest value counted as nonzero, the largest as zero."""
         counted, left_out = zip(self, other, strict=True)
         return Margin(
             min(counted, key=lambda decision: decision.ratio),
@@ -94,7 +95,7 @@ class FixedPoles(NamedTuple):
     settling: Margin = Margin()  # certainty that the slowest pole decays
 
     def transformed(self, change: Array) -> FixedPoles:
-        """Return the poles with the directions of their margins in other coordinates."""
+        """Return the poles, with the directions of the margins in transformed coordinates."""
         margin, settling = self.margin.transformed(change), self.settling.transformed(change)
         return self._replace(margin=margin, settling=settling)
 
@@ -147,8 +148,8 @@ def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
 
 def right_vectors(matrix: Noisy, states: int = 1) -> tuple[Array, Any, int, Margin]:
     """Return n singular values, right singular vectors (n, n), the rank, and its margin."""
-    # Rows are scaled to unit length, so that no row hides behind a larger one. A row with much
-    # rounding error is made shorter, so that it does not hide other rows.
+    # Rows are scaled to unit length, so that a large row does not hide a small one. A row with a
+    # large rounding error is scaled to a smaller length, so that it does not hide other rows.
     n = matrix.values.shape[1]
     sizes, spread = (np.linalg.norm(entries, axis=1) for entries in matrix)
     real = sizes > 0.0

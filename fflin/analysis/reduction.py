@@ -26,7 +26,7 @@ from fflin.robot.robot import Robot
 Make: TypeAlias = Callable[[LinearModel], LinearModel]
 Part = TypeVar("Part", bound=LinearModel)
 
-# Smaller values, relative to the largest, are rounding errors.
+# A value below this fraction of the largest value is rounding error.
 _ROUNDING = 1e-9
 
 # The reduced state may leave out a part of f0 up to this fraction of the largest entry of f0.
@@ -254,7 +254,7 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 
 
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
-    """Return the wheels whose angle has no effect, and those whose speed has no effect either."""
+    """Return the wheels whose angle has no effect, and those of them whose speed has none."""
     # A wheel speed has an effect if the carrier rotates at the operating point or the wheel has
     # friction.
     nv, wanted = len(lin.M), {f"q_m.{name}" for name in wheel_inputs(lin)}
@@ -268,9 +268,9 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     """Return the indices (k,) of the wheels that a design does not regulate (9.5)."""
-    # Combinations of inputs that exert no net force at rest may still change wheel speeds. As many
-    # wheels are kept as there are independent combinations. By default, wheels are kept only if
-    # inputs other than the wheels can rotate the base.
+    # Combinations of inputs that exert no net force at rest may still change wheel speeds. The
+    # number of kept wheels is the number of independent combinations. By default, wheels are kept
+    # only if inputs other than the wheels can rotate the base.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
         raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
     _, free = ignorable_wheels(lin)
@@ -289,8 +289,8 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
 
 def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
     """Return the model of the regulated states, or `lin` itself if it has no wheels."""
-    # The model lacks the `removed_wheels`, and the angles of all wheels whose angle has no effect.
-    # It may therefore have fewer positions than rates. It lacks the base position if no input acts
+    # The model omits the `removed_wheels`, and the angles of all wheels whose angle has no effect.
+    # It may therefore have fewer positions than rates. It omits the base position if no input acts
     # on it.
     if not wheel_inputs(lin):
         return lin
@@ -328,7 +328,7 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
 
 
 def _balanced(lin: LinearModel) -> LinearModel:
-    """Return the model without stiffness and damping that are only rounding errors of a spin."""
+    """Set stiffness and damping of a model to zero if they are only rounding errors of a spin."""
     nv, A, system = len(lin.M), lin.A.copy(), second_order(lin)
     if not lin.dt and not system.K.values.any():
         A[nv:, :nv] = 0.0
@@ -353,13 +353,13 @@ def selection(names: Sequence[str], of: Sequence[str]) -> Array:
 
 
 def outputs_of(lin: LinearModel, S: Array) -> Array:
-    """Return the matrix (k, ny) that selects the outputs that depend only on the states S x."""
+    """Return the selection matrix (k, ny) of the outputs that depend only on the states S x."""
     others = np.abs(lin.C - lin.C @ S.T @ S).max(axis=1, initial=0.0)
     return np.eye(len(lin.C))[others <= 1e-12 * np.abs(lin.C).max(axis=1, initial=0.0)]
 
 
 def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
-    """Return the fields of the model with the states z = S x, where x = T z, and the inertia M."""
+    """Return the fields of the model with states z = S x and inertia M, where x = T z."""
     names = tuple(lin.state_names[i] for i in S.argmax(axis=1))
     whole = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
     return whole | {

@@ -20,8 +20,8 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
 
-# Rounding error of the principal moments relative to the largest, from eigenvalues and sums over
-# bodies.
+# Relative rounding error of the principal moments, which follow from sums over bodies and
+# eigenvalues.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 

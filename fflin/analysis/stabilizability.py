@@ -65,7 +65,7 @@ def require_detectable(lin: LinearModel) -> None:
 def _conclude(
     kind: type[FflinError], words: str, notes: Sequence[str], margin: Margin, depth: int = 4
 ) -> None:
-    """Raise an error with `words` and the undecided ranks, or warn if ranks are only undecided."""
+    """Raise an error with `words` and the undecided ranks; without `words`, warn of these ranks."""
     doubts = [note for note in notes if note.startswith("undecided")]
     if words:
         error: Any = kind("; ".join((words, *doubts)))
@@ -92,7 +92,8 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
 
 def _root(W: Array) -> Array:
     """Return L (m, m) with W = L L^T, for a semidefinite W whose entries have different units."""
-    # The condition number of L is the square root of W's, so its rank is easier to decide.
+    # The condition number of L is the square root of the condition number of W, so the rank of L is
+    # easier to decide.
     size = np.sqrt(W.diagonal())
     size = np.where(size > 0.0, size, 1.0)
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
@@ -113,8 +114,8 @@ def _check_reach(
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
     beyond = np.abs(poles) - 1.0 if discrete else poles.real
-    # Rounding moves the eigenvalues of a Jordan block of size four by its fourth root, so poles
-    # closer than 1e-3 of the largest count as one.
+    # Rounding moves the eigenvalues of a Jordan block of size four by the fourth root of the
+    # rounding error. Poles closer than 1e-3 of the largest therefore count as equal.
     candidates = [complex(discrete)]
     growing = (beyond > 0.0) & (error is not InputError)
     for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-# Patterns of control characters, which could break a line or control the terminal, and of names
-# too long to read. Each part of a path counts as a name. _LONGEST is the longest message.
+# _CONTROL matches control characters, which could break a line or control the terminal. _LONG_NAME
+# matches names that are too long to read; each part of a path counts as a name. _LONGEST is the
+# largest length of a message.
 _CONTROL, _LONG_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]"), re.compile(r"[^\s/\\]{100,}")
 _LONGEST = 1000
 # Line break before an indented line, found in messages of other packages.
@@ -244,6 +246,15 @@ class FflinWarning(UserWarning):
 
     def __str__(self) -> str:
         return one_line(super().__str__())
+
+
+@contextmanager
+def located(where: str) -> Iterator[None]:
+    """Begin the message of an error with the place where it occurs."""
+    try:
+        yield
+    except FflinError as error:
+        raise type(error)(f"{where}: {error}") from None
 
 
 def listed(names: Iterable[str]) -> str:

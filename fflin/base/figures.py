@@ -15,30 +15,13 @@ from fflin.base.writing import as_path, check_ending, write_atomically
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.typing import RcKeyType
 
     from fflin.base.validation import Array
 
 FORMATS = (".png", ".pdf", ".svg")
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a6d3b")
-_STYLE: dict[RcKeyType, object] = {
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.titleweight": "bold",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": "#dddddd",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.4,
-    "legend.framealpha": 0.8,
-    "legend.edgecolor": "none",
-    "legend.fontsize": 8,
-    "figure.dpi": 150,
-    "savefig.dpi": 150,
-}
+_STYLE = Path(__file__).parent / "assets" / "figures.mplstyle"
 
 
 def cycle(count: int) -> list[str]:
@@ -80,7 +63,8 @@ def drawing(
     import matplotlib
     from matplotlib.figure import Figure
 
-    with matplotlib.rc_context(_STYLE):
+    style = matplotlib.rc_params_from_file(_STYLE, use_default_template=False)
+    with matplotlib.rc_context(style):
         figure = Figure(**{"figsize": (width, height), "layout": "constrained"} | options)
         yield figure
         if target is not None:

@@ -31,7 +31,7 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
 
 
 def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
-    """Return success statistics of runs (N,), sorted by the distance of their start.
+    """Return success statistics of runs (N,), which are sorted by the distance of their start.
 
     The statistics are the number of runs before the first failure, a lower bound on the success
     rate of these starts, and a confidence interval for the success rate of all runs.
@@ -44,7 +44,7 @@ def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[f
 
 
 def quantile(values: Array, p: float, confidence: float) -> Estimate:
-    """Return the p-quantile and its interval, infinite ends if there are too few draws."""
+    """Return the p-quantile and its interval; an end is infinite if there are too few draws."""
     from scipy.special import bdtr
 
     count = len(values)
@@ -69,7 +69,7 @@ def mean(values: Array, confidence: float) -> Estimate:
 
 
 def rank_correlations(columns: Array, values: Array) -> Array:
-    """Return Spearman's correlation of columns (N, k) with values (N,), which may be infinite."""
+    """Return Spearman's correlation of each column (N, k) with values (N,), also infinite ones."""
     ranks = np.column_stack([_ranks(column) for column in (*columns.T, values)])
     ranks -= ranks.mean(axis=0)
     size = np.linalg.norm(ranks, axis=0)

@@ -41,16 +41,12 @@ class Progress:
     def __call__(self, done: int, total: int, what: str = "", hint: str = "") -> None:
         """Update the bar: `done` of `total` steps of `what`; a long run also shows `hint`."""
         self.done, self.total = done, total
-        if not self._shown or (now := time.monotonic()) < self._next:
-            return
-        self._next = now + _INTERVAL
-        share = done / total
-        left = (now - self._start) * (1.0 - share) / share
-        bar = "#" * round(30 * share)
-        self._drawn = True
-        said = f"\r{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left "
-        said += hint if now - self._start > LONG_RUN else ""
-        print(said, end="", file=sys.stderr, flush=True)
+        if self._shown:
+            share = done / total
+            spent = time.monotonic() - self._start
+            left, hint = spent * (1.0 - share) / share, hint if spent > LONG_RUN else ""
+            bar = "#" * round(30 * share)
+            self.say(f"{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left {hint}")
 
     def say(self, text: str) -> None:
         """Show a line instead of the bar, for work of unknown length."""
@@ -65,12 +61,12 @@ class Progress:
 
 
 def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
-    """Return `sys.path` without some folders, in whatever form its entries name them."""
-    return [entry for entry in sys.path if not any(same_folder(entry, each) for each in folders)]
+    """Return `sys.path` without the entries that refer to some folders, however they are spelt."""
+    return [entry for entry in sys.path if not any(same_file(entry, each) for each in folders)]
 
 
-def same_folder(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> bool:
-    """Return whether two paths are the same folder; an empty path is the working folder."""
+def same_file(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> bool:
+    """Return whether two paths are the same file or folder; an empty path is the working folder."""
     try:
         return os.path.samefile(first or os.curdir, second or os.curdir)
     except (OSError, ValueError):  # one of them does not exist

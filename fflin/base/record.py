@@ -54,13 +54,8 @@ _BLOCK = 2**22
 _LARGEST = 1e300
 _JSON_CHECKSUM = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
 _MAT_TEXT, _MAT_CHECKSUM = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
-_MAT_NEARLY = re.compile(
-    rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE
-)  # remains of a damaged header with a digest
-
-
-class NoRoomError(FileError):
-    """Error for a file whose content does not fit into memory."""
+# Remains of a damaged header with a digest.
+_MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)
 
 
 def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool) -> None:
@@ -72,7 +67,7 @@ def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool)
 
 def read_record(path: Path) -> tuple[Record, bool]:
     """Return the record in a file, and whether its digest was verified; call within `reading`."""
-    # Arrays may return with another shape: .mat has no vectors and .json has no empty matrices.
+    # The shape of an array may change, because .mat has no vectors and .json has no empty matrices.
     check_ending(path, FORMATS)
     return decoded(path.suffix, read_file(path, path.suffix))
 
@@ -84,7 +79,7 @@ def decoded(suffix: str, content: bytes) -> tuple[Record, bool]:
 
 @contextmanager
 def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
-    """Turn all errors in reading a file that program `by` saved into one `FileError`."""
+    """Convert any error in reading a file to one `FileError`; program `by` saved the file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SciPy takes damaged headers for old ones
@@ -95,7 +90,7 @@ def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
         raise FileError(f"{path}: No such file{missing(path)}") from None
     except Exception as error:  # each decoder raises its own types
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
-            raise NoRoomError(f"{shown(path)}: does not fit into memory") from None
+            raise FileError(f"{shown(path)}: does not fit into memory") from None
         raise FileError(f"{shown(path)}: not a {what} saved by {by} ({reason(error)})") from None
 
 
@@ -164,7 +159,8 @@ def _to_npz(record: Mapping[str, object], checksummed: bool) -> bytes:
 def _from_npz(content: bytes) -> tuple[Record, bool]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         record = {key: file[key] for key in file.files}
-    # The archive ends with its number of entries. A damaged length field can hide some entries.
+    # The archive ends with its number of entries. This number reveals entries that a damaged length
+    # field hides.
     end = content[-22:]
     if end[:4] == b"PK\5\6" and int.from_bytes(end[10:12], "little") != len(record):
         raise ValueError(DAMAGED)
@@ -172,7 +168,7 @@ def _from_npz(content: bytes) -> tuple[Record, bool]:
 
 
 def verify_checksum(record: Record) -> bool:
-    """Remove the digest from the entries of a .npz file; return whether there was a valid one."""
+    """Remove and verify the digest of .npz entries; return False if there is no digest."""
     checksum = record.pop(CHECKSUM, None)
     if checksum is not None and text(checksum) != content_digest(record):
         raise ValueError(DAMAGED)
@@ -212,7 +208,7 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
 
 
 def _of_mat(value: object) -> Any:
-    """Convert a MATLAB variable to an array, string, list of cells or rows, or dict (struct)."""
+    """Convert a MATLAB variable: text to str, cells or text rows to a list, a struct to a dict."""
     if not isinstance(value, np.ndarray):
         return value
     if value.dtype.names:
@@ -307,7 +303,7 @@ class Design(FrozenArrays):
 
     @classmethod
     def _read(cls: type[Kind], path: str | Path, **given: object) -> Kind:
-        """Read a file as `load` does; `given` holds the fields that no file contains."""
+        """Read a file as `load` does; `given` are the fields that files do not contain."""
         source, name = as_path(path), cls.__name__
         with reading(source, name):
             record, verified = read_record(source)

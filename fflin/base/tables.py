@@ -43,7 +43,7 @@ def first_paragraph(report: str) -> str:
 
 
 def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[str]]:
-    """Return the head and the first rows of a long table; `rest` says where the other rows are."""
+    """Return the head and the first rows of a long table; `rest` locates the other rows."""
     left = len(rows) - 1 - MOST_ROWS
     if left <= _SPARE:
         return list(rows)
@@ -81,12 +81,12 @@ def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
 
 
 def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
-    """Format a matrix with its names; "~0" is rounding error, and lines of zeros are left out."""
+    """Format a matrix with names; "~0" is rounding error, zero rows and columns are left out."""
     text = [
         [_number(x, below) for x, below in zip(row, limits, strict=True)]
         for row, limits in zip(values.tolist(), rounding(values).tolist(), strict=True)
     ]
-    # Columns that exceed the width continue below, with only the rows in which they are not zero.
+    # Columns that exceed the width continue below in blocks that show only their nonzero rows.
     label, used = max(map(len, rows)), 0
     folds: list[list[int]] = []
     for j, name in enumerate(columns):
@@ -107,7 +107,7 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
 
 
 def rounding(values: Array) -> Array:
-    """Return the rounding error of each entry, from the largest entries in its row and column."""
+    """Estimate the rounding error of each entry from the largest entries of its row and column."""
     sizes = abs(values)
     by_row: Array = _EPS * sizes.max(axis=1, initial=0.0)[:, None]
     return by_row.clip(max=_EPS * sizes.max(axis=0, initial=0.0))

@@ -16,10 +16,10 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-# Enough for about 1,000 inputs.
+# Largest size of a file [bytes], enough for about 1,000 inputs.
 _SIZE_LIMIT = 2**17
 
-# The time to parse a dotted key grows with the square of the number of its parts.
+# The number of dots in a key is limited, because the parse time grows with its square.
 _DOTS_LIMIT = 1_000
 
 # Multi-line strings may contain lines that look like keys. One-line strings and comments are
@@ -34,8 +34,8 @@ _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
 
 def is_number(value: Any) -> bool:
     """Return whether a TOML value is a finite number."""
-    # The limit keeps computed lengths finite. It also excludes integers that no float can
-    # represent.
+    # The limit keeps the length of a vector of such numbers finite. It also excludes integers that
+    # no float can represent.
     return type(value) in (int, float) and abs(value) < 1e100
 
 
@@ -57,10 +57,11 @@ class TomlFile:
             line = found[1] if found else content.count(b"\n", 0, last) + 1
             message = f"{path}:{line}: invalid TOML: {error}; correct the file"
             raise InputError(message) from None
-        # Multi-line strings are removed. One-line strings stay, because keys may be quoted.
+        # Multi-line strings are removed. One-line strings stay, because they may be quoted keys.
         self._lines = _lines_of(_TEXTS.sub(lambda x: "\n" * x[0].count("\n") or x[0], text))
         for key_path, value in _values(self.record):
-            # Python refuses to convert longer integers to text, so no message could show them.
+            # Python refuses to convert very long integers to text, so a message could not show the
+            # value.
             if type(value) is int and value.bit_length() > 10_000:
                 raise self.error(
                     f"{key_path[-1]} has too many digits; write a number of this size in the form "
@@ -82,7 +83,7 @@ class TomlFile:
 
     @contextmanager
     def located(self, *table: str | int, of: str = "") -> Iterator[None]:
-        """Add file, line and `of` to errors that name a key or a string value of a table."""
+        """Add file, line and the prefix `of` to errors that name a key or a string of a table."""
         try:
             yield
         except FflinError as error:
@@ -90,7 +91,7 @@ class TomlFile:
             raise self.error(type(error)(f"{of}{error}"), *key_path) from None
 
     def _named_in(self, message: str, *table: str | int) -> tuple[str | int, ...]:
-        """Return the path of the first key, string or pattern of a table that a message names."""
+        """Return the path of the first key, string or pattern of a table in a message."""
         head = ".".join(map(str, table)) + "."
         keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]
         names = [

@@ -33,19 +33,19 @@ T = TypeVar("T")
 # this, because the difference is rounding error. A larger difference is an error in the input.
 NORM_TOLERANCE = 1e-6
 
-# Native double precision. NumPy has only one such object, so `is` can replace a comparison.
+# Native double precision. NumPy has only one native float64 type, so `is` can replace a comparison.
 DOUBLE = np.dtype(np.float64)
 
 
 def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
-    """Return a vector (size,) of finite native floats; a valid array is returned itself."""
+    """Return a vector (size,) of finite native floats; a valid array is not copied."""
     if type(value) is np.ndarray and value.dtype is DOUBLE:
         array: Array = value
     else:
         array = as_double(name, value)
     if array.shape != (size,):
         raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
-    # For short vectors, Python's sum is faster than NumPy's. It overflows without a warning.
+    # For short vectors, Python's sum is faster than NumPy's and overflows without a warning.
     if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
         index = int(np.flatnonzero(~np.isfinite(array))[0])
         raise InputError(f"{name}[{index}] is {array[index]}; every entry must be finite")
@@ -95,9 +95,8 @@ def share(name: str, value: object) -> float:
 
 def refuse_masked(name: str, value: object) -> None:
     """Raise `InputError` if an entry is masked, because NumPy may ignore the mask."""
-    ma: ModuleType | None = sys.modules.get(
-        "numpy.ma"
-    )  # a masked array exists only if this is loaded
+    # A masked array exists only if this module is loaded.
+    ma: ModuleType | None = sys.modules.get("numpy.ma")
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
 
@@ -134,7 +133,7 @@ def by_name(name: str, value: object, of_what: str) -> Mapping[str, object]:
 
 
 def untied(key: str, value: object) -> tuple[object, bool]:
-    """Return a range, and whether all names that its key matches get the same random value."""
+    """Return a range, and whether all names that match its key share one random value."""
     if not isinstance(value, Mapping):
         return value, False
     if value.keys() != {"range", "tied"}:
@@ -143,7 +142,7 @@ def untied(key: str, value: object) -> tuple[object, bool]:
 
 
 def numbers(name: str, value: object, of_what: str, each: str) -> dict[str, float]:
-    """Return {name: finite float} from a mapping; a message calls an entry `each`."""
+    """Return {name: finite float} from a mapping; messages call an entry `each`."""
     values = by_name(name, value, of_what)
     return {key: number(f"{each} '{key}'", entry) for key, entry in values.items()}
 
@@ -154,7 +153,7 @@ def dimension(name: str, value: object) -> int:
 
 
 def placement(name: str, value: object) -> pin.SE3:
-    """Return a copy of a placement; its rotation is normalised if it is valid within 1e-6."""
+    """Return a copy of a placement with a normalised rotation, or raise `InputError`."""
     import pinocchio as pin
 
     given = instance(name, value, pin.SE3, "a pin.SE3 (placement)")

@@ -1,6 +1,6 @@
 """Atomic writing of files.
 
-- A file is written completely or, if anything fails, not at all. The old file then stays.
+- A file is written completely. If anything fails, the old file stays unchanged.
 - The target is a new name or a regular file. An old file keeps its mode. The mode of a new file
   follows from the umask.
 - If the target is a symbolic link, the file at its end is written and the link stays.
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fflin.base.errors import FileError, InputError
+from fflin.base.process import same_file
 
 # In folders with more names than this, no similar names are searched for.
 _MANY = 1000
@@ -30,7 +31,7 @@ class CommandFiles(NamedTuple):
     inputs: set[str]
 
 
-# None in a Python session, which may overwrite files that it has read.
+# The value is None in a Python session, which may overwrite files that it has read.
 _of_command: ContextVar[CommandFiles | None] = ContextVar("files of a command", default=None)
 
 
@@ -53,7 +54,8 @@ def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
     """Return the content of a regular file of at most `limit` bytes, or raise `FileError`."""
     what = f"; give the path of a {kind} file"
     try:
-        # Opening a pipe would block until another process writes into it.
+        # Only regular files are opened, because opening a pipe would block until another process
+        # writes into it.
         if path.exists() and not path.is_file():
             raise FileError(
                 f"{path}: is {'a folder' * path.is_dir() or 'not a regular file'}{what}"
@@ -98,16 +100,9 @@ def remember(*paths: str | Path) -> None:
 
 def _require_other(target: Path, inputs: Iterable[str | Path]) -> None:
     for path in inputs:
-        if _same_file(path, target):
+        if same_file(path, target):
             said = f"output {target} is the input file {os.path.abspath(path)}"
             raise FileError(f"{said}; give another output file")
-
-
-def _same_file(path: str | Path, other: Path) -> bool:
-    try:
-        return os.path.samefile(path, other)
-    except (OSError, ValueError):  # one of them does not exist
-        return False
 
 
 def csv_table(rows: Iterable[Iterable[object]]) -> bytes:
@@ -198,14 +193,14 @@ def check_distinct(*targets: Path | None) -> None:
     for target in filter(None, targets):
         for first in seen:
             same = os.path.realpath(first) == os.path.realpath(target)
-            if same or _same_file(first, target):
+            if same or same_file(first, target):
                 said = f"outputs {target} and {first} are the same file"
                 raise FileError(f"{said}; give each output its own file")
         seen.append(target)
 
 
 def missing(path: Path, otherwise: str = "") -> str:
-    """Describe the folder in which a file is missing, and the similar names in it."""
+    """Describe the folder that lacks a file, and the similar names in this folder."""
     import difflib
 
     try:
@@ -229,6 +224,6 @@ def reason(error: Exception) -> str:
 
 
 def shown(path: str | Path) -> str:
-    """Return a path for a message; a path too long for a file name is cut to its two ends."""
+    """Return a path for a message; a very long path is shortened to its two ends."""
     text = str(path)
     return text if len(text) < 500 else f"{text[:60]} ... {text[-60:]}"

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from fflin.base.errors import FflinError, FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.validation import Array
 from fflin.batch.rows import Points
 from fflin.batch.run import ChunkResult
@@ -50,12 +50,12 @@ class ChunkJob:
                     "leave engine out"
                 )
             prepared.kernel()  # raises an error if there is none
-        # At rest about its own reference, a free robot has constant A and f0, so only B is
+        # If a free robot is at rest about its own reference, A and f0 are constant, so only B is
         # computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Each worker needs its own work space, so only the arguments are pickled.
+        # Only the arguments are pickled, because each worker needs its own work space.
         return self._again, ()
 
     @cached_property
@@ -86,13 +86,11 @@ class ChunkJob:
         with _TURN, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", FflinWarning)
             for row in left.tolist():
-                try:
+                with located(f"configuration {start + row}"):
                     if self.only_inertia:
                         self._write_at_rest(points.q[row], out["B_lower"][row])
                     else:
                         self._write(row, points, out)
-                except FflinError as error:
-                    raise type(error)(f"configuration {start + row}: {error}") from None
         return ChunkResult(dict(out), [str(note.message) for note in caught])
 
     def _write(self, row: int, points: Points, out: Mapping[str, Array]) -> None:
@@ -108,7 +106,8 @@ class ChunkJob:
         inertia.invert(q, inverse)
         if actuation.default:
             return
-        # The columns do not depend on the base position, which would only add rounding error.
+        # The columns do not depend on the base position, so the base is moved to the origin to
+        # avoid rounding errors.
         base_centred = q.copy()
         base_centred[:3] = 0.0
         np.matmul(inverse, actuation.columns(data, base_centred), out=B_lower)
@@ -128,7 +127,7 @@ class ChunkJob:
 
 
 class BatchEquations:
-    """Equations of a robot's linear models about many points, for the arrays that vary."""
+    """Compiled equations for the arrays of linear models that vary between points."""
 
     def __init__(self, prepared: Prepared, *, only_inertia: bool) -> None:
         self._prepared, self._only_inertia = prepared, only_inertia
@@ -169,8 +168,8 @@ class BatchEquations:
         out["f0"][:] = 0.0 if ready.moving else f0
         if ready.moving:
             out["_drift"][:] = drift(state, f0, rates.gravity)
-        # Comparisons with NaN are false, so rows with NaN are not valid. The upper half of A is
-        # finite if q0 and f0 are valid.
+        # Comparisons with NaN are false, so rows with NaN are not valid. The upper half of A is not
+        # checked, because it is finite if q0 and f0 are valid.
         good = self._kernel.sound(q, judged) & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
         for rows in (A.reshape(count, -1)[:, A[0].size // 2 :], B.reshape(count, -1), f0):
             good &= np.vecdot(rows, rows) < LARGEST

@@ -12,11 +12,11 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, as_double, instance, number, whole
 from fflin.batch.rows import checked_configurations, follow_rows
 from fflin.dynamics.points import configuration
-from fflin.robot.joints import Joint
+from fflin.robot.fields import travel_of
+from fflin.robot.joints import Joint, by_joint
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ class GivenConfigurations:
         return self.q[start:stop]
 
 
-# Configurations that `sweep` accepts instead of an array; their rows are generated on demand.
+# Configurations of a sweep; the rows of a grid and random rows are generated on demand.
 Configurations: TypeAlias = Grid | RandomConfigurations | GivenConfigurations
 
 
@@ -245,8 +245,7 @@ def random_configurations(
     start = configuration(robot, base=base)
     if not (ranges is None or isinstance(ranges, Mapping)):
         raise InputError(f"ranges is {ranges!r}, expected a mapping {{joint: (low, high)}}")
-    names = robot.joint_names
-    given = joints_by_name("joint", ranges or {}, names, lambda name: robot.joint(name).name)
+    given = by_joint(ranges or {}, robot.joint_names, robot.joint)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
     start.setflags(write=False)
     return RandomConfigurations(robot, count, seed, checked, start)
@@ -285,17 +284,11 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
         except (TypeError, ValueError):
             raise InputError(f"{what} is {given!r}, expected (low, high)") from None
         low, high = number(what, low), number("its end", high)
-        if not low <= high:
-            raise InputError(f"{what} is {low:g} to {high:g}, expected low <= high")
-        if math.isinf(high - low):
-            raise InputError(
-                f"{what} is {low:g} to {high:g}, and its width overflows; give a narrower range"
-            )
+        if not 0.0 <= high - low < math.inf:
+            said = f"{what} is {low:g} to {high:g}"
+            raise InputError(f"{said}, expected low <= high with a width that does not overflow")
         return low, high
-    if joint.unbounded:
-        return _TURN
-    low = float(robot.model.lowerPositionLimit[joint.idx_q])
-    high = float(robot.model.upperPositionLimit[joint.idx_q])
+    low, high = travel_of(robot.model, joint)
     if not joint.prismatic:
         low, high = max(low, 2 * _TURN[0]), min(high, 2 * _TURN[1])
         return (low, high) if low <= high and high - low < 4 * math.pi else _TURN

@@ -69,7 +69,7 @@ def hdf5() -> ModuleType:
 
 
 def is_constant(array: Array) -> bool:
-    """Return whether an array stores a single row that stands for all its rows."""
+    """Return whether an array stores a single row that represents all its rows."""
     return array.strides[0] == 0 and array.size > 0
 
 

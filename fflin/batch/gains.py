@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.base.errors import FflinError, InputError
+from fflin.base.errors import InputError, located
 from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array, instance, vector
@@ -186,10 +186,8 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
             K[index], residual[index] = found.K, found.residual
             margin[index] = -found.poles.real.max()
             continue
-        try:
+        with located(f"point {index}"):
             gain = lqr(batch[index], Q, R)
-        except FflinError as error:
-            raise type(error)(f"point {index}: {error}") from None
         K[index], residual[index], margin[index] = gain.K, gain.residual, gain.margin
     return GainBatch(
         K=K,

@@ -110,11 +110,13 @@ class LinearBatch(FrozenArrays):
     # _x0 is None at rest, because x0 then follows from q. _y0 is None if the outputs are the state.
     _x0: Array | None
     _y0: Array | None
-    # None if the reference is the base's own placement, which follows from q and _root.
+    # _reference is None if the reference is the base's own placement, which follows from q and
+    # _root.
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Fields of the models, by name, that are the same at all points or need the robot.
+    # Fields of the models that are not fields of the batch: the same at all points, or taken from
+    # the robot.
     _asked: Mapping[str, Any]
     verified: bool = True
 
@@ -346,8 +348,8 @@ class LinearBatch(FrozenArrays):
         return {self.joint_names.index(name): value for name, value in joints.items()}
 
 
-# Names of a batch's fields by kind, in order. _TEXTS are the same at all points and are stored in
-# the header of a file. Arrays have one row per point.
+# Names of a batch's fields by kind, in order. The fields in _TEXTS are the same at all points and
+# are stored in the header of a file. Arrays have one row per point.
 _KINDS = {item.name: str(item.type) for item in fields(LinearBatch)}
 _MODEL = {item.name for item in fields(LinearModel)} - {"verified"}
 _ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array"]

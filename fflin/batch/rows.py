@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import FflinError, InputError
+from fflin.base.errors import InputError, located
 from fflin.base.validation import NORM_TOLERANCE, Array, as_double, dimension, vector
 from fflin.robot.joints import ROUND_OFF, Joint
 from fflin.robot.robot import Robot
@@ -15,8 +15,8 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# Position of a joint in q: (index, -1), or the indices of (cos, sin) for a continuous joint. The
-# factor is the entry of q for a joint value of 1.
+# Two indices of a joint in q, and a factor. A continuous joint has the indices of (cos, sin); any
+# other joint has -1 as its second index. The factor is the entry of q for a joint value of 1.
 Column: TypeAlias = tuple[int, int, float]
 
 # Number of rows that are checked together, which limits the memory for intermediate results.
@@ -37,7 +37,7 @@ class Points(NamedTuple):
 
 
 def column(joint: Joint) -> Column:
-    """Return the indices and the scale of a joint in q."""
+    """Return the `Column` of a joint: its indices in q and its factor."""
     return joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1, joint.scale
 
 
@@ -63,7 +63,7 @@ def away(q: Array, column: Column, value: float) -> Array:
 
 
 def follow_rows(robot: Robot, q: Array) -> None:
-    """Set the mimic joints of configurations (N, nq) from their leaders."""
+    """Set the mimic joints of configurations (N, nq) from the joints that they follow."""
     for joint, leader, multiplier, offset in robot.followers:
         at: Any = multiplier * values(q, column(leader)) + offset
         joint.place(q.T, at)
@@ -80,16 +80,15 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
                 excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
             # A finite sum shows that all entries are finite.
             finite = np.isfinite(block.sum()) or np.isfinite(block).all(axis=1)
-        # Comparisons with NaN are false, so rows with NaN are doubtful.
+        # Comparisons with NaN are false, so rows with NaN count as doubtful.
         doubtful = ~((excess <= ROUND_OFF) & finite)
         if robot.followers:
             followed = block.copy()
             follow_rows(robot, followed)
             doubtful |= ~(np.abs(followed - block) <= NORM_TOLERANCE).all(axis=1)
         for row in np.flatnonzero(doubtful).tolist():
-            block[row] = _checked(
-                robot.checked_configuration, "configuration", start + row, block[row]
-            )
+            with located(f"configuration {start + row}"):
+                block[row] = robot.checked_configuration(block[row])
         if robot.followers:
             follow_rows(robot, block)
     rows.setflags(write=False)
@@ -102,7 +101,8 @@ def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
         return np.broadcast_to(robot.checked_velocity(v).copy(), (count, robot.nv))
     rows = _rows("v", v, robot.nv, "one velocity in Pinocchio's order per row", count)
     for row in range(count) if robot.followers else _not_finite(rows):
-        _checked(robot.checked_velocity, "velocity", row, rows[row])
+        with located(f"velocity {row}"):
+            robot.checked_velocity(rows[row])
     rows.setflags(write=False)
     return rows
 
@@ -137,10 +137,3 @@ def _rows(name: str, value: ArrayLike, size: int, of_what: str, count: int | Non
     if not len(array):
         raise InputError(f"{name} has no rows; give at least one row")
     return np.ascontiguousarray(array)
-
-
-def _checked(check: Callable[[Array], Array], what: str, row: int, value: Array) -> Array:
-    try:
-        return check(value)
-    except FflinError as error:
-        raise type(error)(f"{what} {row}: {error}") from None

@@ -1,7 +1,7 @@
-"""Application of a job to rows, chunk by chunk, into a store that may already contain chunks.
+"""Run a job on rows, chunk by chunk, into a store that may already contain chunks.
 
-Chunks run on threads of this process, or on the workers of an executor. The meaning of the rows and
-results is left to the job.
+Chunks run on threads of this process, or on the workers of an executor. The job defines the meaning
+of the rows and the results.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -38,7 +38,7 @@ Progress = Callable[[int, int], object]
 
 
 class Rows(Protocol):
-    """Arrays of equal length, as a named tuple has them."""
+    """Arrays of equal length in a named tuple."""
 
     def _asdict(self) -> dict[str, Any]: ...
 
@@ -70,11 +70,11 @@ class Job(Protocol[R_contra]):
     def run(
         self, rows: R_contra, start: int, out: Mapping[str, Array] | None = None, /
     ) -> ChunkResult:
-        """Process the rows from `start` on, into arrays `out` or new arrays, on any thread."""
+        """Process the rows from `start` on into `out` or new arrays; may run on any thread."""
 
 
 class Done(NamedTuple):
-    """Finished chunk: its result, or the reason of its failure."""
+    """Finished chunk: its result, or the reason why it failed."""
 
     span: Span
     result: ChunkResult | None
@@ -110,9 +110,10 @@ def run_chunks(
     all_needed: bool = False,
 ) -> list[Done]:
     """Compute the missing chunks of a store, save the results, and return failed chunks."""
-    # `rows(start, stop)` returns a named tuple; the store saves the fields that it has arrays for.
-    # Only chunks that begin before `upto` are computed. Without an executor, they run on `threads`
-    # threads of this process. If all chunks are needed, the run ends at the first failure.
+    # `rows(start, stop)` returns a named tuple; the store saves the fields for which it has arrays.
+    # Only chunks that begin before `upto` are computed. Without an executor, the chunks run on
+    # `threads` threads of this process. If all chunks are needed, the run ends at the first
+    # failure.
     size = store.chunk
     spans = [Span(at, min(at + size, store.count)) for at in range(0, store.count, size)]
     left = [span for span in spans if not store.finished(*span)]
@@ -205,7 +206,7 @@ def _run_here(
         while begun:
             yield begun.popleft().result()
     finally:
-        # Do not wait, so that Ctrl-C can also interrupt a compilation.
+        # Do not wait for the threads, so that Ctrl-C can also interrupt a compilation.
         pool.shutdown(wait=False, cancel_futures=True)
 
 
@@ -240,22 +241,17 @@ def _run_on_workers(
 
 
 def _reason(error: Exception) -> str:
-    """Return the reason for which a chunk failed."""
-    if isinstance(error, FflinError):
-        return str(error)
-    if isinstance(error, WorkerDied | NoWorkers):
+    """Return the reason why a chunk failed."""
+    if isinstance(error, FflinError | WorkerDied | NoWorkers):
         return str(error)
     return f"the executor failed: {type(error).__name__}: {error}".rstrip(": ")
 
 
-@contextmanager
-def executor_of(executor: Executor | None, workers: int | None) -> Iterator[Executor | None]:
-    """Yield the given executor, or an executor of new processes that end with this context."""
-    if not workers:
-        yield executor
-        return
-    with OwnWorkers(workers) as pool:
-        yield pool
+def executor_of(
+    executor: Executor | None, workers: int | None
+) -> AbstractContextManager[Executor | None]:
+    """Return a context with the given executor, or with an executor whose processes end with it."""
+    return OwnWorkers(workers) if workers else nullcontext(executor)
 
 
 def work(job: bytes, rows: Rows, start: int) -> ChunkResult:

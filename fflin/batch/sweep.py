@@ -228,7 +228,7 @@ def _in_memory(task: SweepTask, store: FileStore | MemoryStore) -> LinearBatch:
     return task.batch(task.given() | store.arrays)
 
 
-# Attributes that, with the model and the mappings, distinguish a robot from others.
+# Attributes that identify a robot, in addition to its model and its mappings.
 _OF_THE_ROBOT = (
     *("name", "urdf_sha256", "locked", "joints", "followers"),
     *("inputs", "outputs", "gravity", "orbit"),
@@ -257,7 +257,7 @@ class SweepTask:
         return Points(self.configurations.rows(start, stop), v, u)
 
     def given(self) -> dict[str, Array]:
-        """Return the arrays that vary between points and are already known."""
+        """Return the arrays that vary between points and are known before the sweep."""
         rows = {"v": self.v, "u0": self.u}
         if isinstance(self.configurations, GivenConfigurations):
             rows["q"] = self.configurations.q

@@ -38,10 +38,11 @@ class OwnWorkers(Executor):
         cores = available_cores()
         if count > cores:
             said = f"{count} workers requested, but only {cores} cores are available; using {cores}"
-            warnings.warn(said, FflinWarning, stacklevel=5)
+            warnings.warn(said, FflinWarning, stacklevel=4)
             count = cores
         self._max_workers = count
-        # With fork, a process would inherit locks that other threads hold.
+        # With fork, a process would inherit locks that other threads hold, and could wait for them
+        # forever.
         self._context = get_context("spawn")
         self._threads = ThreadPoolExecutor(count)
         self._mine = local()
@@ -58,9 +59,9 @@ class OwnWorkers(Executor):
             self._closed = True
             for process in self._processes:
                 process.terminate()
-        # Do not join the threads; they end with their processes. If Ctrl-C interrupts a wait for a
-        # future, the lock of the future remains locked. A thread that needs this lock to set the
-        # result would never end.
+        # Do not join the threads; they end with their processes. If Ctrl-C interrupts a wait
+        # for a future, the future remains locked. A thread that must set the result of this future
+        # would never end.
         self._threads.shutdown(wait=False, cancel_futures=True)
         for process in list(self._processes):
             self._end(process)
@@ -126,7 +127,7 @@ def _isolated() -> Iterator[None]:
     """Start processes that import nothing from the working folder.
 
     By default, a process that multiprocessing starts imports from the working folder first, until
-    it has copied the `sys.path` of its parent process.
+    it has copied `sys.path` from its parent process.
     """
     from multiprocessing import util
 
@@ -148,7 +149,8 @@ def _deaf_to_ctrl_c() -> Iterator[None]:
         return
     from multiprocessing import resource_tracker
 
-    # A tracker that is started together with a process would unblock the signal.
+    # Start the resource tracker first. If it were started together with a process, it would unblock
+    # the signal.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

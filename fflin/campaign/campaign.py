@@ -44,7 +44,7 @@ _FACTORS = {  # from the unit of a condition to the unit of a figure
 
 
 class Bound(NamedTuple):
-    """Comparison in a condition, and the mask (N,) of runs that meet the condition."""
+    """Comparison in a condition, and the mask (N,) of runs that meet the comparison."""
 
     name: str
     sign: str
@@ -383,7 +383,7 @@ class Campaign(FrozenArrays):
         write_atomically({path: content.getvalue()})
 
     def _save(self, path: Path, **texts: str) -> None:
-        """Write the campaign with further strings, such as the request that identifies its call."""
+        """Write the campaign and further strings, such as the request that identifies the call."""
         arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in _ARRAYS}
         rest = {key: getattr(self, key) for key in _HEADER}
         texts["header"] = json.dumps({"kind": "Campaign", **rest})

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from fflin.robot.equipment.appendages import Appendage
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
-_OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # with their axes
+_OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # {property: axes}
 _AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
 _OF_SENSORS = ("sensor", "noise")
@@ -45,7 +45,7 @@ _FACTORS = ("mass", "inertia", "density", "frequency", *_OF_SPRINGS)
 
 
 class Column(NamedTuple):
-    """Number drawn for each run, and the quantities that this number changes."""
+    """Random value of each run, and the quantities that this value changes."""
 
     name: str
     kind: str  # "state", "delay", "seed" (of noise), or the last part of a name
@@ -64,7 +64,7 @@ class Draws(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """Policy that a function creates for a robot, and the model of its design, if any."""
+    """Function that creates a policy for a robot, and the linear model of its design, if any."""
 
     bind: Callable[[Robot], Policy]
     lin: Any = None
@@ -129,7 +129,7 @@ class Dispersions:
         self._refuse_same_mass()
 
     def _refuse_same_mass(self) -> None:
-        """Raise an error if the mass of a link is dispersed twice, also as part of a body."""
+        """Raise an error if a link's mass is dispersed twice, directly or as part of a body."""
         pieces = [*self._plant.robot.pieces.values()]
         masses = [*self._changed("mass"), *self._changed("density")]
         for (column, at), (other, of) in combinations(masses, 2):
@@ -182,10 +182,10 @@ class Dispersions:
     def _by_piece(
         self, kind: str, spreads: Mapping[str, object]
     ) -> tuple[dict[str, Any], dict[str, str]]:
-        """Return {link or body: spread}, and {link or body: name} if given without a pattern."""
+        """Return {link or body: spread}, and {link or body: key} for keys without a wildcard."""
         robot, found, named = self._plant.robot, dict[str, object](), dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
-        for key in sorted(spreads, key=lambda key: key in alone):  # names go before patterns
+        for key in sorted(spreads, key=lambda key: key in alone):  # names override patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
                 if name in named:
                     raise InputError(
@@ -198,7 +198,7 @@ class Dispersions:
         return {name: x for name, x in found.items() if name in named or name not in links}, named
 
     def _changed(self, *kinds: str) -> list[tuple[int, int]]:
-        """Return (column, index) of these kinds, with the index of a state, body, joint, .."""
+        """Return (column, index of a state, body, joint, ..) for each quantity of these kinds."""
         columns = enumerate(self.columns)
         return [(i, at) for i, each in columns if each.kind in kinds for at, _ in each.at]
 
@@ -220,13 +220,13 @@ class Dispersions:
     def _uniform(self, column: Column, block: int) -> Array:
         key = (self._seed, zlib.crc32(column.name.encode()))
         stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
-        # The inverse may be infinite at 0 and 1.
+        # The inverse may be infinite at 0 and 1, so the values are kept between them.
         return np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
 
     def _drawn(self, column: Column, block: int, count: int) -> Array:
-        """Return the first values of a block of runs.
+        """Return the first `count` values of a block of runs.
 
-        Values of slow distributions are drawn once and kept.
+        Values of slow distributions are kept for later calls.
         """
         uniform = self._uniform(column, block)
         if is_closed_form(column.inverse):
@@ -269,7 +269,7 @@ class Dispersions:
     def _require_realisable(
         self, appendages: Sequence[Appendage], drawn: Array, start: int
     ) -> None:
-        """Raise `InputError` if a body's inertia is too small for its modes' participation."""
+        """Raise `InputError` if a drawn inertia is too small for the flexible modes of its body."""
         refused = first_impossible(self._model, appendages, self.bodies(drawn))
         if refused is not None:
             try:
@@ -366,7 +366,8 @@ class Dispersions:
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
                 old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
-                # Only the change is added, because the parameters also contain wheels in the body.
+                # Only the change of the body is added, because its parameters also contain its
+                # wheels.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(len(drawn), -1)
         runs |= {kind: self._springs(kind, drawn) for kind in self._springs_of}
@@ -438,9 +439,10 @@ def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: float)
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
-    """Return m, m c and I (xx xy xz yy yz zz) of bodies (N, 10), in the axes given as columns.
+    """Return the inertial parameters (N, 10) of bodies along `axes`, the columns of a matrix.
 
-    I is about the origin.
+    The parameters are the mass m, the products m c with the centre of mass c, and the inertia about
+    the origin (xx xy xz yy yz zz).
     """
     square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes

@@ -45,11 +45,11 @@ _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance
 _MOST = 1_000_000
 _ROUNDING = 1e-12  # eigenvalues of P, relative to the largest, that count as zero
 
-# Number of runs per trial level in the search for the largest level, and largest number of
-# halvings.
+# _PILOTS is the number of runs per trial level in the search for the largest level. _HALVINGS is
+# the largest number of halvings.
 _PILOTS, _HALVINGS = 16, 40
-# The largest attitude error [deg], joint error [rad] and position or sliding joint error [m] of a
-# start.
+# Largest errors of a start: attitude [deg], revolute joint [rad], and position or prismatic joint
+# [m].
 _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
 
 
@@ -411,7 +411,7 @@ def funnel(
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """Evaluation of runs: bounds on final errors or final level, and on errors at any time."""
+    """Evaluation of runs by bounds on final errors or final level, and on errors at any time."""
 
     FIELDS: ClassVar[tuple[str, ...]] = ("outcome",)  # the codes of `Funnel.outcomes`
     over: ClassVar[None] = None
@@ -447,7 +447,7 @@ class Starts(NamedTuple):
     rng: np.random.Generator
 
     def drawn(self, roots: Array) -> Array:
-        """Return random initial deviations (N, nx) whose levels have these square roots (N,)."""
+        """Return random initial deviations e (N, nx) with sqrt(e' P e) equal to `roots` (N,)."""
         e = self.rng.normal(size=(len(roots), len(self.P))) @ self.axes.T
         # Directions in which P is zero do not contribute to the level.
         e *= (roots / np.sqrt(((e @ self.P) * e).sum(axis=1)))[:, None]
@@ -476,7 +476,7 @@ def runs_from(
 
 
 def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
-    """Return the square root of the largest level to test, where about one run in sixteen fails."""
+    """Return the square root of the largest level to test; about one run in 16 fails there."""
     root = widest
     if simulate(np.zeros(1)).any():
         return root  # the goal is missed even without an error
@@ -489,7 +489,7 @@ def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
 
 
 def _bounds(name: str, given: Any, kinds: Iterable[str]) -> dict[str, float]:
-    """Return {kind: largest error}, or raise `InputError`."""
+    """Return {kind: largest error} from a given mapping, or raise `InputError`."""
     given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
     for key in given:
         if key not in kinds:
@@ -533,7 +533,7 @@ def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int
 
 
 def _widest(W: Array, robot: Robot) -> float:
-    """Return the square root of the largest level whose errors a start may have."""
+    """Return the square root of the largest level that keeps a start within its largest errors."""
     largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in robot.joints]
     reach = [
         np.linalg.norm(W[:3], 2) / np.sin(np.radians(_LARGEST_ATTITUDE / 2.0)),

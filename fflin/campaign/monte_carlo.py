@@ -278,7 +278,7 @@ def _goals(
 def _memory(
     path: Path | None, runs: int, size: int, shapes: Mapping[str, tuple[int, ...]]
 ) -> MemoryStore | None:
-    """Return a store in memory, or None for a .h5 file, which must fit on the disk."""
+    """Return a store in memory, or None for a .h5 file after a check that it fits on the disk."""
     if path is None or path.suffix == ".npz":
         return MemoryStore(runs, size, shapes)
     if not part_of(path).exists():
@@ -287,7 +287,7 @@ def _memory(
 
 
 def _complete(store: FileStore, done: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Complete a file in which the runs from `done` on are not needed."""
+    """Complete a file whose runs from `done` on are not needed."""
     for start in range(done, store.count, store.chunk):
         stop = min(start + store.chunk, store.count)
         unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}

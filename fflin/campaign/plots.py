@@ -124,8 +124,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
         left, right = figure.subplots(1, 2)
         measured = np.isfinite(validity.prediction_error)
         levels, errors = (each[measured] for each in (validity.levels, validity.prediction_error))
-        # The figure shows the error relative to the displacement, so its order is one less than
-        # the order of the error.
+        # The figure shows the error relative to the displacement. Its order is therefore one less
+        # than the order of the absolute error.
         order = "relative error"
         if np.isfinite(validity.slope):
             order += f", ~ displacement^{validity.slope - 1.0:.2f}"
@@ -215,8 +215,9 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
 def _bands(
     axes: Axes, campaign: Campaign, values: Array, runs: list[int], of: Any = slice(None)
 ) -> None:
-    """Draw bands of the values (N, M) of runs `of` over time, and one line for each of `runs`."""
-    # Interpolation between infinite values is not finite, so each bound is the value of one run.
+    """Draw bands over time of values (N, M) of the runs `of`, and a line for each of `runs`."""
+    # Interpolation between infinite values is not finite, so each bound of a band is the value of
+    # one run.
     most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
     shown, t = np.minimum(values[of], most), campaign.times
     for tail, name, dark in _BANDS:
@@ -286,7 +287,7 @@ def _inputs(
 
 
 def _correlations(axes: Axes, campaign: Campaign) -> None:
-    """Draw rank correlations with the default quantity, and the range that chance explains."""
+    """Draw rank correlations with the default quantity, and the range that chance can explain."""
     found = list(campaign.sensitivity().items())[:_BARS][::-1]
     doubt = min(1.0, 3.0 / math.sqrt(len(campaign)))
     axes.axvspan(-doubt, doubt, color="#999999", alpha=0.18, lw=0)

@@ -99,7 +99,7 @@ def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str,
 
 
 def _indexed(robot: Robot) -> Iterator[tuple[Input, tuple[str, ...], int]]:
-    """Yield each input with the names of its entries and the index of the first entry in u."""
+    """Yield each input, the names of its entries, and the index of its first entry in u."""
     first = 0
     for item, names in named_inputs(robot.inputs):
         yield item, names, first

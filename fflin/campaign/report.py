@@ -79,7 +79,7 @@ def worst_runs(campaign: Campaign, k: int) -> list[str]:
     ranks = campaign.drawn.argsort(axis=0).argsort(axis=0)
     weights = {key.strip("|"): abs(x) for key, x in campaign.sensitivity().items()}
     # A draw is influential if it is far from the median and its correlation is large. The seed of
-    # the noise has no correlation.
+    # the noise has no correlation, so it is never influential.
     out = abs(ranks - ranks.mean()) * [weights.get(name, 0.0) for name in campaign.names]
     for run in campaign.worst(k):
         far = int(out[run].argmax())
@@ -97,7 +97,7 @@ def _when(time: float, unit: str = "") -> str:
 
 
 def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
-    """Return the report as JSON values: [value, low, high], with null for infinite values."""
+    """Return the report as JSON values: estimates are [value, low, high], infinity is null."""
 
     def plain(values: Iterable[float]) -> list[float | None]:
         return [x if math.isfinite(x) else None for x in values]

@@ -67,7 +67,7 @@ class CampaignJob:
     ) -> None:
         self._arguments: tuple[object, ...] = (robot, policy, given, seed, engine, options, judge)
         self.judge, options = judge, dict(options)
-        # A judge compares with the start.
+        # A judge compares errors with the errors at the start, so the histories contain the start.
         histories = options.pop("histories", 0 if judge is None else 1)
         unlimited = options.pop("unlimited", False)
         options = SimulationOptions(linear=False, progress=False, **options)
@@ -98,7 +98,7 @@ class CampaignJob:
         return _remade, (self._arguments, self.engine)
 
     def choose(self, engine: object) -> None:
-        """Set the engine of the runs: the requested one, or the fastest that supports the plan."""
+        """Set the engine of the runs to the requested or the fastest one that supports the plan."""
         self.engine = engine_of(engine, self.plan, self.plant, many=True)
 
     @property
@@ -118,8 +118,9 @@ class CampaignJob:
     def digest(self, first: Draws) -> str:
         """Return a digest of the robot, the policy, the options and the first run.
 
-        Nothing is compiled for it, because the arrays of the compiled loop contain all of these. In
-        Python, a policy may be any function, so the outcome of the first run represents it.
+        For the compiled engine, the arrays that its loop reads contain all of these, so nothing is
+        compiled. For the Python engine, a policy may be any function, whose content cannot be
+        hashed. Then the digest contains the outcome of the first run instead.
         """
         if self.engine == "python":
             return content_digest(self.run(first, 0).arrays)
@@ -258,8 +259,9 @@ def expect(
 ) -> None:
     """Report the estimated time of jobs to a progress bar.
 
-    Each job comes with the draws of its first runs and its number of runs. Only the progress bar of
-    the command line has the method `expect`; other functions do not receive the estimate.
+    Each entry of `work` is a job, the draws of its first runs, and its number of runs. Only the
+    progress bar of the command line has the method `expect`; other progress functions do not
+    receive the estimate.
     """
     tell = getattr(progress, "expect", None)
     if tell is None:

@@ -30,10 +30,10 @@ from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.run import STOPS
 
-# A run has settled or diverged if its error, relative to the initial error, reaches these values.
+# A run has settled or diverged if its error reaches these multiples of the initial error.
 SETTLED, DIVERGED = 1e-3, 1e3
 # Duration of a run that is compared with the prediction, in time constants of the slowest pole.
-# Duration of a random run, in settling times of this pole.
+# Duration of a random run, in settling times of the slowest pole.
 _CONSTANTS, PATIENCE = 3.0, 3.0
 _STEP = 0.25  # time step times the fastest pole
 _WIDEST = 10.0  # largest joint displacement [rad] to which the step is adapted
@@ -89,7 +89,7 @@ class Loop:
 
         names = self.lin.state_names
         of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
-        # A coordinate is weighted like its rate, multiplied by the decay. A rate may have no
+        # The size of a coordinate is the size of its rate times the decay rate. Some rates have no
         # coordinate.
         size = [self.decay * of[rate_of(name)] for name in names if name not in of]
         Q = np.diag(np.array([*size, *of.values()]) ** 2)
@@ -124,10 +124,11 @@ class Loop:
 def settling_runs(
     loop: Loop, predicts: bool, limits: object, joint: float, fine: int = 0
 ) -> CampaignJob:
-    """Return runs of a loop from displaced states that end when they settle, or at a horizon.
+    """Return runs of a loop from displaced states; a run ends if it settles, or at a horizon.
 
     With `predicts`, runs last three time constants and are compared with the linear loop. `joint`
-    is the largest displacement of a joint. `fine` counts how often the steps have been shortened.
+    is the largest displacement of a joint. `fine` is the number of times that the steps have been
+    shortened.
     """
     lin, decay = loop.lin, loop.decay
     # The open loop also limits the step, because inputs are constant between samples and at
@@ -151,7 +152,7 @@ def settling_runs(
     dt, every = dt / finer, every * finer
     options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
     options |= {"limits": limits, "project": not predicts}
-    # Without limits, inputs do not saturate and thrusters may pull.
+    # Without limits, inputs do not saturate and thrusts may be negative.
     options |= {"unlimited": limits is None}
     options |= {"histories": checks + 1} if predicts else {}
     judge = Settling(loop, _transition(loop, dt, every) if predicts else None)
@@ -207,7 +208,7 @@ class Settling:
         return {"outcome": code, "error": np.where(code > 1, np.nan, apart / first)}
 
     def _apart(self, e: Array, step: Array) -> Array:
-        """Return the largest distance (N,) of each run from the linear loop."""
+        """Return the largest norm (N,) of the difference between each run and the linear loop."""
         worst, predicted = np.zeros(len(e)), e[:, 0]
         for now in e.swapaxes(0, 1):
             worst = np.maximum(worst, self.loop.size(now - predicted))

@@ -16,7 +16,7 @@ from fflin.base.toml_file import TomlFile, is_number
 from fflin.base.validation import Array, number
 from fflin.base.writing import as_path
 
-SEED = "noise"  # name of the drawn seed of a run's noise, which explains no result
+SEED = "noise"  # name of the seed of noise among the drawn values; a seed has no correlation
 
 _TABLE = "dispersions"
 _FORMS = ("normal", "uniform", "values", "distribution")
@@ -109,7 +109,7 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
 
 
 def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, object]]:
-    """Yield (name, spread); the key path ``base.mass = 0.1`` becomes the name "base.mass"."""
+    """Yield (name, spread) of a table; its key path ``base.mass = 0.1`` becomes "base.mass"."""
     for key, value in table.items():
         if isinstance(value, dict) and value and not {*value} & {*_FORMS}:
             yield from _names(value, f"{before}{key}.")
@@ -191,7 +191,7 @@ def inverse_of(name: str, spread: object) -> Callable[[Array], Array]:
 
 
 def is_closed_form(inverse: Callable[[Array], Array]) -> bool:
-    """Return whether this module defines an inverse function; SciPy's functions may be slow."""
+    """Return whether this module defines an inverse function; other functions may be slow."""
     return isinstance(inverse, partial) or inverse is whole_number
 
 
@@ -211,12 +211,12 @@ def _normal(deviation: float, u: Array) -> Array:
 
 
 def whole_number(u: Array) -> Array:
-    """Return whole numbers, all different and exact as doubles, that serve as seeds of noise."""
+    """Return seeds of noise: whole numbers below 2^53, which doubles represent exactly."""
     return np.floor(u * 2.0**53)
 
 
 def deviation_of(name: str, spread: Any) -> Callable[[Array], Array]:
-    """Return the inverse for the deviation of noise; a number stands for the deviation itself."""
+    """Return the inverse function for the deviation of noise; a number is the deviation itself."""
     inverse = inverse_of(name, spread)
     fixed = getattr(inverse, "func", None) is _normal
     return partial(_choice, np.array([float(spread)])) if fixed else inverse

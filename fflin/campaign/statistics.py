@@ -36,7 +36,8 @@ KINDS = {
 }
 # Attitude error [deg] at which a run is close to the end of the chart.
 EDGE = 176.0
-# Steps between checks of a stop condition, and steps per call without a stop condition.
+# LOOK is the number of steps between checks of a stop condition. _LONG is the number of steps per
+# call without a stop condition.
 LOOK, _LONG = 64, 2**20
 
 # Function of the state errors (N, nx) at the start and now; returns the mask (N,) of ended runs.
@@ -47,7 +48,7 @@ _FORMER = {"turning": "omega_b", "moving": "v_b", "rates": "joint rates"}
 
 
 def kind_named(name: str) -> str:
-    """Replace the former name of a kind of error, as in ``worst turning``, by its present name."""
+    """Replace a former name of a kind of error, as in ``worst turning``, by its present name."""
     of, _, kind = name.rpartition(" ")
     kind = _FORMER.get(kind, kind) if of in ("", "worst", "settle") else kind
     return f"{of} {kind}".strip()
@@ -230,7 +231,7 @@ class RunStatistics:
         return self._over(first, errors_of(self._state, self._target, q, v)[1])
 
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
-        """Add rows (steps, count, ..) of q, nu, u, .. from step `first` on; `raw` has them too."""
+        """Add rows (steps, count, ..) of q, nu, u, .. from step `first` on, also given as `raw`."""
         take = kernel("loop", "take", "the run statistics")
         take(self._words, raw, first, len(rows[0]))
         self._last = [each[-1] for each in rows[:3]]

@@ -22,8 +22,8 @@ from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
-# The prediction error is measured at these fractions of the largest displacement, in this number
-# of directions.
+# The prediction error is measured at these fractions of the largest displacement, in _DIRECTIONS
+# directions.
 _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
@@ -236,7 +236,7 @@ def validity(
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
     sets, work = [], []
-    # Level and random stream of each run for the prediction error, and of each random run.
+    # Level and random stream of each run: the runs for the prediction error, then the random runs.
     for predicts, at, streams in (
         (True, np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
         (False, levels, _DIRECTIONS + np.arange(samples)),
@@ -315,7 +315,8 @@ def _crossing(errors: Array) -> float:
         return 1.0
     first = int(beyond[0])
     if first == 0 or not np.isfinite(errors[first]):
-        # Below the first level, the error is proportional to the level.
+        # The error is assumed proportional to the level, below the first level and above the last
+        # level at which no run failed.
         at = max(first - 1, 0)
         near = float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
         return near if np.isfinite(errors[0]) else 0.0

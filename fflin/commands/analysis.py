@@ -12,43 +12,30 @@ from typing import TYPE_CHECKING
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.tables import counted, folded, signals
 from fflin.commands import options, parser
-from fflin.commands.points import (
-    attitude,
-    linear_model,
-    load_robot,
-    once,
-    placed,
-    point_of,
-)
+from fflin.commands.points import attitude, linear_model, load_robot, once, placed, point_of, refuse
 from fflin.commands.results import Report, figure_of, plain
 
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
 
-_SLACK = 1e-9  # up to which a value is at its limit, in SI units
+_SLACK = 1e-9  # [SI]; a value counts as at its limit within this distance
 
 
 def add_commands(commands: parser.Commands) -> None:
     """Add the commands analyze, modes, equilibrium, sensitivity and uncertain."""
     analyze = parser.command(
         commands,
-        "analyze",
         _analyze,
-        "show controllability, conserved momenta, modes and observability of a linear model",
-        example="fflin analyze servicer_7dof --stiffness panel_left=100 --output joints",
-        common="joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
+        "joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
         "frame plot",
     )
     options.add_point(analyze)
     options.add_figure(analyze, "the modes")
     modes = parser.command(
         commands,
-        "modes",
         _modes,
-        "show natural frequencies, damping ratios, kinetic energies and effective masses",
-        example="fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100",
-        common="joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
+        "joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
         "frame plot html",
     )
     options.add_point(modes)
@@ -57,13 +44,9 @@ def add_commands(commands: parser.Commands) -> None:
     pages.add("--html", "write an HTML page that animates the mode shapes", parser.PAGE)
     held = parser.command(
         commands,
-        "equilibrium",
         _equilibrium,
-        "show whether an operating point is stable, the inputs that hold the robot there, and "
-        "the spring deflections",
-        example="fflin equilibrium servicer_7dof --stiffness panel_left=100 --gravity 0 0 -0.01",
-        common="joint rpy velocity relative-equilibrium orbit stiffness gravity passive inputs "
-        "frame output-file",
+        "joint rpy velocity relative-equilibrium orbit stiffness gravity passive inputs frame "
+        "output-file",
     )
     options.add_point(held)
     what = "the equilibrium (q, u, spring deflections and poles)"
@@ -75,12 +58,8 @@ def add_commands(commands: parser.Commands) -> None:
 def _add_sensitivity(commands: parser.Commands) -> None:
     sensitivity = parser.command(
         commands,
-        "sensitivity",
         _sensitivity,
-        "show or save the derivatives of A and B with respect to the parameters of the robot, "
-        "such as masses, springs and thrusters",
-        example="fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
-        common="joint rpy velocity equilibrium inputs frame dt top only output-file",
+        "joint rpy velocity equilibrium inputs frame dt top only output-file",
     )
     options.add_point(sensitivity)
     model = sensitivity.group("derivatives")
@@ -103,21 +82,8 @@ def _add_sensitivity(commands: parser.Commands) -> None:
 
 
 def _add_uncertain(commands: parser.Commands) -> None:
-    uncertain = parser.command(
-        commands,
-        "uncertain",
-        _uncertain,
-        "show or save the exact linear-fractional model (LFT) of a robot at rest with uncertain "
-        "parameters",
-        example="fflin uncertain servicer_7dof --vary base.mass=0.2 "
-        "--vary panel_left.stiffness=80:120 -o uncertain.mat",
-    )
-    point = uncertain.group(parser.POINT)
-    neutral = (
-        "position of a joint [rad|m]. The default is the position in robot.toml or, if there is "
-        "none, the neutral position"
-    )
-    point.add("--joint", neutral, parser.assignment, repeatable=True)
+    uncertain = parser.command(commands, _uncertain)
+    options.add_joint(uncertain.group(parser.POINT))
     options.add_robot(uncertain)
     options.add_system(uncertain)
     uncertain.group("parameters").add(
@@ -148,6 +114,10 @@ def _range(text: str) -> tuple[str, object]:
 
 
 def _analyze(arguments: argparse.Namespace) -> Report:
+    """Show controllability, conserved momenta, modes and observability of a linear model.
+
+    example: fflin analyze servicer_7dof --stiffness panel_left=100 --output joints
+    """
     from fflin.analysis.controllability import controllability
     from fflin.analysis.modes import modes
     from fflin.analysis.observability import observability
@@ -173,6 +143,10 @@ def _analyze(arguments: argparse.Namespace) -> Report:
 
 
 def _modes(arguments: argparse.Namespace) -> Report:
+    """Show natural frequencies, damping ratios, kinetic energies and effective masses.
+
+    example: fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100
+    """
     from fflin.analysis.effective_masses import effective_masses
     from fflin.analysis.modes import modes
 
@@ -199,17 +173,17 @@ def _modes(arguments: argparse.Namespace) -> Report:
 
 
 def _equilibrium(arguments: argparse.Namespace) -> Report:
+    """Show whether an operating point is stable, its holding inputs, and its spring deflections.
+
+    example: fflin equilibrium servicer_7dof --stiffness panel_left=100 --gravity 0 0 -0.01
+    """
     from fflin.analysis.modes import modes
     from fflin.base.record import write_record
     from fflin.linear.equilibrium import equilibrium
     from fflin.linear.linearization import linearize
     from fflin.robot.fields import limits_of
 
-    if arguments.effort:
-        raise InputError(
-            "--effort sets inputs at the operating point, but this command computes the inputs; "
-            "remove --effort"
-        )
+    refuse(arguments, ("effort",), "this command computes the inputs at the operating point")
     robot, q, v, reference = point_of(arguments)
     if arguments.relative_equilibrium:
         q, reference = attitude(robot, q, arguments.relative_equilibrium, arguments.frame)
@@ -276,6 +250,10 @@ def _momentum(lin: LinearModel) -> str:
 
 
 def _sensitivity(arguments: argparse.Namespace) -> Report:
+    """Show or save the derivatives of A and B with respect to the parameters of the robot.
+
+    example: fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat
+    """
     from fflin.uncertainty.sensitivity import sensitivity, sensitivity_record
 
     _, lin = linear_model(arguments)
@@ -285,6 +263,11 @@ def _sensitivity(arguments: argparse.Namespace) -> Report:
 
 
 def _uncertain(arguments: argparse.Namespace) -> Report:
+    """Show or save the exact linear-fractional model (LFT) of an uncertain robot at rest.
+
+    example: fflin uncertain servicer_7dof --vary base.mass=0.2 --vary panel_left.stiffness=80:120
+    -o uncertain.mat
+    """
     from fflin.dynamics.points import base_of
     from fflin.uncertainty.uncertain import uncertain
 

@@ -25,13 +25,8 @@ TASKS = {
         **{"uncertain": "analysis", "validity": "regions", "funnel": "regions"},
     },
     "design and simulate": {
-        **{
-            "lqr": "regulator",
-            "tvlqr": "regulator",
-            "plan": "simulation",
-            "simulate": "simulation",
-        },
-        "export": "regulator",
+        **{"lqr": "regulator", "tvlqr": "regulator", "plan": "simulation"},
+        **{"simulate": "simulation", "export": "regulator"},
     },
     "many models or simulations": {"sweep": "sweeps", "montecarlo": "simulation"},
 }
@@ -40,7 +35,7 @@ _MODULES = {name: module for names in TASKS.values() for name, module in names.i
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return 0 if done, 1 if a check failed, 2 for invalid input."""
-    reported: set[str] = set()  # each warning once per command
+    reported: set[str] = set()  # each warning is shown only once
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
         if (text := str(message)) not in reported:
@@ -68,12 +63,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         if sys.stdout is not None:
             sys.stdout.flush()
         return code
-    except (FflinError, FflinWarning) as error:  # a warning if Python raises warnings
+    except (FflinError, FflinWarning) as error:  # Python may raise warnings as errors
         parser.print_error(f"fflin: error: {error}")
         return BAD_INPUT
     except BrokenPipeError:
-        # The reader of the pipe, such as head, has closed it. Python would report this again at
-        # exit.
+        # The reader of the pipe, such as head, has closed it. Redirect the output, because Python
+        # would report the closed pipe again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:

@@ -54,22 +54,6 @@ class Loop(NamedTuple):
     prediction: Mapping[str, Any] = MappingProxyType({})
 
 
-def refuse_law(arguments: argparse.Namespace) -> None:
-    """Raise an error if --free is combined with options of a regulator."""
-    refuse(
-        arguments,
-        ("limit", "delay"),
-        "with --free all inputs are zero, so limits and delays have no effect",
-    )
-    names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "reduce", "allocate", "gain", "controller", "mpc")
-    refuse(
-        arguments,
-        names,
-        "with --free there is no regulator, so the options of a regulator and its target have no "
-        "effect",
-    )
-
-
 def add_loop(command: parser.Command) -> None:
     """Add the options that define the closed loop and its simulation."""
     options.add_robot(command)
@@ -104,13 +88,18 @@ def add_loop(command: parser.Command) -> None:
     options.add_frame(run)
 
 
-def _add_controllers(group: parser.Group) -> None:
+def add_schedule(group: parser.Group) -> None:
+    """Add --schedule."""
     group.add(
         "--schedule",
         "use the gains in FILE, which `fflin tvlqr` saved, and follow the trajectory that FILE "
         "also contains. This option replaces --trajectory",
         Path,
     )
+
+
+def _add_controllers(group: parser.Group) -> None:
+    add_schedule(group)
     group.add(
         "--gain",
         "use the gain in FILE, which `fflin lqr` saved, and regulate to the operating point for "
@@ -158,21 +147,15 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         "duration": arguments.duration,
     }
     if not arguments.controller:
-        refuse(
-            arguments,
-            ("negative_feedback",),
-            "the sign of the feedback can be chosen only for --controller",
-        )
+        refuse(arguments, ("negative_feedback",), "only --controller has a sign of the feedback")
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
         return Loop(policy, settings | start)
-    if arguments.offset or arguments.hold:
-        raise InputError(
-            "--offset and --hold apply only along a trajectory; add --trajectory FILE, or remove "
-            "--offset and --hold"
-        )
+    refuse(arguments, ("offset", "hold"), "without --trajectory FILE, this has no effect")
     if arguments.free:
-        refuse_law(arguments)
+        of_law = ("limit", "delay", "reduce", "allocate", "gain", "controller", "mpc")
+        names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], *of_law)
+        refuse(arguments, names, "with --free there is no regulator and all inputs are zero")
         settings["q0"], settings["v0"] = start_of(robot, arguments)
         settings["duration"] = SHORTEST if arguments.duration is None else arguments.duration
         return Loop(None, settings | {"frame": arguments.frame})
@@ -221,11 +204,8 @@ def about_point(
     if arguments.gain:
         from fflin.control.gain import Gain
 
-        refuse(
-            arguments,
-            (*_WEIGHTS, *_TARGETS),
-            "the file of --gain already contains the weights and the operating point of the design",
-        )
+        why = "the file of --gain already contains the weights and the operating point"
+        refuse(arguments, (*_WEIGHTS, *_TARGETS), why)
         gain = Gain.load(arguments.gain)
         design = robot_of_design(robot, arguments.allocate, gain)
         lin = _about_gain(design, gain, arguments)
@@ -233,11 +213,8 @@ def about_point(
         design = robot_of_design(robot, arguments.allocate)
         lin = _about_target(design, arguments)
     if arguments.controller:
-        refuse(
-            arguments,
-            (*_WEIGHTS, "gain", "reduce"),
-            "--controller replaces the regulator and its options",
-        )
+        of_gain = (*_WEIGHTS, "gain", "reduce")
+        refuse(arguments, of_gain, "--controller replaces the regulator and its options")
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback: Any = LinearController(arguments.controller, lin, sign=sign)
     elif arguments.mpc:
@@ -271,26 +248,17 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
     from fflin.control.policies import Allocation
     from fflin.control.tracking import TrajectoryFeedback
 
-    refuse(
-        arguments,
-        ("free", "mpc", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS),
-        "the target and the regulator follow from the trajectory",
+    regulator = ("free", "mpc", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS)
+    why = (
+        "the trajectory defines the regulator, its target, and the start, which --offset displaces"
     )
-    poses = ("joint", "rpy", "position", "velocity")
-    refuse(
-        arguments,
-        poses,
-        "the simulation starts on the trajectory, and only --offset displaces the start from it",
-    )
+    refuse(arguments, (*regulator, "joint", "rpy", "position", "velocity"), why)
     design = robot_of_design(robot, bool(arguments.allocate))
     if arguments.schedule is None:
         models = models_along(arguments, design)
         policy = TrajectoryFeedback(models, schedule_of(models, arguments))
     else:
-        why = (
-            "the file of --schedule already contains the trajectory, its hold, the weights and "
-            "the sample time"
-        )
+        why = "the file of --schedule already contains the trajectory and the design of its gains"
         refuse(arguments, ("trajectory", "hold", *_WEIGHTS), why)
         schedule = GainSchedule.load(arguments.schedule)
         policy = TrajectoryFeedback(schedule.trajectory(design), schedule)
@@ -317,11 +285,7 @@ def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> Linea
         require_same(made, robot, kind, own, (there.names, there.units))
     q, v = state.to_pinocchio(gain.x0)
     if gain.x0[:6].any():
-        refuse(
-            arguments,
-            _POSE,
-            "the operating point in the file of --gain already contains the pose of the base",
-        )
+        refuse(arguments, _POSE, "the file of --gain already contains the pose of the base")
     else:
         q[:7] = target_of(robot, arguments)[0][:7]
     if number := arguments.relative_equilibrium:

@@ -15,9 +15,9 @@ from fflin.base.errors import FflinError, FflinWarning, FileError, InputError
 from fflin.base.names import runs
 from fflin.base.tables import cut, grid, matrix, signals, width
 from fflin.base.writing import check_ending
-from fflin.commands import options, parser
-from fflin.commands.points import configuration_of, linear_model, load_robot, velocity_of
-from fflin.commands.regulator import add_trajectory, check_along, checked, linearize_along
+from fflin.commands import DONE, FELL_SHORT, options, parser
+from fflin.commands.points import configuration_of, linear_model, load_robot, refuse, velocity_of
+from fflin.commands.regulator import add_trajectory, models_along
 from fflin.commands.results import Report, figure_of
 
 if TYPE_CHECKING:
@@ -28,27 +28,12 @@ if TYPE_CHECKING:
 
 def add_commands(commands: parser.Commands) -> None:
     """Add the commands robots, info, init, linearize and check."""
-    summary = "list the robots that can be loaded by name"
-    parser.command(commands, "robots", _robots, summary, example="fflin robots")
-    info = parser.command(
-        commands,
-        "info",
-        _info,
-        "show the joint tree, limits and settings of a robot, and its mass, inertia, wheels and "
-        "thrusters at a configuration",
-        example="fflin info servicer_7dof",
-    )
+    parser.command(commands, _robots)
+    info = parser.command(commands, _info)
     options.add_robot(info)
     options.add_pose(info.group(parser.POINT))
     options.add_system(info)
-    init = parser.command(
-        commands,
-        "init",
-        _init,
-        "write an initial robot.toml for a URDF; the file lists all inputs, limits and "
-        "unactuated joints",
-        example="fflin init my.urdf && fflin simulate my.toml",
-    )
+    init = parser.command(commands, _init)
     urdf = "path of a URDF, or a robot name listed by `fflin robots`"
     init.add_argument("robot", metavar="URDF", type=parser.input_name, help=urdf)
     what = "the robot file (by default the URDF's name with .toml, in the current folder)"
@@ -62,11 +47,8 @@ def add_commands(commands: parser.Commands) -> None:
 def _add_linearize(commands: parser.Commands) -> None:
     linearize = parser.command(
         commands,
-        "linearize",
         _linearize,
-        "show or save the linear model A, B, C, D about an operating point",
-        example="fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat",
-        common="joint rpy position velocity effort equilibrium frame reference inputs dt tool "
+        "joint rpy position velocity effort equilibrium frame reference inputs dt tool "
         "trajectory output-file plot",
     )
     options.add_point(linearize)
@@ -90,12 +72,8 @@ def _add_linearize(commands: parser.Commands) -> None:
 def _add_check(commands: parser.Commands) -> None:
     check = parser.command(
         commands,
-        "check",
         _check,
-        "compare A and B with two independent computations; the exit code is 1 if the results "
-        "differ",
-        example="fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
-        common="joint rpy position velocity effort equilibrium frame reference inputs trajectory "
+        "joint rpy position velocity effort equilibrium frame reference inputs trajectory "
         "tolerance plot",
     )
     options.add_point(check)
@@ -109,6 +87,10 @@ def _add_check(commands: parser.Commands) -> None:
 
 
 def _robots(_: argparse.Namespace) -> Report:
+    """List the robots that can be loaded by name.
+
+    example: fflin robots
+    """
     from fflin.robot.catalog import find_robot, list_robots
     from fflin.robot.loading import load
     from fflin.robot.summary import robot_list
@@ -117,7 +99,7 @@ def _robots(_: argparse.Namespace) -> Report:
     for name in list_robots():
         try:
             with warnings.catch_warnings():
-                # These warnings are left to `fflin info`.
+                # Do not show these warnings here; `fflin info` shows them.
                 warnings.simplefilter("ignore", FflinWarning)
                 entries.append((name, load(name), find_robot(name).origin))
         except FflinError as error:
@@ -132,6 +114,10 @@ def _robots(_: argparse.Namespace) -> Report:
 
 
 def _info(arguments: argparse.Namespace) -> Report:
+    """Show the joints, limits, settings, mass, inertia, wheels and thrusters of a robot.
+
+    example: fflin info servicer_7dof
+    """
     import numpy as np
 
     from fflin.control.authority import point_properties, point_report
@@ -163,6 +149,10 @@ def _info(arguments: argparse.Namespace) -> Report:
 
 
 def _init(arguments: argparse.Namespace) -> Report:
+    """Write an initial robot.toml for a URDF, with all inputs, limits and unactuated joints.
+
+    example: fflin init my.urdf && fflin simulate my.toml
+    """
     from fflin.base.writing import check_output_path, write_atomically
     from fflin.robot.catalog import find_robot
     from fflin.robot.loading import load
@@ -193,6 +183,10 @@ def _init(arguments: argparse.Namespace) -> Report:
 
 
 def _linearize(arguments: argparse.Namespace) -> Report:
+    """Show or save the linear model A, B, C, D about an operating point.
+
+    example: fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat
+    """
     if arguments.tool and arguments.trajectory:
         raise InputError(
             "--for converts the model about one operating point, but --trajectory defines many; "
@@ -203,7 +197,11 @@ def _linearize(arguments: argparse.Namespace) -> Report:
     if arguments.output_file and (arguments.tool or arguments.trajectory):
         check_ending(arguments.output_file, parser.RECORD.endings)
     if arguments.trajectory:
-        return linearize_along(arguments)
+        refuse(arguments, ("plot",), "with --trajectory, there is no single model to plot")
+        along = models_along(arguments)
+        if arguments.dt is not None:
+            along = along.discretize(arguments.dt)
+        return Report(along.robot.name, along, str(along), {arguments.output_file: along.save})
     _, lin = linear_model(arguments)
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
@@ -218,13 +216,23 @@ def _linearize(arguments: argparse.Namespace) -> Report:
 
 
 def _check(arguments: argparse.Namespace) -> Report:
-    if arguments.trajectory:
-        return check_along(arguments)
-    from fflin.linear.check import check
+    """Compare A and B with two independent computations; the exit code is 1 if the results differ.
 
-    robot, lin = linear_model(arguments)
-    found = check(robot, lin, tolerance=arguments.tolerance)
-    return checked(robot, found, str(found), {arguments.plot: figure_of("plot_check", found)})
+    example: fflin check canadarm2 --rpy 20 0 0 --reference world --frame world
+    """
+    from fflin.linear.check import check, held_to
+
+    if arguments.trajectory:
+        along = models_along(arguments)
+        robot, found = along.robot, held_to(arguments.tolerance, along.check())
+        text = f"{found}\n\n{along}"
+    else:
+        robot, lin = linear_model(arguments)
+        found = check(robot, lin, tolerance=arguments.tolerance)
+        text = str(found)
+    result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
+    files = {arguments.plot: figure_of("plot_check", found)}
+    return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)
 
 
 # Rates [SI] below this value count as zero.
@@ -245,7 +253,8 @@ def model_report(lin: LinearModel) -> str:
     head += f"; the operating point is {point}"
     parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # The poles of a model in motion do not show stability. If A A = 0, all poles are zero.
+    # Poles are reported only at a fixed point, because the poles of a model in motion do not show
+    # stability. If A A = 0, all poles are zero.
     if stays and not lin.dt and (lin.A @ lin.A).any():
         from fflin.analysis.modes import modes
 

@@ -24,7 +24,7 @@ from fflin.commands.parser import (
 
 
 class _FormerName(argparse.Action):
-    """Option under its former name; it warns that there is a new name."""
+    """Option under its former name; it sets the option of the new name and warns."""
 
     def __call__(
         self, _: object, given: argparse.Namespace, value: object, option: object = None
@@ -66,8 +66,8 @@ def add_point(command: Command) -> None:
     add_reference(point)
 
 
-def add_pose(group: Group) -> None:
-    """Add the options for the configuration and velocity of the robot."""
+def add_joint(group: Group) -> None:
+    """Add --joint."""
     group.add(
         "--joint",
         "position of a joint [rad|m]. The default is the position in robot.toml or, if there is "
@@ -75,9 +75,12 @@ def add_pose(group: Group) -> None:
         assignment,
         repeatable=True,
     )
-    rpy = "base attitude: roll, pitch, yaw [deg] about fixed axes"
-    group.add("--rpy", rpy, float, ("R", "P", "Y"))
-    group.add("--position", "base position [m]", float, ("X", "Y", "Z"))
+
+
+def add_pose(group: Group) -> None:
+    """Add the options for the configuration and velocity of the robot."""
+    add_joint(group)
+    _add_base(group, "--", "base")
     group.add(
         "--velocity",
         "velocity of a joint or wheel [rad/s|m/s], or a component of the base velocity in base "
@@ -96,9 +99,7 @@ def add_target(group: Group) -> None:
         assignment,
         repeatable=True,
     )
-    rpy = "target attitude of the base: roll, pitch, yaw [deg] about fixed axes"
-    group.add("--target-rpy", rpy, float, ("R", "P", "Y"))
-    group.add("--target-position", "target position of the base [m]", float, ("X", "Y", "Z"))
+    _add_base(group, "--target-", "target base")
     group.add(
         "--target-velocity",
         "target velocity, such as the speed of a wheel. In a simulation, the target velocity is "
@@ -106,6 +107,12 @@ def add_target(group: Group) -> None:
         assignment,
         repeatable=True,
     )
+
+
+def _add_base(group: Group, prefix: str, base: str) -> None:
+    rpy = f"{base} attitude: roll, pitch, yaw [deg] about fixed axes"
+    group.add(f"{prefix}rpy", rpy, float, ("R", "P", "Y"))
+    group.add(f"{prefix}position", f"{base} position [m]", float, ("X", "Y", "Z"))
 
 
 def add_limits(group: Group) -> None:
@@ -127,6 +134,17 @@ def add_limits(group: Group) -> None:
     )
 
 
+def add_saturation(group: Group) -> None:
+    """Add --limits with the default `none`."""
+    group.add(
+        "--limits",
+        "saturate the inputs at the limits of the robot as `fflin simulate` does (urdf), or do "
+        "not saturate them (none, default)",
+        choices=("urdf", "none"),
+        default="none",
+    )
+
+
 def add_step(group: Group) -> None:
     """Add --dt, and its former name --step."""
     group.add("--dt", "integration step [s]; chosen automatically by default", float, "H")
@@ -135,26 +153,25 @@ def add_step(group: Group) -> None:
 
 def settle_step(arguments: argparse.Namespace) -> None:
     """Set --dt and --sample from their former names, --step and --dt, with a warning."""
-    said = ""
-    if arguments.step is not None:
-        said = "the integration step --step has the new name --dt"
-        if arguments.dt is not None:
-            said += ", and the sample time --dt has the new name --sample"
-            arguments.sample = arguments.dt
-        arguments.dt = arguments.step
-    if said:
-        warnings.warn(said, FflinWarning, stacklevel=2)
+    if arguments.step is None:
+        return
+    said = "the integration step --step has the new name --dt"
+    if arguments.dt is not None:
+        said += ", and the sample time --dt has the new name --sample"
+        arguments.sample = arguments.dt
+    arguments.dt = arguments.step
+    warnings.warn(said, FflinWarning, stacklevel=2)
+
+
+def add_effort(group: Group, where: str) -> None:
+    """Add --effort."""
+    text = f"value of an input {where}. NAME is the name of the input in u, such as tau_m.joint_1"
+    group.add("--effort", text, assignment, repeatable=True)
 
 
 def add_inputs_there(group: Group) -> None:
     """Add the options for the inputs at the operating point."""
-    group.add(
-        "--effort",
-        "value of an input at the operating point. NAME is the name of the input in u, such as "
-        "tau_m.joint_1",
-        assignment,
-        repeatable=True,
-    )
+    add_effort(group, "at the operating point")
     group.switch(
         "--equilibrium",
         "apply the minimum-norm inputs that make the operating point an equilibrium (or a steady "

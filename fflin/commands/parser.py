@@ -93,7 +93,7 @@ def assignment(text: str) -> tuple[str, float]:
 
 
 def joint_or_all(text: str) -> tuple[str | None, float | str]:
-    """Read NAME=VALUE, or a single VALUE (or urdf) for all joints; its name is None."""
+    """Read NAME=VALUE, or for all joints VALUE or urdf alone, with None as the name."""
     if "=" in text:
         return assignment(text)
     return None, text if text == "urdf" else number(text)
@@ -106,7 +106,7 @@ def orbit(text: str) -> dict[str, float | str]:
 
 
 def lock(text: str) -> tuple[str, float | None]:
-    """Read NAME=VALUE, or a single NAME for the neutral position; its value is None."""
+    """Read NAME=VALUE, or NAME with the value None, which means the neutral position."""
     return assignment(text) if "=" in text else (text, None)
 
 
@@ -142,7 +142,7 @@ class Group(argparse._ArgumentGroup):
 
         For the type float, the value must be finite. For int, it must be a positive integer. For
         Path, it is the name of an input file. If `metavar` is a tuple, the option takes one value
-        for each entry. The help contains the default of a number.
+        for each entry. For a number, the help contains the default.
         """
         reader = _READERS.get(type, type)
         if repeatable:
@@ -186,7 +186,7 @@ class Command(argparse.ArgumentParser):
         return group
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        # argparse would ignore errors while it writes a help.
+        # argparse would ignore errors in writing a help text, so the text is written here.
         if file is not None:
             file.write(message)
             file.flush()
@@ -209,25 +209,20 @@ def print_error(line: str) -> None:
 
 
 def command(
-    commands: Commands,
-    name: str,
-    run: Callable[[argparse.Namespace], Report],
-    summary: str,
-    *,
-    example: str,
-    common: str = "",
+    commands: Commands, run: Callable[[argparse.Namespace], Report], common: str = ""
 ) -> Command:
-    """Add a command and its option --json.
+    """Add the command `name` that the function `_name` runs, and its option --json.
 
-    The help of the command ends with `example`. ``--help`` lists --json and the `common` options,
-    or all options if `common` is empty.
+    The docstring of the function is the help of the command: a summary, and an example at the end.
+    ``--help`` lists --json and the `common` options, or all options if `common` is empty.
     """
+    summary, _, example = (run.__doc__ or "").partition("\n\n")
     command = commands.add_parser(
-        name,
+        run.__name__.removeprefix("_"),
         add_help=False,
-        help=summary,
-        description=f"{summary[0].upper()}{summary[1:]}.",
-        epilog=f"example: {example}",
+        help=summary[:1].lower() + summary[1:].removesuffix("."),
+        description=summary,
+        epilog=example,
     )
     about = "show help for the common options; --help all shows help for all options"
     command.add_argument("-h", "--help", nargs="?", metavar="all", action=_Help, help=about)

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FflinError, FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, located
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def load_robot(arguments: argparse.Namespace) -> Robot:
     """Load the robot with the joints, inputs, outputs, gravity and orbit of the arguments."""
-    from fflin.robot.loading import load, with_fields
+    from fflin.robot.loading import load
 
     lock, passive = once("--lock", arguments.lock), getattr(arguments, "passive", [])
     first: dict[str, Any] = {"passive": passive} if passive else {}
@@ -41,15 +41,13 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
             fields[name] = for_all[0] if for_all else once(f"--{name}", values)
     if getattr(arguments, "inputs", None) is not None:
         inputs = _inputs(robot, arguments.inputs)
-        try:
+        with located(arguments.inputs):  # a name or an inertia that this robot does not accept
             robot = robot.replace(inputs=inputs)
-        except FflinError as error:  # a name or an inertia that this robot does not accept
-            raise type(error)(f"{arguments.inputs}: {error}") from None
     if getattr(arguments, "output", []):
         from fflin.robot.outputs import parse_output
 
         fields["outputs"] = [output for text in arguments.output for output in parse_output(text)]
-    return with_fields(robot, fields)
+    return robot.merged(fields)
 
 
 def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
@@ -123,10 +121,7 @@ def placed(
     for joint in robot.joints:
         if joint.name not in joints or joint.unbounded:
             continue
-        low, high = (
-            float(limits[joint.idx_q])
-            for limits in (model.lowerPositionLimit, model.upperPositionLimit)
-        )
+        low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
         value, unit = joints[joint.name], "m" if joint.prismatic else "rad"
         if not low <= value <= high:
             warnings.warn(
@@ -163,19 +158,15 @@ def point_of(
 
 def refuse_pose(arguments: argparse.Namespace, prefix: str = "") -> None:
     """Raise an error if --relative-equilibrium is combined with --rpy or --position."""
-    names = [f"{prefix}{name}" for name in ("rpy", "position")]
-    if arguments.relative_equilibrium and any(getattr(arguments, name) for name in names):
-        rpy, position = (f"--{name.replace('_', '-')}" for name in names)
-        raise InputError(
-            f"--relative-equilibrium sets the base pose, but so do {rpy} and {position}; give only "
-            "one of these options"
-        )
+    if arguments.relative_equilibrium:
+        names = (f"{prefix}rpy", f"{prefix}position")
+        refuse(arguments, names, "--relative-equilibrium already sets the base pose")
 
 
 def velocity_of(
     robot: Robot, arguments: argparse.Namespace, state: Mapping[str, Any], *options: str
 ) -> Array | None:
-    """Return the velocity (nv,) of a robot's state, overridden by the given options in turn."""
+    """Return the velocity (nv,) of a robot's state; each option overrides the values before it."""
     from fflin.base.names import rates_by_name
     from fflin.dynamics.points import velocity
 
@@ -201,11 +192,8 @@ def held_at(
 
         given = once("--effort", arguments.effort)
         return q, effort(robot, given) if given else None, reference
-    if arguments.effort:
-        which = "--relative-equilibrium" if number else "--equilibrium"
-        raise InputError(
-            f"--effort and {which} both set the inputs at the point; give only one of them"
-        )
+    which = "--relative-equilibrium" if number else "--equilibrium"
+    refuse(arguments, ("effort",), f"{which} already sets the inputs at the operating point")
     from fflin.linear.equilibrium import equilibrium
 
     if number:
@@ -215,7 +203,7 @@ def held_at(
 
 
 def attitude(robot: Robot, q: Array, number: int, frame: Frame) -> tuple[Array, pin.SE3]:
-    """Return q (nq,) and base placement of the relative equilibrium with a number from 1 to 24."""
+    """Return q (nq,) and the base placement of the relative equilibrium `number`, from 1 to 24."""
     import pinocchio as pin
 
     from fflin.analysis.relative_equilibria import relative_equilibria

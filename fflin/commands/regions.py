@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+from contextlib import closing
 
 from fflin.base.errors import InputError
 from fflin.base.tables import folded
 from fflin.commands import options, parser
-from fflin.commands.loops import along
+from fflin.commands.loops import add_schedule, along
 from fflin.commands.points import limits_of_options, load_robot, once
 from fflin.commands.regulator import add_allocation, add_trajectory, add_weights, designed
 from fflin.commands.results import Report, figure_of
 
 _ERRORS = "attitude [deg], position [m], joints, omega_b, v_b or joint rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
-
-# `along` refuses these options of other commands, so they need a value here.
-_NONE = "free mpc gain controller target_joint target_rpy target_position target_velocity effort"
-_NONE += " equilibrium"
-_NONE += " joint rpy position velocity"
 
 
 def add_commands(commands: parser.Commands) -> None:
@@ -31,11 +26,8 @@ def add_commands(commands: parser.Commands) -> None:
 def _add_validity(commands: parser.Commands) -> None:
     validity = parser.command(
         commands,
-        "validity",
         _validity,
-        "find how far the robot can be displaced before the linear model or its regulator fails",
-        example="fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
-        common="joint inputs weights q r bryson sample reduce attitude offset spread samples seed "
+        "joint inputs weights q r bryson sample reduce attitude offset spread samples seed "
         "jobs limits frame plot",
     )
     options.add_point(validity)
@@ -48,25 +40,16 @@ def _add_validity(commands: parser.Commands) -> None:
     runs.add("--samples", "number of random runs", int, default=100)
     runs.add("--seed", "random seed of the runs", parser.whole, "S", default=0)
     runs.add("--jobs", "number of processes; at most one per core", int, default=1)
-    runs.add(
-        "--limits",
-        "saturate the inputs at the limits of the robot (urdf), or do not saturate them (none, "
-        "default)",
-        choices=("urdf", "none"),
-        default="none",
-    )
+    options.add_saturation(runs)
     options.add_figure(validity, "the results")
 
 
 def _add_funnel(commands: parser.Commands) -> None:
     funnel = parser.command(
         commands,
-        "funnel",
         _funnel,
-        "find the initial errors from which the regulator along a trajectory reaches a goal",
-        example="fflin funnel arm.toml --schedule gains.npz --goal attitude=1",
-        common="trajectory schedule goal within weights q r knots samples seed threads "
-        "dt limits limit frame inputs output-file plot",
+        "trajectory schedule goal within weights q r knots samples seed threads dt limits "
+        "limit frame inputs output-file plot",
     )
     options.add_robot(funnel)
     options.add_system(funnel)
@@ -74,12 +57,7 @@ def _add_funnel(commands: parser.Commands) -> None:
     add_trajectory(funnel)
     add_weights(funnel, integrated=True)
     runs, shown = funnel.group("runs"), funnel.group(parser.OUTPUT)
-    funnel.group(parser.CONTROLLER).add(
-        "--schedule",
-        "use the gains in FILE, which `fflin tvlqr` saved, and the trajectory that FILE also "
-        "contains. This option replaces --trajectory",
-        Path,
-    )
+    add_schedule(funnel.group(parser.CONTROLLER))
     goal = f"largest error allowed at the end of a run: {_ERRORS}"
     runs.add("--goal", goal, parser.assignment, repeatable=True)
     within = "largest error allowed at any time of a run, named as in --goal"
@@ -93,20 +71,24 @@ def _add_funnel(commands: parser.Commands) -> None:
     options.add_step(runs)
     options.add_figure(funnel, "the funnel")
     options.add_output_file(shown, "the funnel", parser.RECORD, "Funnel")
-    funnel.set_defaults(**dict.fromkeys((*_NONE.split(), "offset", "allocate"), ()))
+    funnel.set_defaults(offset=(), allocate=False)  # options of `along` that funnel does not have
 
 
 _FREE = "not saturated; use --limits urdf to saturate them"
 
 
 def _validity(arguments: argparse.Namespace) -> Report:
+    """Find how far the robot can be displaced before the linear model or its regulator fails.
+
+    example: fflin validity ets_vii --attitude 120 --samples 200 --jobs 2
+    """
     from fflin.base.process import Progress
     from fflin.campaign.validity import validity
 
     robot, design, lin, gain = designed(arguments)
     judged = lin.discretize(arguments.sample) if arguments.sample else lin
-    bar, cut = Progress(), arguments.limits == "urdf"
-    try:
+    cut = arguments.limits == "urdf"
+    with closing(Progress()) as bar:
         found = validity(
             design,
             judged,
@@ -120,8 +102,6 @@ def _validity(arguments: argparse.Namespace) -> Report:
             workers=arguments.jobs if arguments.jobs > 1 else None,
             progress=bar,
         )
-    finally:
-        bar.close()
     text = str(found)
     if cut or any(name in lin.limits for name in lin.input_names):
         said = "saturated at the limits of the robot" if cut else _FREE
@@ -132,6 +112,10 @@ def _validity(arguments: argparse.Namespace) -> Report:
 
 
 def _funnel(arguments: argparse.Namespace) -> Report:
+    """Find the initial errors from which the regulator along a trajectory reaches a goal.
+
+    example: fflin funnel arm.toml --schedule gains.npz --goal attitude=1
+    """
     from fflin.base.process import Progress
     from fflin.campaign.funnel import funnel
 
@@ -142,15 +126,8 @@ def _funnel(arguments: argparse.Namespace) -> Report:
     policy, _ = along(robot, arguments)
     settings = {"limits": limits_of_options(arguments), "dt": arguments.dt}
     kept = {key: getattr(arguments, key) for key in _RUNS} | settings
-    kept["within"], bar = once("--within", arguments.within), Progress()
-    try:
-        goal = once("--goal", arguments.goal)
+    kept["within"], goal = once("--within", arguments.within), once("--goal", arguments.goal)
+    with closing(Progress()) as bar:
         found = funnel(robot, policy, goal, progress=bar, **kept)
-    finally:
-        bar.close()
-
-    files = {
-        arguments.plot: figure_of("plot_funnel", found),
-        arguments.output_file: found.save,
-    }
+    files = {arguments.plot: figure_of("plot_funnel", found), arguments.output_file: found.save}
     return Report(robot.name, found, str(found), files)

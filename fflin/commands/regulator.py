@@ -6,7 +6,6 @@ import argparse
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import (
@@ -17,17 +16,14 @@ from fflin.base.errors import (
     UnknownNameError,
 )
 from fflin.base.tables import folded
-from fflin.commands import DONE, FELL_SHORT, options, parser
+from fflin.commands import options, parser
 from fflin.commands.points import linear_model, load_robot, once, refuse
 from fflin.commands.results import Report, figure_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
     from fflin.control.gain import Gain
     from fflin.control.gain_schedule import GainSchedule
     from fflin.control.kalman import Compensator
-    from fflin.linear.check import Check
     from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
@@ -43,11 +39,8 @@ def add_commands(commands: parser.Commands) -> None:
 def _add_lqr(commands: parser.Commands) -> None:
     lqr = parser.command(
         commands,
-        "lqr",
         _lqr,
-        "design a linear quadratic regulator; show gain, poles, residual and margins",
-        example="fflin lqr canadarm2 -o gain.npz",
-        common="joint velocity equilibrium inputs frame weights q r bryson sample reduce "
+        "joint velocity equilibrium inputs frame weights q r bryson sample reduce "
         "wheel-speeds output-file plot",
     )
     options.add_point(lqr)
@@ -60,12 +53,8 @@ def _add_lqr(commands: parser.Commands) -> None:
 def _add_tvlqr(commands: parser.Commands) -> None:
     tvlqr = parser.command(
         commands,
-        "tvlqr",
         _tvlqr,
-        "design a time-varying linear quadratic regulator along a trajectory",
-        example="fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 "
-        "-o gains.npz",
-        common="trajectory hold strict weights q r bryson sample qf inputs frame output-file",
+        "trajectory hold strict weights q r bryson sample qf inputs frame output-file",
     )
     options.add_robot(tvlqr)
     options.add_system(tvlqr)
@@ -83,13 +72,7 @@ def _add_tvlqr(commands: parser.Commands) -> None:
 
 
 def _add_export(commands: parser.Commands) -> None:
-    export = parser.command(
-        commands,
-        "export",
-        _export,
-        "write C99 code of a gain, compensator or gain schedule, with a test program",
-        example="fflin export gain.npz --robot servicer_7dof --limits urdf -o flight",
-    )
+    export = parser.command(commands, _export)
     what = "gain, compensator or gain schedule saved by fflin: .npz, .mat or .json"
     export.add_argument("file", metavar="FILE", type=parser.input_file, help=what)
     group = export.group(parser.OUTPUT)
@@ -102,11 +85,7 @@ def _add_export(commands: parser.Commands) -> None:
         metavar="ROBOT",
         type=parser.input_name,
     )
-    limits = (
-        "saturate the inputs at the limits of the robot as `fflin simulate` does (urdf), or do "
-        "not saturate them (none, default)"
-    )
-    group.add("--limits", limits, choices=("urdf", "none"), default="none")
+    options.add_saturation(group)
     group.add("--name", "prefix of all names in the C code", metavar="NAME", default="controller")
     real = "floating-point type in the C code; double by default"
     group.add("--real", real, choices=("double", "float"), default="double")
@@ -187,8 +166,8 @@ def robot_of_design(
 ) -> Robot:
     """Return the robot of a design; with allocation, base torque and force replace the thrusters.
 
-    By default, thrusters are allocated if they can push in every direction, unless the law in a
-    file was designed for other inputs.
+    By default, thrusters are allocated if they can push in every direction, unless the controller
+    in a file was designed for other inputs.
     """
     from fflin.control.authority import thrusters_give_every_wrench
     from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
@@ -281,10 +260,14 @@ _NOT_ALLOCATED = (
 
 
 def _lqr(arguments: argparse.Namespace) -> Report:
+    """Design a linear quadratic regulator; show gain, poles, residual and margins.
+
+    example: fflin lqr canadarm2 -o gain.npz
+    """
     from fflin.base.record import record_of
 
     robot, design, _, gain = designed(arguments)
-    # The warnings of the gain already appear on stderr.
+    # The report omits warnings, because they already appear on stderr.
     text = "\n\n".join(x for x in str(gain).split("\n\n") if not x.startswith("warning: "))
     if design is not robot:
         text += f"\n\n{folded([_ALLOCATED])}"
@@ -294,6 +277,10 @@ def _lqr(arguments: argparse.Namespace) -> Report:
 
 
 def _export(arguments: argparse.Namespace) -> Report:
+    """Write C99 code of a gain, compensator or gain schedule, with a test program.
+
+    example: fflin export gain.npz --robot servicer_7dof --limits urdf -o flight
+    """
     from fflin.base.record import read_record, reading, text
     from fflin.control.gain import Gain
     from fflin.control.gain_schedule import GainSchedule
@@ -351,55 +338,23 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
     from fflin.linear.trajectory import Trajectory
 
     point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
-    refuse(
-        arguments,
-        point,
-        "with --trajectory, the models are about the points of the trajectory, not about an "
-        "operating point",
-    )
+    refuse(arguments, point, "with --trajectory, the models are about the points of the trajectory")
     robot = robot or load_robot(arguments)
     settings = {"hold": arguments.hold, "frame": arguments.frame}
     motion = Trajectory.load(arguments.trajectory, robot, **settings)
     return linearize_trajectory(robot, motion, strict=arguments.strict)
 
 
-def linearize_along(arguments: argparse.Namespace) -> Report:
-    """Show or save the linear models along a trajectory."""
-    along = models_along(arguments)
-    if arguments.dt is not None:
-        along = along.discretize(arguments.dt)
-    return Report(along.robot.name, along, str(along), {arguments.output_file: along.save})
-
-
-def check_along(arguments: argparse.Namespace) -> Report:
-    """Check the linear models along a trajectory."""
-    from fflin.linear.check import held_to
-
-    along = models_along(arguments)
-    found = held_to(arguments.tolerance, along.check())
-    return checked(along.robot, found, f"{found}\n\n{along}")
-
-
-def checked(
-    robot: Robot,
-    found: Check,
-    text: str,
-    files: Mapping[Path | None, Callable[[Path], object] | None] = MappingProxyType({}),
-) -> Report:
-    """Return the report of a check, with the exit code."""
-    result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
-    return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)
-
-
 def _tvlqr(arguments: argparse.Namespace) -> Report:
+    """Design a time-varying linear quadratic regulator along a trajectory.
+
+    example: fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 -o
+    gains.npz
+    """
     from fflin.robot.inputs import Thruster
 
-    refuse(
-        arguments,
-        ("reduce",),
-        "a regulator along a trajectory needs no reduced model, because its finite-horizon cost "
-        "always exists",
-    )
+    why = "along a trajectory no reduced model is needed, because the finite-horizon cost exists"
+    refuse(arguments, ("reduce",), why)
     along = models_along(arguments)
     schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
     text = str(schedule)

@@ -16,11 +16,11 @@ from fflin.base.tables import first_paragraph, headed
 from fflin.base.writing import followed_path
 from fflin.commands import DONE
 
-# The report includes the size of these files.
+# The report includes the size of files with these endings.
 _PAGES = (".html", ".gif")
 
 
-# Entries that identify a result if its file does not contain its kind.
+# Entries that identify the kind of a result if its file does not state the kind.
 _ENTRIES = {
     "Sensitivity": {"urdf_sha256", "dA", "dB"},
     "LinearModel": {"urdf_sha256", "certificate"},
@@ -42,7 +42,8 @@ class Report:
     text : str
         Report without --json. Its first paragraph is the entry "result" of --json.
     files : mapping
-        {path: function that writes the file, or None if it is written}. A path None is ignored.
+        {path: function that writes the file, or None if the file is already written}. A path None
+        is ignored.
     code : int
         Exit code.
     interrupted : str
@@ -84,7 +85,7 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
 
 
 def figure_of(name: str, drawn: object) -> Callable[[Path], object]:
-    """Return a function that plots `drawn` with the public function `name` and saves the figure."""
+    """Return a function that saves a figure of `drawn`, made by the public function `name`."""
 
     def save(path: Path) -> None:
         import fflin
@@ -139,7 +140,7 @@ def _fields(value: object) -> Any:
         return record_of(value)
     if is_dataclass(value):
         own = {each.name: getattr(value, each.name) for each in fields(value)}
-        # The model of a result is omitted, because it is a result itself.
+        # The model in a result is omitted, because it is a separate result.
         return {key: x for key, x in own.items() if not isinstance(x, LinearModel)}
     return value._asdict() if hasattr(value, "_asdict") else value
 

@@ -34,12 +34,9 @@ def add_commands(commands: parser.Commands) -> None:
 def _add_plan(commands: parser.Commands) -> None:
     plan = parser.command(
         commands,
-        "plan",
         _plan,
-        "plan a low-effort trajectory between two states within limits",
-        example="fflin plan planar_detumble --target-joint joint_1=0.3 --duration 20 -o plan.npz",
-        common="joint rpy position velocity target-joint target-rpy target-position "
-        "target-velocity duration knots hold free-end r limits limit inputs output-file",
+        "joint rpy position velocity target-joint target-rpy target-position target-velocity "
+        "duration knots hold free-end r limits limit inputs output-file",
     )
     options.add_robot(plan)
     options.add_system(plan)
@@ -58,20 +55,16 @@ def _add_plan(commands: parser.Commands) -> None:
     options.add_output_file(
         plan.group(parser.OUTPUT), "the trajectory", parser.TABLE, "Trajectory", "Motion"
     )
-    # The functions for start and target read these options of other commands, so they need a value
-    # here.
+    # The functions for start and target read these options, which only other commands have, so they
+    # need a value here.
     plan.set_defaults(relative_equilibrium=None)
 
 
 def _add_simulate(commands: parser.Commands) -> None:
     simulate = parser.command(
         commands,
-        "simulate",
         _simulate,
-        "simulate the robot with a regulator to a target or along a trajectory",
-        example="fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html "
-        "--plot loop.png",
-        common="joint rpy target-joint target-rpy trajectory weights q r sample mpc gain schedule "
+        "joint rpy target-joint target-rpy trajectory weights q r sample mpc gain schedule "
         "free limits duration inputs output-file plot html",
     )
     add_loop(simulate)
@@ -100,6 +93,10 @@ def _add_simulate(commands: parser.Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> Report:
+    """Simulate the robot with a regulator to a target or along a trajectory.
+
+    example: fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png
+    """
     from fflin.simulation.report import motion_record, motion_report
 
     robot = load_robot(arguments)
@@ -140,6 +137,10 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
 
 
 def _plan(arguments: argparse.Namespace) -> Report:
+    """Plan a low-effort trajectory between two states within limits.
+
+    example: fflin plan planar_detumble --target-joint joint_1=0.3 --duration 20 -o plan.npz
+    """
     from fflin.control.plan import plan
     from fflin.dynamics.points import combined
 
@@ -163,13 +164,9 @@ def _plan(arguments: argparse.Namespace) -> Report:
 def _add_montecarlo(commands: parser.Commands) -> None:
     montecarlo = parser.command(
         commands,
-        "montecarlo",
         _montecarlo,
-        "simulate a control loop many times with random parameters; show quantiles, success rates "
-        "and the worst runs with their causes",
-        example="fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png",
-        common="runs seed until width confidence workers goal worst joint rpy trajectory "
-        "gain schedule duration inputs output-file plot",
+        "runs seed until width confidence workers goal worst joint rpy trajectory gain "
+        "schedule duration inputs output-file plot",
     )
     add_loop(montecarlo)
     montecarlo.add_argument(
@@ -215,6 +212,10 @@ def _add_montecarlo(commands: parser.Commands) -> None:
 
 
 def _montecarlo(arguments: argparse.Namespace) -> Report:
+    """Simulate a loop with random parameters; show quantiles, success rates and the worst runs.
+
+    example: fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png
+    """
     from fflin.campaign.monte_carlo import monte_carlo
     from fflin.campaign.report import campaign_record, worst_runs
     from fflin.campaign.spreads import load_dispersions

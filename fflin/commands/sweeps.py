@@ -15,8 +15,6 @@ from fflin.commands.points import configuration_of, load_robot, once, velocity_o
 from fflin.commands.results import Report
 
 if TYPE_CHECKING:
-    import pinocchio as pin
-
     from fflin.base.process import Progress
     from fflin.base.validation import Array
     from fflin.batch.configurations import Configurations
@@ -27,13 +25,8 @@ def add_commands(commands: parser.Commands) -> None:
     """Add sweep."""
     sweep = parser.command(
         commands,
-        "sweep",
         _sweep,
-        "linearise about many points and save all models",
-        example="fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 "
-        "-o grid.h5",
-        common="grid random seed range joint velocity inputs output frame engine "
-        "workers output-file",
+        "grid random seed range joint velocity inputs output frame engine workers output-file",
     )
     points = sweep.group(
         "points",
@@ -60,13 +53,7 @@ def add_commands(commands: parser.Commands) -> None:
     )
     point = sweep.group(parser.POINT)
     options.add_pose(point)
-    point.add(
-        "--effort",
-        "value of an input at all points. NAME is the name of the input in u, such as "
-        "tau_m.joint_1",
-        parser.assignment,
-        repeatable=True,
-    )
+    options.add_effort(point, "at all points")
     options.add_frame(point)
     options.add_reference(point)
     options.add_robot(sweep)
@@ -87,7 +74,7 @@ def add_commands(commands: parser.Commands) -> None:
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
-    """Split JOINT=A:B:... into the name and its values, as many as `form` has."""
+    """Split JOINT=A:B:... into the name and its values; `form` has the same number of values."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
     if not name or len(parts) != len(form.split(":")):
@@ -109,6 +96,10 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
 
 
 def _sweep(arguments: argparse.Namespace) -> Report:
+    """Linearise about many points and save all models.
+
+    example: fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5
+    """
     import pinocchio as pin
 
     from fflin.batch.files import part_of
@@ -122,13 +113,9 @@ def _sweep(arguments: argparse.Namespace) -> Report:
     size = planned_bytes(robot, len(q), at_rest=v is None and u is None, **settings)
     part = part_of(path)
     resuming = f", resuming from {part}" * part.exists()
-    # All options are valid.
-    scale, unit = (1e9, "GB") if size >= 1e9 else (1e3, "kB")
-    needs = f"{size / scale:,.1f} {unit}"
-    said = (
-        f"fflin: linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}{resuming}"
-    )
-    print(said, file=sys.stderr)
+    needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"
+    said = f"linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}{resuming}"
+    print(f"fflin: {said}", file=sys.stderr)  # all options are valid
     with going_on(path, "points") as progress:
         work = {"engine": arguments.engine, "workers": arguments.workers, "progress": progress}
         batch = sweep(robot, q, v, u, **settings, **work, out=path)
@@ -144,6 +131,7 @@ def _points(
 ) -> tuple[Configurations, Array | None, Array | None]:
     """Return q, v and u of the points of a sweep."""
     import numpy as np
+    import pinocchio as pin
 
     from fflin.batch.configurations import grid, random_configurations
     from fflin.dynamics.points import effort
@@ -156,7 +144,8 @@ def _points(
     v = velocity_of(robot, arguments, robot.point, "velocity")
     u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
     fixed = once("--joint", arguments.joint)
-    base = _base(robot, configuration_of(robot, arguments, robot.point))
+    q = configuration_of(robot, arguments, robot.point)
+    base = robot.model.jointPlacements[1] * pin.XYZQUATToSE3(q[:7])
     if arguments.random is not None:
         ranges = once("--range", arguments.range)
         ranges |= {name: (value, value) for name, value in fixed.items()}
@@ -169,12 +158,6 @@ def _points(
     joints = {**robot.point.get("joints", {}), **by_joint(fixed, robot.joint_names, robot.joint)}
     others = {name: x for name, x in joints.items() if name not in axes or name in fixed}
     return grid(robot, values, joints=others, base=base), v, u
-
-
-def _base(robot: Robot, q: Array) -> pin.SE3:
-    import pinocchio as pin
-
-    return robot.model.jointPlacements[1] * pin.XYZQUATToSE3(q[:7])
 
 
 @contextmanager

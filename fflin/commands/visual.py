@@ -21,13 +21,7 @@ _FILES, _SHOWN = ("html", "png", "gif"), ("scene", "follow", "tool")
 
 def add_commands(commands: parser.Commands) -> None:
     """Add view."""
-    view = parser.command(
-        commands,
-        "view",
-        _view,
-        "show a robot live in the browser with a slider for each joint",
-        example="fflin view servicer_7dof --joint joint_2=0.4",
-    )
+    view = parser.command(commands, _view)
     options.add_robot(view)
     options.add_pose(view.group(parser.POINT))
     options.add_orbit(view.group(parser.ROBOT))
@@ -106,6 +100,10 @@ def pictures(
 
 
 def _view(arguments: argparse.Namespace) -> Report:
+    """Show a robot live in the browser with a slider for each joint.
+
+    example: fflin view servicer_7dof --joint joint_2=0.4
+    """
     from fflin.dynamics.points import combined
     from fflin.view.live import Live
     from fflin.view.visualize import visualize

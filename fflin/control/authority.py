@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _FACETS = 20_000  # normals computed together
 _MANY = 36  # thrusters; their zonotope has 400 000 facets
 
-# A force or torque that is smaller, relative to the sum of all thrusts, is rounding error.
+# A force or torque below this fraction of the sum of all thrusts is rounding error.
 _ROUNDING = 1e-9
 
 _AXES = "xyz"
@@ -94,8 +94,8 @@ def wheel_momenta(robot: Robot, q: Array, v: Array) -> tuple[Array, Array, Array
 def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, object]:
     """Return the total momentum of the wheels, and the momentum that they can store.
 
-    The stored momentum [N m s] is the largest one that they can store in every direction. `rank` is
-    the number of axes that they span.
+    `least` is the largest momentum [N m s] that the wheels can store in every direction. `axes` is
+    the number of axes that the wheels span.
     """
     axes, stored, largest = wheel_momenta(robot, q, v)
     rank = int(np.linalg.matrix_rank(axes, tol=1e-6)) if stored.size else 0
@@ -127,10 +127,10 @@ def wheel_report(properties: Mapping[str, Any]) -> str:
 
 
 def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, object]:
-    """Return the least force and torque that the thrusters alone produce in any direction.
+    """Return the force and torque that the thrusters alone can produce in every direction.
 
-    Both are None unless the thrusters push in every direction, all have limits, and there are at
-    most _MANY.
+    Both are None unless the thrusters can push in every direction, all thrusters have limits, and
+    there are at most _MANY thrusters.
     """
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust", ())
@@ -152,7 +152,7 @@ def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, obje
 
 
 def thruster_report(properties: Mapping[str, Any]) -> str:
-    """Report whether the thrusters push in every direction, with least force and torque."""
+    """Report whether the thrusters push in every direction, and with what force and torque."""
     if not properties["thrusters"]:
         return ""
     text = f"{counted(properties['thrusters'], 'thruster')} alone "
@@ -170,7 +170,7 @@ def thruster_report(properties: Mapping[str, Any]) -> str:
 
 
 def gives_every_wrench(W: Array, pushing: Mask) -> bool:
-    """Return whether inputs with columns W (6, k), `pushing` or not, produce every wrench."""
+    """Return whether inputs W (6, k) can produce every wrench; `pushing` inputs only push."""
     from scipy.optimize import nnls
 
     both = np.hstack((W, -W[:, ~pushing]))
@@ -202,9 +202,9 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
     Parameters
     ----------
     W : ndarray (m, k)
-        Wrenches of unit inputs, of rank m.
+        Wrenches of unit inputs; the rank of W is m.
     low, high : ndarray (k,)
-        Limits of the inputs, which contain 0.
+        Limits of the inputs, with low <= 0 <= high.
     kept : ndarray (m, d)
         Orthonormal columns.
     """

@@ -34,7 +34,7 @@ class Saturation(NamedTuple):
 
 
 def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Array]:
-    """Return the least and the largest value (nu,) of each input; thrusts are never negative."""
+    """Return the smallest and largest value (nu,) of each input; thrusts are never negative."""
     inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
     low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in inputs]).T
     low = np.maximum(low, [-math.inf if item.PULLS else 0.0 for item in inputs.values()])
@@ -88,8 +88,8 @@ def _pulses(
 ) -> Pulses:
     """Return the pulses of thrusters {input: (name, thruster)} for samples of `time` [s].
 
-    `time` is 0 for continuous commands. If the limit in `high` (nu,) is infinite, an on-off
-    thruster uses its own `max`.
+    `time` is 0 for continuous commands. An on-off thruster without a finite limit in `high` (nu,)
+    uses its own `max`.
     """
     at, zero = list(thrusters), np.zeros(len(thrusters))
     on_off = np.array([item.on_off for _, item in thrusters.values()])
@@ -152,11 +152,11 @@ class Law:
         limits: tuple[Array, Array],
         slow: float,
     ) -> None:
-        # Above the squared velocity `slow`, the motion counts as diverging, and a command that is
-        # not finite raises no error.
+        # A motion whose squared velocity exceeds `slow` counts as diverging. A command that is not
+        # finite then raises no error.
         self.policy, self._names, self._limits, self._slow = policy, names, limits, slow
         self._shape = (len(names),)
-        # Only policies that integrate their own state have `advance`.
+        # Only a policy that integrates its own state has `advance`.
         self.advance: Callable[..., None] | None = getattr(policy, "advance", None)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
@@ -182,7 +182,7 @@ class Law:
 
 
 def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> rules.Channel:
-    """Return the kernel's channel for limits, and a sample time and a delay in steps.
+    """Return the kernel's channel with limits; the sample time and the delay are in steps.
 
     `initial` (nu,) acts until the first command arrives.
     """

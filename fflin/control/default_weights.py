@@ -14,8 +14,8 @@ from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.linear.model import LinearModel
 
-# Bandwidth [rad/s] of a loop that no limit slows; the loop settles in about 30 s. With inputs held
-# for h, the bandwidth is at most _HELD / h.
+# Bandwidth [rad/s] of a loop that no limit slows; the loop settles in about 30 s. If the inputs are
+# held for h seconds, the bandwidth is at most _HELD / h.
 BANDWIDTH, _HELD = 0.2, 0.3
 
 # Displacements from which the robot must return within its limits: a rotation of the base [deg],
@@ -23,24 +23,26 @@ BANDWIDTH, _HELD = 0.2, 0.3
 # displacement is at most the fraction TRAVEL of the joint's range.
 ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
-# The bandwidth is at least this fraction of the growth rate of an unstable mode, or at least the
-# second fraction if efforts are limited. With a lower bandwidth, light joints would swing by
-# radians.
+# The bandwidth is at least the fraction _OF_GROWTH of the growth rate of an unstable mode. If
+# efforts are limited, it is at least the fraction _LEAST_OF_GROWTH. With a lower bandwidth, light
+# joints would swing by radians.
 _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
-# The effect of the inputs on a mode counts as at least this fraction of the effort that holds the
-# mode at rest. A mode on which the inputs have less effect keeps its own decay.
+# The effect of the inputs on a mode, relative to the effort that holds the mode at rest, is raised
+# to this if it is smaller. Such a mode keeps the decay that it has without feedback.
 _LEAST_REACH = 1e-3
 
-# An input has no effect on a coordinate if its effect, relative to the inertia, is below this.
+# If the effect of the inputs on a coordinate, relative to the inertia, is below this, it counts as
+# zero.
 _IDLE = 1e-12
 
-# Number of iterations for the bandwidth of a robot with dampers, because the effect of a damper
-# depends on the bandwidth.
+# The effect of a damper depends on the bandwidth, so the bandwidth of a robot with dampers is
+# computed in this number of iterations.
 _PASSES = 4
 
 # Largest number of trials with a lower bandwidth for a loop with springs or gravity. The fastest
-# trial is chosen whose effort factor is at least the fraction _IN_VAIN of the best one.
+# trial is chosen among trials whose effort factor `left` is at least _IN_VAIN times the largest
+# one.
 _TRIALS, _IN_VAIN = 8, 0.9
 
 # The report names a mode whose decay is below this fraction of the nominal decay, which is
@@ -61,7 +63,7 @@ class Weights(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """Bandwidth of a loop without active limits, and the fraction of the displacements."""
+    """Bandwidth of a loop if no limit reduces it, and fraction of the design displacements."""
 
     bandwidth: float = BANDWIDTH  # [rad/s]
     fraction: float = 1.0
@@ -82,7 +84,7 @@ AT_A_POINT = Pace()
 def default_weights(
     lin: LinearModel, pace: Pace = AT_A_POINT, momenta: Mapping[str, float] | None = None
 ) -> Weights:
-    """Return weights with which a displaced robot returns within its limits (10.7)."""
+    """Return weights with which a displaced robot stays within its limits on its return (10.7)."""
     m = len(lin.M)
     N = rate_matrix(lin)[:m, m:]
     if N.shape != lin.M.shape or not np.linalg.cond(N) < 1e8:
@@ -102,12 +104,12 @@ def default_weights(
 def _damping(lin: LinearModel) -> Array:
     """Return the damping matrix B (m, m) of viscous dampers, zero if there are none."""
     m = len(lin.M)
-    if lin.dt or not lin.A[m:, m:].any():  # samples show springs as damping too
+    if lin.dt or not lin.A[m:, m:].any():  # in a sampled model, springs look like damping
         return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
-    # Coupling by motion only moves energy between coordinates, and an orbit rotates them. Neither
-    # is damping.
+    # Gyroscopic coupling only moves energy between coordinates, and an orbit only rotates them.
+    # Neither is damping.
     size = np.sqrt(lin.M.diagonal())
     whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
     damped = bool(rates.sum() > 1e-9 * whole)
@@ -237,7 +239,7 @@ def _radius_of_gyration(M: Array) -> float:
 
 
 def _reach(S: Array, cost: Array, D: Array) -> Array:
-    """Return S R^-1 S' (m, m), with D for coordinates on which no input acts."""
+    """Return S R^-1 S' (m, m), with entries of D for coordinates on which no input acts."""
     reach = (S / cost) @ S.T
     idle = reach.diagonal() <= _IDLE * D
     reach[idle, idle] = D[idle]
@@ -249,7 +251,7 @@ def _reach(S: Array, cost: Array, D: Array) -> Array:
 def _fastest(
     T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel, mass: Array
 ) -> Array:
-    """Return the largest of the speeds (k,), T times the mode rates, on the return at w = 1."""
+    """Return the largest speeds (k,) during the return at w = 1; T maps mode rates to speeds."""
     # The mass (m,) of a mode is 1 without damping. The difference 1 - mass is the mode's damping.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
@@ -288,7 +290,7 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
 
 
 def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
-    """Return the largest K d over base displacements in any direction and joint signs."""
+    """Return the largest K d over all directions of base displacements and joint signs."""
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
     scaled = K[..., : len(size)] * size
     total: Array = np.abs(scaled[..., ~np.isin(groups, ("q_b", "r_b"))]).sum(axis=-1)
@@ -307,13 +309,13 @@ def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) 
 
 
 def _efforts_left(lin: LinearModel) -> dict[str, float]:
-    """Return the input limits minus the inputs at the operating point."""
+    """Return the input limits minus the magnitudes of the inputs at the operating point."""
     inputs = zip(lin.input_names, lin.u0.tolist(), strict=True)
     return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
 
 
 def _growth(lin: LinearModel) -> Limit:
-    """Return the largest growth rate [1/s] of the model, and the mode that has it."""
+    """Return the largest growth rate [1/s] of the model, and a description of its mode."""
     poles, modes = np.linalg.eig(lin.A)
     rates = rates_of(poles, lin.dt).real
     fastest, k = float(rates.max()), int(rates.argmax())
@@ -343,8 +345,9 @@ def _slowed(
     """Reduce the bandwidth of a loop with springs or gravity until it respects the limits.
 
     The bandwidth is not reduced below `least`. Displacements `size` (m,) require efforts at the
-    start, and displacements `driven` also on the way back. `driven` omits joints without a motor,
-    which springs or gravity move. The result also reports what the loop achieves.
+    start of the return. Displacements `driven` also require efforts during the return. `driven`
+    omits joints without a motor, because springs or gravity move them. The second result is a
+    report of the achieved loop.
     """
     trials = list[_Trial]()
     for _ in range(_TRIALS):
@@ -372,7 +375,7 @@ def _slowed(
         slower = Limit(min(max(left, 0.3), 0.8) * limit.bandwidth, what)
         limit = max(slower, least)
     if not trials:
-        return limit, ""  # the regulator raises with the reason
+        return limit, ""  # the design of the regulator fails and reports the reason
     most = max(trial.left for trial in trials)
     trial = next(x for x in trials if x.left >= _IN_VAIN * most)
     limit, effort = trial.limit, trial.effort
@@ -380,7 +383,7 @@ def _slowed(
     where = "to return from the displacements of the default weights"
     required = trial.required[None]
     warn_beyond(lin.robot, where, lin.input_names, lin.input_units, required, -high, high)
-    held = limit.what == least.what  # a slower loop loses an unstable mode
+    held = limit.what == least.what  # a slower loop cannot control the unstable mode
     what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
     return limit._replace(what=what), _achieved(lin, trial)
 
@@ -404,10 +407,10 @@ def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
     return [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]
 
 
-# Along a trajectory, displacements are a tenth as large. They must decay within the duration, so
-# the duration has at least _CONSTANTS time constants. The loop is at least as fast as at a point,
-# but not faster than _FASTEST. With held inputs, a bandwidth above the limit at a point is
-# allowed, because the sampled regulator is exact.
+# Along a trajectory, displacements are _BESIDE times the displacements at a point. The bandwidth is
+# at least _CONSTANTS / duration, so that the displacements decay within the duration. It is at
+# least the bandwidth at a point, and at most _FASTEST. With held inputs, a bandwidth above the
+# limit at a point is allowed, because the sampled regulator is exact.
 _BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
 
 

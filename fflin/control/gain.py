@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from fflin.control.optimal.riccati import Solution
     from fflin.linear.exchange import ToolGain
 
-# Larger gains, of robots with more than three joints, are not shown.
+# A gain with more entries than this, as for a robot with more than three joints, is not shown.
 _LARGE = 9 * 18
 
 # Relative accuracy of the largest gain over frequency.
 ACCURACY = 1e-5
 
-# A loop with a smaller disk margin is called fragile.
+# A loop whose disk margin is below this is called fragile.
 _FRAGILE = 0.3
 
 
@@ -218,7 +218,7 @@ def make_gain(
     N: Array | None,
     weights: str = "as given",
 ) -> Gain:
-    """Return the gain of a Riccati solution for a part of a model; no other state is fed back."""
+    """Return the gain of a Riccati solution for a part of a model; other states get zero gain."""
     S = selection(part.state_names, lin.state_names)
     poles, margin = solution.ordered(lin.dt)
     return Gain(
@@ -336,7 +336,7 @@ def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
     scale = np.sqrt(R.diagonal())
     F, G, H, D = A - B @ K, B / scale, -scale[:, None] * K, 0.5 * np.eye(len(K))
     if dt:
-        # The bilinear map s = (z - 1)/(z + 1) preserves the norm.
+        # The bilinear map s = (z - 1)/(z + 1) preserves the H-infinity norm.
         inverse = np.linalg.inv(F + np.eye(len(F)))
         D = D - H @ inverse @ G
         F, G, H = inverse @ (F - np.eye(len(F))), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
@@ -366,10 +366,10 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
 
 
 def gain_crossings(A: Array, B: Array, C: Array, D: Array, bound: float) -> tuple[Values, Mask]:
-    """Return Hamiltonian eigenvalues (.., 2 nx), and which of them are imaginary.
+    """Return the eigenvalues (.., 2 nx) of a Hamiltonian matrix, and which are imaginary.
 
-    The gain crosses the bound at the imaginary eigenvalues. A spurious crossing only costs one more
-    evaluation of the response.
+    At the frequency of each imaginary eigenvalue, the gain of the system equals the bound. An
+    eigenvalue that is wrongly counted as imaginary only costs one more evaluation of the response.
     """
     inverse = np.linalg.inv(bound**2 * np.eye(D.shape[1]) - D.T @ D)
     F = A + B @ inverse @ D.T @ C

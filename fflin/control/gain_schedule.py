@@ -239,7 +239,7 @@ class Interpolant:
         self.first, self.last = float(t[0]), float(t[-1])
         self._t, self._P, self.K, self._dt = t, P, K, dt
         if dt:
-            # Samples start slightly early, because times are rounded.
+            # A sample starts slightly before its nominal time, because times are rounded.
             self.starts = [self.first, *(t[1:] - 1e-9 * dt).tolist()]
             return
         self.starts = t[:-1].tolist()

@@ -12,15 +12,17 @@ from fflin.base.errors import FflinWarning, MissingPackageError
 from fflin.base.validation import Array, Indices, Mask, number, vector
 from fflin.control.policies import Clock
 
-# Settings of DAQP for rows scaled to length 1, relative to the typical width of the limits:
-# tolerance, weight and regularisation of soft limits, and smallest violation to report.
+# Settings of DAQP for rows scaled to length 1, relative to the typical width of the limits. _EXACT
+# is the tolerance. _PRICE is the weight and _YIELDS the regularisation of soft limits. _VIOLATED is
+# the smallest violation to report.
 _EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
 
-# Violations by the robot below this fraction of the width between limits are not reported.
+# If the robot exceeds a limit by less than this fraction of the width between the limits, the
+# violation is not reported.
 _OVER = 1e-3
 
-# DAQP's infinity, its code of a soft limit, its exit flag for a plan that exceeds a soft limit,
-# and the largest number of iterations.
+# _OPEN is DAQP's infinity, _SOFT is its code of a soft limit, and _SOFTENED is its exit flag for a
+# plan that exceeds a soft limit. _MOST is the largest number of iterations.
 _OPEN, _SOFT, _SOFTENED, _MOST = 1e30, 8, 2, 10_000
 
 
@@ -89,7 +91,7 @@ def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Arr
 
 @dataclass(frozen=True, eq=False)
 class Horizon:
-    """Samples of a run; a horizon that reaches past the end repeats the last N samples."""
+    """Samples of a run; near the end of the run, the horizon is the last N samples."""
 
     stages: tuple[Stage, ...]
     samples: int  # N
@@ -139,7 +141,7 @@ class Receding:
         self.solves = self.softened = self.unfinished = self.exceeded = 0
         self._worst, self._said, self._over, self._met = 0.0, "", _OVER, ""
         self._due: tuple[Stage, Array] | None = None  # the last sample and its input
-        if horizon.limited:  # here, so that the first sample takes no longer than others
+        if horizon.limited:  # now, so that the first sample is not slower
             self._change(horizon.window(0.0))
 
     @property
@@ -181,7 +183,7 @@ class Receding:
         self.solves += 1
         self._judge(t, e)
         z, flag = self._solved(free)
-        if flag <= 0:  # once more, without a warm start
+        if flag <= 0:  # solve again without a warm start
             self._start()
             z, flag = self._solved(free)
         if flag > 0:

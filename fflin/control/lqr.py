@@ -26,8 +26,9 @@ from fflin.linear.model import LinearModel
 # A relative residual above _COARSE gives a warning; above _USELESS, the gain is wrong.
 _COARSE, _USELESS = 1e-8, 1e-3
 
-# A pole may lie on the stability boundary if its distance, relative to the largest pole, is below
-# this. Rounding moves the pole of a mode that Q does not weight.
+# A pole may lie on the stability boundary if its distance from the boundary, relative to the
+# largest pole, is below this. Rounding moves the pole of a mode that Q does not weight by such a
+# distance.
 _NEAR_BOUNDARY = 1e-6
 
 
@@ -302,7 +303,7 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
     structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
     if structured is not None and not near_boundary(structured.poles, lin.dt):
         return structured
-    # A general solver would fail without naming the mode that causes the failure.
+    # These checks name the mode that would make a general solver fail.
     require_stabilizable(lin)
     free, A = Q, lin.A
     if N is not None:

@@ -32,8 +32,8 @@ from fflin.robot.robot import Robot
 # Tolerance [rad, m, s] of the goal, and of the limits of states at knots.
 _REACHED = 1e-7
 
-# Between knots, limits may be exceeded by this fraction. The ends of _PARTS equal parts of each
-# interval are checked.
+# Between knots, the motion may exceed a limit by this fraction. It is checked at the ends of _PARTS
+# equal parts of each interval.
 _BETWEEN, _PARTS = 0.01, 16
 
 
@@ -166,8 +166,7 @@ def plan(
     size[size == 0.0] = 1.0
     for name, point, which in (("start", start, slice(None)), ("goal", end, asked)):
         _require_within(shooting, bounds, name, point, which)
-    # A search without a solution may diverge; this is reported as an error instead of NumPy
-    # warnings.
+    # A search without a solution may diverge; an error is then raised instead of NumPy warnings.
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
         guess = shooting.guess(start, end)
         cost = cost_of_inputs(shooting, weights, guess[2])
@@ -208,7 +207,8 @@ class _Made(NamedTuple):
 def _least(search: Search, guess: tuple[Array, Array, Array], size: Array) -> _Made:
     """Return the plan of least effort, or the plan that is closest to the goal and the limits."""
     shooting, bounds, best = search.shooting, search.bounds, None
-    # If limits cannot be respected between knots, they are respected at knots only.
+    # If the limits cannot be met between knots, the search is repeated with limits at the knots
+    # only.
     for parts in (_PARTS, 1) if np.isfinite(bounds).any() else (1,):
         q, v, u = search._replace(parts=parts).best(*guess)
         missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked

@@ -23,12 +23,13 @@ _LINE = "#888888"
 
 _POINTS = 400
 
-# A smaller gain factor counts as zero, because an integrator has infinite gain at zero frequency.
+# A gain factor below this counts as zero, because an integrator has infinite gain at zero
+# frequency.
 _NOTHING = 1e-6
 
 
 class LoopMargins(NamedTuple):
-    """Phase margin [deg] of a loop, and the gain factors between which the loop is stable."""
+    """Phase margin [deg] of a loop, and the range of gain factors for which the loop is stable."""
 
     phase: float
     gain: tuple[float, float]

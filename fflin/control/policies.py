@@ -205,7 +205,7 @@ class AllocatedPolicy:
         return (*[said] * (not same), *getattr(self._inner, "notes", ()))
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
-        """Return the inputs (nu,) whose force is nearest to the force of the inner command."""
+        """Return the inputs (nu,) whose force is nearest to the force of the inner policy."""
         asked, given = self._states
         u = self._design.in_base_axes(asked.chart(q), self._command(t, q, v))
         force = self._design.columns(self._data, q) @ u
@@ -239,7 +239,7 @@ class Clock:
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
     """Return the state index of each output, and the gyroscopes, whose indices follow the states.
 
-    For other sensors, `InputError` is raised.
+    Other sensors raise `InputError`.
     """
     found, gyros = list[int](), list[Gyroscope]()
     for output in state.robot.outputs:
@@ -293,7 +293,7 @@ class Compensation:
         return u
 
     def advance(self, weights: Array, last: bool) -> None:
-        """Integrate z to the next stage; `weights` apply to the step's first z and to its rates."""
+        """Integrate z to the next stage: sum `weights` times the step's first z and its rates."""
         if not self.dt:
             self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:

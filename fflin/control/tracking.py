@@ -28,7 +28,7 @@ from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
-# Sums of many time steps are rounded, so times within this factor of the end count as the end.
+# Times within this factor of the end count as the end, because sums of many time steps are rounded.
 AT_THE_END = 1.0 + 1e-9
 
 # Function that returns q, v and u, in the policy's axes, at a time of the run.
@@ -239,8 +239,8 @@ def tracking_of(policy: object) -> TrajectoryFeedback | None:
 @lru_cache(maxsize=2)  # saves half the time of a short run
 def largest_rate(schedule: GainSchedule) -> float:
     """Return the 95th percentile over time of the largest pole magnitude [1/s]; 0 if sampled."""
-    # The percentile excludes the short time in which a large final weight makes K large. A larger
-    # step may skip this time.
+    # The percentile excludes the short time in which a large final weight makes K large. The
+    # integration step may be too long for this time.
     if schedule.dt:
         return 0.0
     rates = np.abs(np.linalg.eigvals(schedule.A - schedule.B @ schedule.K)).max(axis=1)
@@ -335,8 +335,8 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         k, jump = round(t / dt), np.zeros(self._size)
         if k < len(seen.A):
             A, B, K, L, C, D = (x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D))
-            # A held input approximates a changing input best with its value at the middle of the
-            # sample.
+            # A held input approximates a changing input best if it has the value at the middle of
+            # the sample.
             u = self.reference(t + 0.5 * dt * (self.trajectory.hold == "linear"))[2]
             y = seen.y[k]
         else:

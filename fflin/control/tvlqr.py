@@ -190,7 +190,7 @@ def require_continuous(traj: LinearTrajectory) -> None:
 
 
 def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
-    """Return the model at the last knot, or the first (0), at rest if the knot is not steady."""
+    """Return the model at knot `end`, or the model at rest there if the knot is not steady."""
     lin = traj[end]
     if lin.is_equilibrium():
         return lin

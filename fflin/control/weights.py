@@ -25,10 +25,10 @@ from fflin.linear.model import LinearModel
 
 Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 
-# Relative asymmetry and negative eigenvalues below this are rounding errors.
+# A relative asymmetry or a negative eigenvalue is rounding error if its magnitude is below this.
 _ROUNDING = 1e-9
 
-# Wheel speeds are regulated with this fraction of the bandwidth.
+# Bandwidth with which wheel speeds are regulated, as a fraction of the bandwidth of the loop.
 _SPEEDS = 0.1
 
 
@@ -273,7 +273,7 @@ def rule_weights(
     wheel_speeds: bool | None = None,
     pace: Pace = AT_A_POINT,
 ) -> tuple[Array, Array, Array | None, str]:
-    """Return Q, R and N by a rule, changed by `given` weights, and the rule in words."""
+    """Return Q, R and N by a rule, changed by `given` weights, and a description of the rule."""
     # If the continuous model is known, the cost of a sampled model is the continuous cost with
     # held inputs. The rule is set by the robot's `weights`; by default it is "urdf".
     source = lin.generator or lin
@@ -310,7 +310,7 @@ def _of_regulated(
 ) -> tuple[Array, Array, str, Array]:
     """Return Q (nx, nx), R, the rule and the costs, for a model that may have wheels.
 
-    The costs (nx + nu,) are the contributions of the largest value of each state and input. They
+    The costs (nx + nu,) are the contributions of each state and input at its largest value. They
     are 0 if the rule has no largest values.
     """
     part = regulated_part(lin, wheel_speeds)
@@ -322,7 +322,7 @@ def _of_regulated(
     at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
     names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
     most = np.array([lin.limits[name] for name in names])
-    # A wheel that is already at its limit counts as a wheel at rest, and the report names it.
+    # A wheel that is already at its limit is treated as a wheel at rest, and the report names it.
     room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
     found = default_weights(body, pace, dict(zip(names, room, strict=True)))
     Q, R, rule, bandwidth, (of_positions, of_inputs) = found
@@ -336,8 +336,8 @@ def _of_regulated(
     terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
     if speeds := [name for name in part.state_names if name not in body.state_names]:
         S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
-        # Z spans the null space of the scaled forces. The inputs R^-1/2 Z n rotate no body, and
-        # change the wheel speeds at the rates X n.
+        # Z spans the null space of the scaled forces. For any vector n, the inputs R^-1/2 Z n
+        # rotate no body and change the wheel speeds at the rates X n.
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
         X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
@@ -346,7 +346,7 @@ def _of_regulated(
 
 
 class _Given(NamedTuple):
-    """Given weight, and whether it was given as a largest value."""
+    """A weight from the user, and whether it was given as a largest value (Bryson's rule)."""
 
     value: float
     largest: bool

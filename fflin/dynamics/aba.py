@@ -22,7 +22,7 @@ class Aba:
         self._weightless = robot.model
         self._model = robot.model.copy()
         self._model.gravity.linear = np.array(robot.gravity)
-        # M^-1 in base axes from ABA, at the point of the last call of `slopes`.
+        # M^-1 in base axes by ABA, at the point given in the last call of `slopes`.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
         self.field = state.field
         self._resists = bool(np.any(robot.springs))
@@ -42,7 +42,7 @@ class Aba:
         return self.field.relative(v, absolute, rate) if self.field else rate
 
     def accelerations(self, q: Array, v: Array, u: Array) -> Array:
-        """Return dv/dt (N, nv) of N points, see `acceleration`."""
+        """Return dv/dt (N, nv) at N points; see `acceleration`."""
         state = self.state
         if self.field or state.robot.followers or state.robot.stored_momentum:
             return np.array([self.acceleration(*point) for point in zip(q, v, u, strict=True)])
@@ -56,7 +56,7 @@ class Aba:
         return found
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
-        """Return the sum of the magnitudes of the terms of the accelerations (6 + n,)."""
+        """Return, for each acceleration (6 + n,), the sum of the magnitudes of its terms."""
         state, data = self.state, self._data
         M = state.project(pin.crba(self._model, data, q).T)
         columns = self.actuation.columns(data, q)
@@ -66,8 +66,8 @@ class Aba:
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return d(nudot)/d(tangent of q, nu, u) in state order, (6 + n, ...); `u` in base axes."""
-        # Wrenches of thrusters are constant in the frames of their links, so that the derivative
-        # over q includes d(B u)/dq. B comes from the accelerations of unit inputs at rest.
+        # Wrenches of thrusters are constant in the frames of their links, so the derivative over q
+        # includes d(B u)/dq. B comes from the accelerations of unit inputs at rest.
         state = self.state
         stiffness, damping, _ = state.robot.springs
         tau, field = state.lift(self.actuation.torques(u) + self._passive_force(q, v)), self.field
@@ -114,7 +114,7 @@ class Aba:
         return wrenches
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
-        """Return the wrenches of inputs and of gyroscopic torques on the links."""
+        """Return the wrenches of the inputs and of the gyroscopic torques on the links."""
         stored = self.state.robot.stored_momentum
         wrenches = self.actuation.wrenches(u) or self._none
         if not stored:
@@ -128,8 +128,8 @@ class Aba:
 
     def _angular_velocity_derivatives(self, joint: int, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the derivatives (3, nv) over v and q of a link's angular velocity in its axes."""
-        # Let a joint between base and link have the axis s (in link axes) and a parent with the
-        # angular velocity omega_p. The derivative over the joint angle is omega_p x s. The
+        # For a joint between base and link, let s be its axis (in link axes) and omega_p the
+        # angular velocity of its parent. The derivative over the joint angle is omega_p x s. The
         # derivative over a rotation of the base is zero.
         model, data = self._model, self._data
         pin.forwardKinematics(model, data, q, v)
@@ -167,9 +167,9 @@ class Aba:
     ) -> tuple[Array, Array, Array]:
         """Return the derivatives for robots with mimic joints: S^T M a = S^T (tau - b)."""
         # The constraint forces of mimic joints drop out of this equation. ABA needs a regular M,
-        # but M is singular if a mimic joint or its leader moves no mass. So each of these joints
-        # gets a rotor with the inertia of their common coordinate. The contribution of the rotors
-        # to S^T M S is subtracted afterwards.
+        # but M is singular if a mimic joint or its leader moves no mass. So each mimic joint and
+        # its leader get a rotor. The rotor's inertia is the diagonal entry of S^T M S for their
+        # coordinate. The rotors' contribution to S^T M S is subtracted afterwards.
         state, data = self.state, self._data
         shared = S @ state.project(pin.crba(self._model, data, q)).diagonal()
         model = self._model.copy()

@@ -54,11 +54,11 @@ class Actuation:
         if len({*names}) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"two inputs are named '{twice}'; give one of them another name")
-        # Linear models call them `input_names` and `input_units`.
+        # In linear models, the same attributes have the names `input_names` and `input_units`.
         self.names = self.input_names = tuple(names)
         self.units = self.input_units = tuple(units)
-        # {group: indices of its inputs} with the groups tau_b, F_b, tau_m, thrust and wheel, in
-        # order of appearance.
+        # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel, in
+        # the order in which they first appear.
         self.groups = {
             group: np.flatnonzero(np.array(groups) == group) for group in dict.fromkeys(groups)
         }
@@ -101,7 +101,7 @@ class Actuation:
         chart.turn_columns(self.held, by_u)
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
-        """Return the wrench of thrusters and wheels on each joint in its frame, or None."""
+        """Return each joint's wrench of thrusters and wheels in its frame; None without any."""
         if not self.carried:
             return None
         external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())
@@ -110,5 +110,5 @@ class Actuation:
         return external
 
     def torques(self, u: Array) -> Array:
-        """Return the generalised forces (6 + n,) of the inputs that act without `wrenches`."""
+        """Return the generalised forces (6 + n,) of the inputs that are not in `wrenches`."""
         return self.fixed @ u

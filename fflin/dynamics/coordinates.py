@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Frame = Literal["hybrid", "local", "world", "lvlh", "hill"]
 
-# Frames of a circular orbit. The world of a robot in orbit is one of them.
+# Frames of a circular orbit. For a robot in orbit, one of them takes the place of the world frame.
 ORBITAL: tuple[Frame, ...] = ("lvlh", "hill")
 
 # Whether (omega_b, v_b) are expressed in reference axes instead of base axes. The same holds for
@@ -54,7 +54,7 @@ def unknown_frame(frame: object) -> InputError:
 
 
 def frame_of(robot: Robot, frame: object) -> Frame:
-    """Return the requested or default frame; raise `InputError` if it does not fit the orbit."""
+    """Return the given or default frame; raise `InputError` if it contradicts the orbit."""
     if frame is None:
         return ORBITAL[0] if robot.orbit else "hybrid"
     if not isinstance(frame, str) or frame not in get_args(Frame):
@@ -110,7 +110,8 @@ def forces_of(robot: Robot) -> dict[str, str]:
     return units
 
 
-# If q0 is below the square root of the machine epsilon, sqrt(1 - |q_b|^2) has no correct digit.
+# If q0 = sqrt(1 - |q_b|^2) is below the square root of the machine epsilon, it has no correct
+# digit.
 SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 
 _IDENTITY = np.eye(3)
@@ -188,11 +189,11 @@ class Chart:
             x[..., columns] = product(x[..., columns], self._back)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) with parts, three rows each, rotated by R to reference axes."""
+        """Return x (.., m, k) with some parts (three rows each) rotated by R to reference axes."""
         return x if self.standing or not parts else _turn(self.R, parts, x.copy("K"))
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) with parts, three rows each, rotated by R^T to base axes."""
+        """Return x (.., m, k) with some parts (three rows each) rotated by R^T to base axes."""
         return x if self.standing or not parts else _turn(self._back, parts, x.copy("K"))
 
 
@@ -241,8 +242,8 @@ def readout(
 ) -> Callable[[Array, Array], Array]:
     """Return the function f(q, v) = offset - K x(q, v) (m,), with angles nearest to `near`."""
     # q_b is linear in the quaternion of q, r_b is linear in the position of q, and velocities in
-    # reference axes are linear in R v. So f is one matrix-vector product, which takes a fifth of
-    # the time of computing x.
+    # reference axes are linear in R v. So f is one matrix-vector product. It takes a fifth of the
+    # time of computing x.
     robot, g = state.robot, state.groups
     idx_q = np.array([joint.idx_q for joint in robot.joints], dtype=np.intp)
     circling, cos = state.unbounded, idx_q[state.unbounded]
@@ -295,9 +296,9 @@ def readout(
 def state_history(
     state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
 ) -> Array:
-    """Return the states (N, nx) of a motion, with angles unwrapped from `near` (nx,) on."""
-    # If the times t (N,) are given, the joint rates decide the number of turns between rows.
-    # Otherwise the step between rows is taken as less than half a turn.
+    """Return the states (N, nx) of a motion, with angles unwrapped, starting near `near` (nx,)."""
+    # If the times t (N,) are given, the joint rates determine how many turns lie between two rows.
+    # Otherwise, an angle is assumed to change by less than half a turn between rows.
     rates = state.velocities(v)
     x = states_of(state, q, rates)
     q_m = x[:, state.groups.q_m]
@@ -319,7 +320,7 @@ def attitude_errors(x: Array, target: Array) -> Array:
 
 
 def _apart(x: Array, target: Array) -> tuple[Array, Array]:
-    """Return vector (N, 3) and scalar (N, 1) of the quaternion from target to x."""
+    """Return the quaternion from target to x as vector (N, 3) and scalar (N, 1)."""
     at, to = x[:, :3], target[..., :3]
     w, d = (
         np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
@@ -340,7 +341,7 @@ def moving_errors(frame: str, x: Array, target: Array) -> Array:
 
 
 def moved_by(frame: str, target: Array, e: Array) -> Array:
-    """Return the states (N, nx) with errors e from a target; NaN if |q_b| of e exceeds 1."""
+    """Return the states (N, nx) that have errors e from a target; NaN if |q_b| of e exceeds 1."""
     x, (turn_target, R_target), (turn, R) = target + e, _turned(target), _turned(e)
     q_e, q_target = e[:, :3], target[:, :3]
     x[:, :3] = turn_target * q_e + turn * q_target + np.cross(q_target, q_e)
@@ -355,13 +356,13 @@ def moved_by(frame: str, target: Array, e: Array) -> Array:
 
 
 def _turned(x: Array) -> tuple[Array, Array]:
-    """Return the nonnegative scalar part (N, 1) and the rotation (N, 3, 3) of states' attitudes."""
+    """Return the nonnegative quaternion scalar (N, 1) and the rotation (N, 3, 3) of each state."""
     scalar = np.sqrt(1.0 - (x[:, :3] ** 2).sum(axis=1, keepdims=True))
     return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
 
 
 def _in_reference(frame: str, nx: int) -> list[Indices]:
-    """Return the indices of the base velocities that are in reference axes."""
+    """Return the indices of the base velocities that the frame expresses in reference axes."""
     velocities = np.arange(nx)[nx // 2 :]
     return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
 

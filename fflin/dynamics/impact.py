@@ -15,7 +15,7 @@ from fflin.base.validation import Array, FrozenArrays, dimension, instance, vect
 from fflin.base.validation import placement as checked_placement
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT, by_joint, find_frame
-from fflin.robot.loading import body_alone, inertia_of
+from fflin.robot.loading import body_alone
 from fflin.robot.robot import Robot
 from fflin.robot.welding import joined, welded
 
@@ -159,7 +159,7 @@ def jam(
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> tuple[dict[str, Any], Array]:
-    """Join robots at (q, v) to one (13.1); return the fields of `Impact`, and the impulses."""
+    """Join robots at (q, v) to one robot (13.1); return the fields of `Impact` and the impulses."""
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))
@@ -206,7 +206,7 @@ def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
 
 
 def joint_called(robot: Robot, name: str) -> pin.JointModel:
-    """Return the joint of Pinocchio's model with a name."""
+    """Return the joint with a name in Pinocchio's model."""
     return robot.model.joints[robot.model.getJointId(name)]
 
 
@@ -336,7 +336,7 @@ def capture(
     """
     instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     if isinstance(payload, pin.Inertia):
-        alone = body_alone(inertia_of(payload), prefix)
+        alone = body_alone(payload, prefix)
         other = replace(alone, gravity=robot.gravity, orbit=robot.orbit)
     else:
         instance("payload", payload, Robot, "a pin.Inertia or a fflin.Robot").require_unchanged()
@@ -368,7 +368,7 @@ def capture(
 
 
 def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tuple[Array, Array]:
-    """Return the checked configuration and velocity of a payload with its base at a placement."""
+    """Return a payload's checked configuration and velocity, with its base at a given placement."""
     configuration = other.neutral() if q is None else other.checked_configuration(q).copy()
     root = other.model.jointPlacements[ROOT]
     configuration[:7] = pin.SE3ToXYZQUAT(root.actInv(at))

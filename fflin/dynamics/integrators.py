@@ -16,12 +16,12 @@ _integrate = pin.integrate
 
 
 def integrate_rows(model: pin.Model, q: Array, way: Array) -> Array:
-    """Return configurations (N, nq) that are displaced by tangent vectors (N, nv)."""
+    """Displace configurations (N, nq) by tangent vectors (N, nv), and return the results."""
     return np.array([_integrate(model, *each) for each in zip(q, way, strict=True)])
 
 
 class Integrator:
-    """Integrator with one step size for one model, of one point or of N rows of points."""
+    """Integrator of one model with a fixed step size, for one point or for N rows of points."""
 
     # Times of the stages in a step of length 1.
     nodes: ClassVar[tuple[float, ...]]
@@ -31,8 +31,8 @@ class Integrator:
     moments: ClassVar[tuple[float, ...]]
     # Stability limit on the negative real axis: largest |pole| h.
     reach: ClassVar[float]
-    # Configuration from which each displacement starts: 0 for the one at the beginning of the
-    # step, 1 for the one of the second stage.
+    # Stage from whose configuration each displacement starts: 0 for the first stage (the beginning
+    # of the step), 1 for the second.
     origins: ClassVar[tuple[int, ...]]
 
     def __init__(self, model: pin.Model, dt: float, rows: int | None = None) -> None:
@@ -44,7 +44,7 @@ class Integrator:
 
     @classmethod
     def step_weights(cls, dt: float) -> tuple[Array, Array]:
-        """Return the weights of v and of the stages' accelerations l in each step of q and of v."""
+        """Return the weights of v and the stages' accelerations l for each new q and each new v."""
         raise NotImplementedError
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
@@ -93,7 +93,7 @@ class CommutatorFree4(Integrator):
 
 
 class SemiImplicitEuler(Integrator):
-    """Semi-implicit Euler: order 1, the new velocity moves the configuration."""
+    """Semi-implicit Euler: order 1; the configuration moves with the new velocity."""
 
     nodes, weights, moments = (0.0,), (1.0,), (1.0,)
     reach = 2.0
@@ -118,8 +118,8 @@ def integrator(name: str) -> type[Integrator]:
     return INTEGRATORS[name]
 
 
-# Commutator-free method of order four (10.3): its Gauss nodes, and their weights in the first of
-# its two exponentials. In the second exponential the weights are exchanged.
+# Commutator-free method of order four (10.3): its Gauss nodes, and the nodes' weights in the first
+# of the two exponentials. The second exponential has the weights in reverse order.
 GAUSS = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 HEAVY, LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
 

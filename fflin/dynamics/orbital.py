@@ -26,7 +26,7 @@ def mean_motion(robot: Robot) -> float:
     return robot.orbit.mean_motion if robot.orbit else 0.0
 
 
-# Relative errors of the linear field above which a warning is issued, or an error is raised.
+# Relative errors of the linear gravity field: the first causes a warning, the second an error.
 _COARSE, _USELESS = 0.01, 0.5
 
 
@@ -127,7 +127,7 @@ class OrbitField:
     def near(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and the inertial v with the base at the frame's origin and zero linear velocity.
 
-        Neither changes the motion relative to the free fall of the base.
+        Base position and linear velocity do not affect motion relative to the base's free fall.
         """
         q, v = q.copy(), self.absolute(q, v)
         q[:3] = v[PIN_LINEAR] = 0.0
@@ -138,7 +138,7 @@ class OrbitField:
         R, position = self.base(q)
         fall = R.T @ (self.pull @ position - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
         spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))
-        # Derivatives of dw/dt + w x spin, and of dv/dt = c + fall - 2 spin x v - w x v.
+        # The next lines differentiate dw/dt + w x spin and dv/dt = c + fall - 2 spin x v - w x v.
         by_q[:, ANGULAR] += by_v[:, ANGULAR] @ spin
         by_q[ANGULAR, ANGULAR] += W @ spin
         by_v[ANGULAR, ANGULAR] -= spin
@@ -161,7 +161,7 @@ class OrbitField:
         return energy
 
     def _bodies(self, data: pin.Data) -> tuple[Array, Array]:
-        """Return the attitude (k, 3, 3) and the centre of mass (k, 3, 1) of each body."""
+        """Return the attitude (k, 3, 3) and the centre of mass (k, 3, 1) of each of k bodies."""
         placements = data.oMi.tolist()[ROOT:]
         R = np.array([placement.rotation for placement in placements])
         origins = np.array([placement.translation for placement in placements])

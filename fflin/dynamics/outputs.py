@@ -33,7 +33,7 @@ class Sensed(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Robot with its base at the origin and without linear velocity, and the removed motion."""
+    """Robot with its base at the origin and no linear velocity, and the removed base motion."""
 
     model: pin.Model
     data: pin.Data
@@ -54,7 +54,7 @@ class Point(NamedTuple):
 
 
 class World(NamedTuple):
-    """Robot at its actual pose, after Pinocchio's second-order forward kinematics."""
+    """Robot at its actual pose, with the positions, velocities and accelerations of all joints."""
 
     model: pin.Model
     data: pin.Data
@@ -99,8 +99,8 @@ def _center(world: World) -> Array:
 
 
 def _momentum_derivatives(at: Point, to: Sensed) -> None:
-    # The function also differentiates the rate of momentum, which is not used here. So any value
-    # may stand for the acceleration.
+    # Pinocchio also differentiates the rate of momentum, which needs an acceleration. This
+    # derivative is not used here, so v is given in place of the acceleration.
     by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
     mass, h = pin.computeTotalMass(at.model), at.data.hg
     to.y[:3] = at.R.dot(h.angular)
@@ -221,7 +221,7 @@ def _accelerometer(world: World, _: object, frame: Carried) -> Array:
     return np.asarray(acceleration - world.placement(frame).rotation.T @ world.gravity)
 
 
-# Outputs of all other types consist of states.
+# All types of outputs that are not listed here consist of states.
 KINDS: dict[type[kinds.Output], tuple[Derivatives, Value]] = {
     kinds.CenterOfMass: (_center_of_mass_derivatives, _center_of_mass),
     kinds.Momentum: (_momentum_derivatives, _momentum),
@@ -243,10 +243,11 @@ class Sensing:
     With `own_reference`, the outputs are relative to the base's current pose.
     """
 
-    # Position and velocity of the base do not change what happens on the robot (Galilean
-    # invariance). So Pinocchio evaluates the robot with its base at the origin and v_b = 0, and the
-    # base motion is added afterwards. This loses no digits at orbital positions and velocities.
-    # Sensors measure the base's acceleration as dv_b/dt + omega_b x v_b - g in base axes.
+    # Motion relative to the base does not depend on the base's position and velocity (Galilean
+    # invariance). So Pinocchio evaluates the robot with its base at the origin and v_b = 0, and
+    # the base motion is added afterwards. This loses no digits at orbital positions and
+    # velocities. Sensors measure the base's acceleration as dv_b/dt + omega_b x v_b - g in base
+    # axes.
 
     def __init__(
         self, state: StateMap, outputs: Sequence[Output], *, own_reference: bool = False
@@ -270,7 +271,8 @@ class Sensing:
                 indices = state_indices(state, output)
                 self.states += enumerate(indices, start=at)
                 signals += [(state.names[index], state.units[index]) for index in indices]
-        # Outputs of frames come last, because the others overwrite the data that they read.
+        # Outputs of frames come last, because other outputs overwrite the data that frame outputs
+        # read.
         self._kinds.sort(key=lambda kind: bool(kind[2]))
         self.names = tuple(name for name, _ in signals)
         self.units = tuple(unit for _, unit in signals)
@@ -372,7 +374,7 @@ class Measuring:
 
 
 def state_indices(state: StateMap, output: Output) -> list[int]:
-    """Return the indices of the states of which an output consists."""
+    """Return the indices of the states that make up an output."""
     robot, groups = state.robot, state.groups
     if isinstance(output, FullState):
         return list(range(state.nx))

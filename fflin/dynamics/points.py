@@ -84,7 +84,7 @@ def base_of(state: Mapping[str, Any]) -> pin.SE3:
 
 
 def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a state whose parts, joints and rates are replaced by the entries of another state."""
+    """Return a state in which the parts, joints and rates of another state take precedence."""
     both = {**state, **other}
     for part in ("joints", "velocity"):
         if part in both:

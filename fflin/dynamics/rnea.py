@@ -15,26 +15,28 @@ from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.state import StateMap
 from fflin.robot.mass_properties import coordinate_names
 
-# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate, and grows
-# as the inertia of i alone vanishes. Coupling times machine epsilon is the relative error of
-# (M^-1)_ii. If the sum of all couplings exceeds _WARNING_COUPLING, M^-1 has fewer than nine correct
-# digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a sum below the
-# number of coordinates shows that pivots are round-off.
+# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. It
+# grows as 1 / (M^-1)_ii, the inertia of i while all other coordinates are free, becomes small
+# relative to M_ii. Coupling times machine epsilon is the relative error of
+# (M^-1)_ii. If the sum of all couplings exceeds _WARNING_COUPLING, M^-1 has fewer than nine
+# correct digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a
+# smaller sum than the number of coordinates shows that some pivots are only rounding errors.
 _EPS = float(np.finfo(float).eps)
 _WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
-# Pinocchio's articulated-body inverse sums inertias about the base's origin. The couplings with
-# M_ii replaced by `inertia_bounds` bound its rounding errors. If their sum exceeds this limit, a
-# Cholesky factor of M is used instead.
+# Pinocchio's articulated-body inverse sums inertias about the base's origin. With `inertia_bounds`
+# in place of M_ii, the couplings bound the rounding errors of this inverse. If their sum exceeds
+# this limit, a Cholesky factor of M is used instead.
 _QUICK_COUPLING = 1e-11 / _EPS
 
 STROKE = 1.0  # [m] largest displacement of a prismatic joint for which `inertia_bounds` holds
 
-# Above this size LAPACK is faster than a sparse factor.
+# If M has more rows than this, LAPACK is faster than a sparse factor.
 _DENSE_SIZE = 64
 
 
-# Bound once, because looking up a name in a module takes as long as factorising a small matrix.
+# Looked up once, because looking up a name in a module takes as long as factorising a small
+# matrix.
 _crba, _decompose, _invert_factor, _compute_inverse = (
     pin.crba,
     pin.cholesky.decompose,
@@ -76,16 +78,16 @@ class Inertia:
     def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
         still = self.centred(q)
-        # Articulated bodies are used only if `quick`: their small rounding errors would appear in
-        # entries of M^-1 K that are exactly zero. The rounding of a Cholesky factor does not
-        # depend on the scaling of M.
+        # The articulated-body inverse is used only if `quick`, because its rounding errors would
+        # appear in entries of M^-1 K that should be exactly zero. The relative rounding errors of
+        # a Cholesky factor do not depend on the scaling of M.
         bounds = self._bounds if quick else None
         if bounds is not None and (
             not self._slides or np.abs(still.take(self._slides)).max() <= STROKE
         ):
             _compute_inverse(self._model, self._data, still)
             self._state.project(self._inverse, out)
-            # A zero pivot gives NaN, for which this comparison is false.
+            # A zero pivot gives NaN, which makes this comparison false.
             if self.least_coupling < bounds.dot(self._inverse_diagonal) < _QUICK_COUPLING:
                 return
         upper = _crba(self._model, self._data, still)
@@ -197,8 +199,8 @@ class Gyroscopic(NamedTuple):
 
     wrenches: pin.StdVec_Force  # on every joint, in its frame
     force: Array  # generalised force (nv,) of the gyroscopic torques
-    # Derivatives (nv, nv) of `force`. `by_q` holds the Jacobian constant, because RNEA's
-    # derivatives with `wrenches` include its change.
+    # Derivatives (nv, nv) of `force`. In `by_q` the Jacobian is constant, because RNEA's
+    # derivatives with `wrenches` already include the change of the Jacobian.
     by_q: Array
     by_v: Array
 
@@ -243,8 +245,8 @@ class Accelerations:
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
         # The base's placement and linear velocity are left out: in base axes c does not depend on
-        # them, and Pinocchio's derivatives would lose digits to large values. Gravity is left out
-        # as well, because it accelerates all parts of the robot alike (equivalence principle).
+        # them, and large values would cost Pinocchio's derivatives digits. Gravity is left out as
+        # well, because it accelerates all parts of the robot alike (equivalence principle).
         q_still, v_still = self._inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:

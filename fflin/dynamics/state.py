@@ -99,7 +99,7 @@ class StateMap:
         self.frame = names.frame_of(robot, frame)
         self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
-        # Acceleration field of the robot's orbit, or None.
+        # Acceleration field of the robot's orbit; None without an orbit.
         self.field = OrbitField(robot, self.frame) if robot.orbit else None
         self.nx = 12 + 2 * n
         self.groups = names.Groups(
@@ -114,7 +114,7 @@ class StateMap:
         joints = robot.joints
         # Index in Pinocchio's v of each velocity of the state.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
-        # The inverse map. Entries of mimic joints are written afterwards (`spread`).
+        # The inverse map. `spread` writes the entries of mimic joints afterwards.
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
@@ -334,7 +334,7 @@ class StateMap:
         """
         if self.S is not None:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
-        # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
+        # With mode="clip", NumPy writes into `out` without a buffer. No index is out of range.
         return matrix.take(self._flat, out=out, mode="clip")
 
     def project_transposed(self, matrix: Array, out: Array) -> None:

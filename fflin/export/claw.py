@@ -192,7 +192,8 @@ class _OutputLoop(Loop):
     def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
         """Return the command of a sample.
 
-        Outputs are measured twice, since an accelerometer must measure under this command.
+        Outputs are measured twice, because an accelerometer measures accelerations under this
+        command.
         """
         by = self.at(t)
         u, _ = self._law.output_step(self.estimate, measure(by, self._u0), t)

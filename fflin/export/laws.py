@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ from fflin.control.policies import Compensation, Gridded, Sample, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.linear.fit import sensed
+from fflin.linear.fit import Signals, require_same, sensed
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits
@@ -50,17 +50,14 @@ class Law:
     """Properties common to all exported laws."""
 
     title: str
-    names: tuple[str, ...]  # of the states or outputs
-    units: tuple[str, ...]
+    signals: Signals  # names and units of the states or outputs
+    inputs: Signals
     frame: Any
     dt: float
-    input_names: tuple[str, ...]
-    input_units: tuple[str, ...]
     u0: Array  # (rows, nu)
-    low: Array  # (nu,)
-    high: Array
+    limits: tuple[Array, Array]  # (nu,) least and largest inputs
     robot: Robot | None
-    lin: LinearModel | None = None
+    lin: LinearModel | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +72,7 @@ class StateLaw(Law):
     placements: Array  # (rows, 7), poses of the base or reference in the world
     x0: Array  # (rows, nx)
     K: Array  # (rows or points of the grid, nu, nx)
-    axes: dict[str, Array] = field(default_factory=dict)
+    axes: dict[str, Array]
 
     @property
     def follows(self) -> bool:
@@ -96,7 +93,7 @@ class StateLaw(Law):
     def _case(self, random: np.random.Generator, row: int, index: int) -> Case:
         state, n, about = self.state, self.state.robot.n, self.placements[row]
         world = StateMap(state.robot, frame=self.frame)
-        # A displaced state with the base at the reference; its pose is set afterwards.
+        # A random state near x0 with the base at the reference; the base's pose is set afterwards.
         x = self.x0[row] + random.normal(scale=10.0 ** random.uniform(-4, 0), size=state.nx)
         x[:6] = 0.0
         turns = np.zeros(n)
@@ -142,12 +139,12 @@ class OutputLaw(Law):
         """Whether each output is the angle of a continuous joint."""
         joints = self.robot.joints if self.robot else ()
         angles = {f"q_m.{joint.name}" for joint in joints if joint.unbounded}
-        return [name in angles for name in self.names]
+        return [name in angles for name in self.signals[0]]
 
     @property
     def operations(self) -> float:
         """Bound on the number of rounded operations between an argument and u or z."""
-        return float(len(self.terms.A) + len(self.names) + 16)
+        return float(len(self.terms.A) + len(self.signals[0]) + 16)
 
     def cases(self) -> list[Case]:
         """Return test cases at random controller states and outputs, with u and the next z."""
@@ -175,28 +172,16 @@ def measured(world: StateMap, q: Array, v: Array) -> Array:
 
     `world` is the state map relative to the world.
     """
-    nu = world.velocities(v)
-    return np.concatenate(
-        (
-            quaternion_product(world.origin_quaternion, q[3:7]),
-            world.positions(q),
-            world.joint_positions(q),
-            nu[:3],
-            world.rotation(q) @ nu[3:6],
-            nu[6:],
-        )
-    )
-
-
-_KINDS = (
-    *(Gain, StateFeedback, Gridded, LinearController, Compensator),
-    *(GainSchedule, TrajectoryFeedback),
-)
+    attitude, nu = quaternion_product(world.origin_quaternion, q[3:7]), world.velocities(v)
+    pose = attitude, world.positions(q), world.joint_positions(q)
+    return np.concatenate((*pose, nu[:3], world.rotation(q) @ nu[3:6], nu[6:]))
 
 
 def law_of(given: object, robot: object, limits: object) -> StateLaw | OutputLaw:
     """Convert a policy or design to the tables of a law; `limits` are as in `simulate`."""
-    if not isinstance(given, _KINDS) or isinstance(given, TrajectoryOutputFeedback):
+    of_states = Gain | StateFeedback | Gridded | GainSchedule | TrajectoryFeedback
+    known = isinstance(given, of_states | LinearController | Compensator)
+    if not known or isinstance(given, TrajectoryOutputFeedback):
         raise InputError(
             f"law has type {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
             "LinearController, Compensator, GainSchedule, TrajectoryFeedback or ScheduledFeedback"
@@ -212,28 +197,36 @@ def law_of(given: object, robot: object, limits: object) -> StateLaw | OutputLaw
         )
     if isinstance(given, GainSchedule):
         given = TrajectoryFeedback(given.trajectory(robot), given)
-    if isinstance(given, TrajectoryFeedback):
-        return _tracking_law(given, robot, limits)
     policy: Any = given
-    if isinstance(given, Gain):
-        lin = lin or _model_of(given, robot)
-        policy = StateFeedback(lin, given.K)
-    axes, gains = policy.table() if isinstance(policy, Gridded) else ({}, policy.K[None])
-    state = policy.state_map(robot)
-    terms = [StateFeedback(lin, K).terms(state) for K in gains]
+    axes: dict[str, Array] = {}
+    if isinstance(given, TrajectoryFeedback):
+        lin, dt, state = None, given.schedule.dt, given.state_map(robot)
+        placements, x0, u0, K = _samples(given, state)
+    else:
+        if isinstance(given, Gain):
+            lin = lin or _model_of(given, robot)
+            policy = StateFeedback(lin, given.K)
+        dt, state = given.dt if isinstance(given, Gain) else lin.dt, policy.state_map(robot)
+        axes, gains = policy.table() if isinstance(policy, Gridded) else ({}, policy.K[None])
+        terms = [StateFeedback(lin, gain).terms(state) for gain in gains]
+        placements, x0, u0 = lin.placement[None], terms[0][2][None], lin.u0[None]
+        K = np.array([gain for gain, _, _ in terms])
+    actuation = Actuation(state)
     return StateLaw(
-        **_common(given, robot, limits, lin.input_names, lin.input_units),
+        title=type(given).__name__,
+        signals=(state.names, state.units),
+        inputs=(actuation.names, actuation.units),
         frame=state.frame,
-        dt=given.dt if isinstance(given, Gain) else lin.dt,
-        names=state.names,
-        units=state.units,
-        u0=lin.u0[None],
+        dt=dt,
+        u0=u0,
+        limits=_limits(robot, limits, actuation.names),
+        robot=robot,
         lin=lin,
         state=state,
         policy=policy.bind(robot),
-        placements=lin.placement[None],
-        x0=terms[0][2][None],
-        K=np.array([K for K, _, _ in terms]),
+        placements=placements,
+        x0=x0,
+        K=K,
         axes=axes,
     )
 
@@ -250,7 +243,7 @@ def _robot_of(given: Any, lin: LinearModel | None) -> Robot | None:
 
 
 def _model_of(gain: Gain, robot: Robot) -> LinearModel:
-    """Linearise the robot at the point and reference of a gain that was read from a file."""
+    """Linearise a robot at the point and reference stored with a gain that was read from a file."""
     if not gain.placement.size:
         raise InputError(
             "the file of the gain does not contain the reference pose, because the file was "
@@ -264,69 +257,45 @@ def _model_of(gain: Gain, robot: Robot) -> LinearModel:
         )
     frame: Any = gain.frame
     state = StateMap(robot, frame=frame, reference=pin.XYZQUATToSE3(gain.placement))
-    if gain.state_names != state.names:
-        raise InputError(
-            f"the states of the gain differ from those of '{robot.name}'; give the robot of the "
-            "design with robot= (--robot)"
-        )
+    own, there = (gain.state_names, gain.state_units), (state.names, state.units)
+    require_same(f"the gain was designed for '{gain.robot}'", robot, "state", own, there)
     q, v = state.to_pinocchio(gain.x0)
     return linearize(robot, q, v, gain.u0, frame=frame, reference=state.reference)
 
 
-def _common(
-    given: object,
-    robot: Robot | None,
-    limits: object,
-    names: tuple[str, ...],
-    units: tuple[str, ...],
-) -> dict[str, Any]:
-    """Return the fields common to all laws; without `limits`, the input limits are infinite."""
-    low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
-    if limits is not None:
-        own = [x for _, group in named_inputs(robot.inputs if robot else ()) for x in group]
-        if robot is None or tuple(own) != names:
-            raise InputError(
-                "limits need the robot with the inputs of the law; give the robot of the design "
-                "with robot= (--robot)"
-            )
-        low, high = input_limits(robot, chosen_limits(robot, limits)[0])
-    common = {"title": type(given).__name__, "robot": robot, "low": low, "high": high}
-    return {**common, "input_names": names, "input_units": units}
+def _limits(robot: Robot | None, limits: object, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the least and largest inputs (nu,); without `limits`, they are infinite."""
+    if limits is None:
+        return np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    own = [x for _, group in named_inputs(robot.inputs if robot else ()) for x in group]
+    if robot is None or own != list(names):
+        raise InputError(
+            "limits need the robot with the inputs of the law; give the robot of the design "
+            "with robot= (--robot)"
+        )
+    return input_limits(robot, chosen_limits(robot, limits)[0])
 
 
-def _tracking_law(policy: TrajectoryFeedback, robot: Robot, limits: object) -> StateLaw:
-    if not policy.schedule.dt:
+def _samples(policy: TrajectoryFeedback, state: StateMap) -> tuple[Array, Array, Array, Array]:
+    """Return poses, x0, u0 and K at each sample, and at last after the end of the trajectory."""
+    if not (dt := policy.schedule.dt):
         raise InputError(
             "the gains are continuous in time, expected sampled gains; design sampled gains with "
             "tvlqr(..., sample=dt) (fflin tvlqr --sample)"
         )
-    dt, state = policy.schedule.dt, policy.state_map(robot)
-    world = StateMap(robot, frame="local")
-    # One row for each sample; the last row applies after the end of the trajectory.
     last = int(np.ceil(policy.over / dt * (1.0 - 1e-12)))
     while last * dt <= policy.over:
         last += 1
-    points = [(*policy.commanded(k * dt), policy.gain(k * dt)) for k in range(last + 1)]
-    placements, x0 = np.empty((last + 1, 7)), np.zeros((last + 1, state.nx))
-    for k, (q, v, _, _) in enumerate(points):
-        placements[k, :3] = world.positions(q)
-        placements[k, 3:] = quaternion_product(world.origin_quaternion, q[3:7])
-        x0[k, state.groups.q_m] = world.joint_positions(q)
-        x0[k, 6 + robot.n :] = world.velocities(v)
-    actuation = Actuation(state)
-    return StateLaw(
-        **_common(policy, robot, limits, actuation.names, actuation.units),
-        frame=state.frame,
-        dt=dt,
-        names=state.names,
-        units=state.units,
-        u0=np.array([u for _, _, u, _ in points]),
-        state=state,
-        policy=policy.bind(robot),
-        placements=placements,
-        x0=x0,
-        K=np.array([K for *_, K in points]),
-    )
+    world, rows = StateMap(state.robot, frame="local"), []
+    for t in dt * np.arange(last + 1):
+        q, v, u = policy.commanded(t)
+        attitude = quaternion_product(world.origin_quaternion, q[3:7])
+        x0 = np.zeros(state.nx)
+        x0[state.groups.q_m] = world.joint_positions(q)
+        x0[6 + state.robot.n :] = world.velocities(v)
+        rows.append((np.append(world.positions(q), attitude), x0, u, policy.gain(t)))
+    poses, states, inputs, gains = map(np.array, zip(*rows, strict=True))
+    return poses, states, inputs, gains
 
 
 def _output_law(
@@ -335,34 +304,33 @@ def _output_law(
     if isinstance(given, Compensator):
         none = np.zeros((len(given.u0), len(given.y0)))
         terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0)
-        inputs, outputs = given.output_names, given.input_names
-        units = _units_of(robot, inputs, outputs)
+        known: dict[str, str] = {}  # {signal: unit}
+        if robot is not None:
+            state = StateMap(robot)
+            actuation = Actuation(state)
+            for names, units in (sensed(state), (actuation.names, actuation.units)):
+                known |= dict(zip(names, units, strict=True))
+        inputs, outputs = (
+            (names, tuple(known.get(name, "unknown") for name in names))
+            for names in (given.output_names, given.input_names)
+        )
     else:
-        terms, inputs, outputs = given.terms, lin.input_names, lin.output_names
-        units = [lin.input_units, lin.output_units]
+        terms, inputs = given.terms, (lin.input_names, lin.input_units)
+        outputs = lin.output_names, lin.output_units
     if not given.dt and len(terms.A):
         raise InputError(
             "the controller is continuous, expected a sampled controller; use "
             "LinearController.sampled(dt), or design the controller for lin.discretize(dt)"
         )
     return OutputLaw(
-        **_common(given, robot, limits, inputs, units[0]),
+        title=type(given).__name__,
+        signals=outputs,
+        inputs=inputs,
         frame=lin.frame if lin else "",
         dt=given.dt,
         u0=terms.u0[None],
+        limits=_limits(robot, limits, inputs[0]),
+        robot=robot,
         lin=lin,
         terms=terms,
-        names=outputs,
-        units=units[1],
     )
-
-
-def _units_of(robot: Robot | None, *names: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Return the units of named inputs and outputs of a robot, "unknown" for other names."""
-    known: dict[str, str] = {}
-    if robot is not None:
-        state = StateMap(robot)
-        actuation = Actuation(state)
-        for signals in (sensed(state), (actuation.names, actuation.units)):
-            known |= dict(zip(*signals, strict=True))
-    return [tuple(known.get(name, "unknown") for name in each) for each in names]

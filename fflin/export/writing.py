@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -15,7 +16,6 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.record import content_digest
-from fflin.base.validation import Array
 from fflin.base.writing import as_path, write_atomically
 from fflin.export.laws import CASES, OutputLaw, StateLaw, law_of
 from fflin.robot.robot import Robot
@@ -23,7 +23,7 @@ from fflin.robot.robot import Robot
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
 _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
 
-# Largest rounding error in double precision, relative to the magnitudes of the terms.
+# Largest accepted rounding error in double precision, relative to the magnitudes of the terms.
 _DOUBLE_ERROR = 1e-14
 
 
@@ -106,7 +106,10 @@ def write_c(
     texts = _Texts(tables, name, real)
     contents = {target / file: text.encode() for file, text in texts.files().items()}
     old = next((path for path in contents if path.exists()), None)
-    if old and _title(target / f"{name}.json") != texts.title:
+    title = None
+    with suppress(OSError, ValueError, TypeError, LookupError):
+        title = json.loads((target / f"{name}.json").read_bytes())["title"]
+    if old and title != texts.title:
         raise InputError(
             f"{old} exists and does not belong to the {texts.title}; give another name= (--name) "
             "or another folder, or delete the file"
@@ -120,17 +123,9 @@ def write_c(
 
 
 def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
-    """Return the digest that ties the description of a law to its code."""
+    """Return the digest that shows whether a law's description and code belong together."""
     parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
     return content_digest(parts)
-
-
-def _title(path: Path) -> str | None:
-    """Return the title of the law that a file of `write_c` describes, or None."""
-    try:
-        return json.loads(path.read_bytes())["title"]
-    except (OSError, ValueError, TypeError, LookupError):
-        return None
 
 
 class _Texts:
@@ -138,16 +133,16 @@ class _Texts:
 
     def __init__(self, law: StateLaw | OutputLaw, name: str, real: str) -> None:
         self.law, self.name, self.real, self.cases = law, name, real, law.cases()
-        # Unit roundoff of a float times the number of operations.
+        # For single precision, the bound is the unit roundoff times the number of operations.
         self.error = _DOUBLE_ERROR if real == "double" else law.operations * 2.0**-24
         bounds = self.error * np.max([case.scale for case in self.cases], axis=0)
-        sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, law.input_units, strict=False)]
+        sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, law.inputs[1], strict=False)]
         robot = law.robot
         self.kind = "state" if isinstance(law, StateLaw) else "output"
         self.title = f"{law.title} of '{robot.name if robot else 'unknown'}'"
-        self.words = {
+        self.words: dict[str, object] = {
             **(_DOUBLE if real == "double" else _FLOAT),
-            **{"name": name, "NAME": name.upper(), "real": real, "count": f"{CASES}"},
+            **{"name": name, "NAME": name.upper(), "real": real, "count": CASES},
             **{"law": law.title, "frame": law.frame or "not known"},
             "robot": _plain(robot.name if robot else "unknown"),
             "sha256": (robot.urdf_sha256 if robot else "") or "not known",
@@ -156,10 +151,12 @@ class _Texts:
             "pinocchio_version": pin.__version__,
             "sample_time": f"{law.dt!r} s" if law.dt else "none, the law is continuous in time",
             "error": f"{self.error:.2g}",
-            "tolerances": _listed("u", law.input_names, sizes),
-            "inputs": f"{len(law.low)}",
-            "input_list": _listed("u", law.input_names, law.input_units),
-            **{key: self.array(getattr(law, key)) for key in ("u0", "low", "high")},
+            "tolerances": _listed("u", law.inputs[0], sizes),
+            "inputs": len(law.inputs[0]),
+            "input_list": _listed("u", *law.inputs),
+            "u0": self.array(law.u0),
+            "low": self.array(law.limits[0]),
+            "high": self.array(law.limits[1]),
             "row": "0",
         }
         self.words |= self._state(law) if isinstance(law, StateLaw) else self._output(law)
@@ -176,10 +173,7 @@ class _Texts:
         about: dict[str, object] = {
             **{"title": self.title, "real": self.real, "frame": law.frame, "dt": law.dt},
             "kind": "samples" if follows else self.kind,
-            "signals": {
-                "input": (law.input_names, law.input_units),
-                self.kind: (law.names, law.units),
-            },
+            "signals": {"input": law.inputs, self.kind: law.signals},
             "nq": len(lin.q) if lin else law.robot.nq if law.robot else 0,
             "u0": law.u0[0].tolist(),
             "memory": len(law.terms.A) if isinstance(law, OutputLaw) else 0,
@@ -198,31 +192,31 @@ class _Texts:
         text = files("fflin.export").joinpath("templates", template).read_text("utf-8")
         return Template(text).substitute(self.words)
 
-    def _vectors(self) -> dict[str, str]:
-        """Return the entries of the test program's template."""
-        law, rows, nu = self.law, [], len(self.law.low)
+    def _vectors(self) -> dict[str, object]:
+        """Return the values that fill the template of the test program."""
+        law, rows, nu = self.law, [], len(self.law.inputs[0])
         for case in self.cases:
             out = case.out.copy()
-            out[:nu] = np.clip(out[:nu], law.low, law.high)
+            out[:nu] = np.clip(out[:nu], *law.limits)
             numbers = map(self.array, (case.given, out, self.error * case.scale))
             status = int((out != case.out).any())
             rows.append(f"{{{case.sample}UL, {', '.join(numbers)}, {status}}}")
         given, out = self.cases[0].given, self.cases[0].out
-        names = [*map(_plain, law.input_names), *(f"next z[{k}]" for k in range(len(out) - nu))]
+        names = [*map(_plain, law.inputs[0]), *(f"next z[{k}]" for k in range(len(out) - nu))]
         return {
             "vectors": "{\n" + ",\n".join(rows) + "}",
-            "ins": f"{len(given)}",
-            "outs": f"{len(out)}",
+            "ins": len(given),
+            "outs": len(out),
             "out_names": ",\n".join(f'    "{each}"' for each in names),
         }
 
-    def _state(self, law: StateLaw) -> dict[str, str]:
+    def _state(self, law: StateLaw) -> dict[str, object]:
         state, (rows, nx), follows = law.state, law.x0.shape, law.follows
         n = state.robot.n
-        words = {
-            **{"joints": f"{n}", "joints_max": f"{max(n, 1)}", "states": f"{nx}"},
-            **{"rows": f"{rows}", "gains": f"{len(law.K)}"},
-            "state_list": _listed("x", state.names, state.units),
+        words: dict[str, object] = {
+            **{"joints": n, "joints_max": max(n, 1), "states": nx},
+            **{"rows": rows, "gains": len(law.K)},
+            "state_list": _listed("x", *law.signals),
             "joint_list": _listed("joints", state.names[6 : 6 + n], state.units[6 : 6 + n]),
             "reference": self.array(law.placements),
             "x0": self.array(law.x0),
@@ -244,8 +238,7 @@ class _Texts:
             joints, sizes = state.robot.joint_names, [len(values) for values in law.axes.values()]
             padded = [np.pad(x, (0, max(sizes) - len(x))) for x in law.axes.values()]
             self.words |= {
-                **{"axis_count": f"{len(sizes)}", "axis_room": f"{max(sizes)}"},
-                "corners": f"{2 ** len(sizes)}",
+                **{"axis_count": len(sizes), "axis_room": max(sizes), "corners": 2 ** len(sizes)},
                 "axis_joint": _whole(joints.index(name) for name in law.axes),
                 "axis_size": _whole(sizes),
                 "axis_points": self.array(padded),
@@ -255,12 +248,16 @@ class _Texts:
             words["gains_between"] = ", K interpolated linearly between joint angles"
         return words
 
-    def _output(self, law: OutputLaw) -> dict[str, str]:
-        by, ny = law.terms, len(law.names)
+    def _output(self, law: OutputLaw) -> dict[str, object]:
+        by = law.terms
         return {
-            **{"states": f"{len(by.A)}", "states_max": f"{max(len(by.A), 1)}", "outputs": f"{ny}"},
-            "output_list": _listed("y", law.names, law.units),
-            **{key: self.array(_at_least_one(getattr(by, key))) for key in "ABCD"},
+            **{"states": len(by.A), "states_max": max(len(by.A), 1), "outputs": len(by.y0)},
+            "output_list": _listed("y", *law.signals),
+            # C has no empty arrays: a matrix without rows or columns gets a zero row or column.
+            **{
+                key: self.array(np.pad(x, [(0, int(not size)) for size in x.shape]))
+                for key, x in zip("ABCD", by[:4], strict=True)
+            },
             "y0": self.array(by.y0),
             "continuous": _whole(law.continuous),
         }
@@ -281,12 +278,6 @@ class _Texts:
         end = "F" if self.real == "float" else ""
         shown = ", ".join(f"{x!r}{end}" for x in values.tolist())
         return "{" + shown.replace(f"inf{end}", "NO_LIMIT") + "}"
-
-
-def _at_least_one(matrix: Array) -> Array:
-    """Add a zero row or column to a matrix without rows or columns: C has no empty arrays."""
-    rows, columns = matrix.shape
-    return np.pad(matrix, ((0, int(not rows)), (0, int(not columns))))
 
 
 def _whole(values: Iterable[int]) -> str:

@@ -1,4 +1,4 @@
-"""Kernel: dynamics and simulation of eight robots at once, compiled by numba if it is installed.
+"""Kernel: dynamics and simulation of eight robots at once, compiled if numba is installed.
 
 Imports `base`, `robot` and `dynamics`.
 """

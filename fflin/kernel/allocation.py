@@ -35,7 +35,8 @@ from fflin.kernel.lanes import (
 )
 from fflin.kernel.rnea import write_columns
 
-# Weight of the magnitudes of the inputs: it selects the smallest of the inputs with equal effect.
+# Weight of the inputs' magnitudes in the cost: among inputs of equal effect it selects the
+# smallest.
 LEAST = 1e-7
 _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 
@@ -43,7 +44,7 @@ _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 class LeastSquares(
     namedtuple("LeastSquares", "least most columns given A Q R b y wanted x s low high state order")
 ):
-    """Problem: find x (k,) between `least` and `most` (k,) with columns @ x nearest to a force.
+    """Problem: find x (k,) with least <= x <= most for which columns @ x is nearest to a force.
 
     `columns` holds the k columns of generalised force per unit input, one after the other, and then
     the force. The other fields are work space:
@@ -104,7 +105,7 @@ def least_squares(least, most, size):
 def half_solve(work, tree, x, first):
     """Replace the force f at x by D^-1/2 L^-T f.
 
-    The squared norm of the result is f^T M^-1 f, the squared norm of the acceleration in M.
+    The squared norm of the result is f^T M^-1 f = a^T M a with the acceleration a = M^-1 f.
     """
     for k in range(len(tree.row) - 1, -1, -1):
         value, row = load(x, first + k), tree.row[k]
@@ -116,7 +117,7 @@ def half_solve(work, tree, x, first):
 
 @inlined
 def allocate(allocation, point, commanded):
-    """Write a command as inputs, allocated to other inputs if there is an allocation problem."""
+    """Write a command into the inputs, after allocation if there is an allocation problem."""
     if len(allocation.problem.least) == 0:
         vec.copy(commanded, 0, point.u, 0, len(point.u))
     else:
@@ -191,8 +192,8 @@ def solve(problem, size, lane):
         write_scaled(given, 0, 1.0 / unit, A)
         write_scaled(given[last:], 0, 1.0 / force, wanted)
         free, kept = _solve_scaled(problem, size, free, 0)
-        # Remove the part of the force that the inputs cannot produce: its rounding error would
-        # exceed the rows of LEAST.
+        # Remove the part of the force that the inputs cannot produce, because its rounding error
+        # would exceed the rows of LEAST.
         wanted[:] = 0.0
         for j in range(count):
             if x[j] != 0.0:
@@ -255,7 +256,7 @@ def _solve_scaled(problem, size, free, kept):
 def _fit(problem, size, free, kept):
     """Write the least squares solution for the free inputs into s, and the residual into b.
 
-    The columns of the free inputs from `kept` on are added to the QR factor first.
+    First, the columns of the free inputs from the index `kept` on are added to the QR factor.
     """
     s, Q, R, b, order, y = problem.s, problem.Q, problem.R, problem.b, problem.order, problem.y
     count = len(s)
@@ -299,7 +300,7 @@ def _orthogonalise(problem, size, at):
 
 @called
 def _steepest(problem, size):
-    """Return the untried input whose release from its bound helps most, or -1 without one."""
+    """Return the untried input whose release reduces the error fastest, or -1 without one."""
     best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
     row_products(problem.A, size, b, slopes)
     for j in range(len(state)):

@@ -1,9 +1,9 @@
 """Kernel arguments: nested named tuples of arrays, stored as one array of 64-bit words.
 
-numba compiles a function for each set of argument types, and passes a named tuple array by array.
-Here a call has one argument, an array of words. A `Struct` is a pointer into the array, and its
-fields are read when they are needed. So the argument types are always the same, and a call within
-compiled code passes one pointer. The words must not change during a call.
+numba compiles a function for each set of argument types, and passes a named tuple as separate
+arrays. Here a call has one argument, an array of words. A `Struct` is a pointer into the array, and
+its fields are read when they are needed. So the argument types are always the same, and a call
+within compiled code passes one pointer. The words must not change during a call.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _size(kind: Any) -> int:
 
 
 class Opener(NamedTuple):
-    """Function that compiled code uses to interpret an array of words as a struct."""
+    """Function by which compiled code interprets an array of words as a struct."""
 
     kind: Struct
 
@@ -66,7 +66,7 @@ class Opener(NamedTuple):
 def laid_out(value: Any, kind: Any, fresh: Callable[[Array, Array], None] | None = None) -> Any:
     """Convert the fields of a named tuple to the kinds of its struct.
 
-    `fresh` is called with each laned array and the column of its values.
+    `fresh` is called with each new laned array and with the column of values that fills it.
     """
     if isinstance(kind, Struct):
         if value is empty(kind):

@@ -39,7 +39,7 @@ class Channel(
 ):
     """Limits (nu,) of commands, and the delayed commands `pending` (slots, nu), one per sample.
 
-    `delay` (1,) is in steps. `fresh` (1,) is 1 if a command begins to act, else 0.
+    `delay` (1,) is in steps. `fresh` (1,) is 1 if a command begins to act in this step, else 0.
     """
 
 
@@ -62,7 +62,7 @@ CHANNEL = Struct(
 
 @inlined
 def clipped(value, low, high):
-    """Return a number within limits; NaN remains NaN."""
+    """Return a number clipped to limits; NaN remains NaN."""
     value = chosen(value, low, low, value)
     return chosen(high, value, high, value)
 
@@ -83,7 +83,7 @@ def is_asked(channel, step):
 
 @inlined
 def transmit(channel, step, nu, u):
-    """Replace the command u by the inputs that act in a step.
+    """Replace the command u by the inputs that act in this step.
 
     u is a new command only in steps in which the policy is evaluated (`is_asked`).
     """
@@ -100,7 +100,7 @@ def transmit(channel, step, nu, u):
 
 @inlined
 def _arrive(channel, step, u):
-    """Write the latest command after the delay, or its pulses, into the inputs of a step."""
+    """Write the latest command that has arrived after the delay, or its pulses, into the inputs."""
     count, any_fresh = len(channel.low), False
     for lane in range(width(channel.delay)):
         since = step - int(peek(channel.delay, 0, lane))
@@ -124,7 +124,7 @@ def _arrive(channel, step, u):
 
 @inlined
 def _begin_pulses(channel, step, u):
-    """Fire the pulse of a sample, and add the remaining impulse to the next sample."""
+    """Fire the pulse of a sample, and leave the remaining impulse to the next sample."""
     pulses, sample, fresh = channel.pulses, channel.sample, load(channel.fresh, 0)
     for index in range(len(pulses.at)):
         most, least = load(pulses.most, index), load(pulses.least, index)
@@ -137,7 +137,7 @@ def _begin_pulses(channel, step, u):
         else:
             level = clipped(wanted / pulses.time, 0.0, most)
             length, fired = float(sample) + 0.0 * wanted, level * pulses.time
-        # An impulse that is below the least impulse only by rounding is fired.
+        # An impulse that only rounding errors put below the least impulse is fired.
         fires = chosen(0.0, fired, chosen(fired, (1.0 - 1e-9) * least, 0.0, 1.0), 0.0)
         left, end = wanted - fires * fired, float(step) + fires * length
         store(pulses.left, index, chosen(0.5, fresh, left, load(pulses.left, index)))
@@ -147,7 +147,7 @@ def _begin_pulses(channel, step, u):
 
 @inlined
 def _limit_wheel_speeds(channel, nu, u):
-    """Reduce torques, at most to zero, that would exceed a wheel's speed limit in the step."""
+    """Reduce torques that would make a wheel exceed its speed limit in a step, at most to zero."""
     wheels = channel.wheels
     for index in range(len(wheels.at)):
         least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)

@@ -18,8 +18,8 @@ from typing import Any
 
 from fflin.base.errors import unknown
 
-# Linux files with a container's quota of computing time and its period [us], in version 2 and in
-# version 1 of control groups.
+# Linux files that contain a container's quota of computing time and the quota's period [us]. The
+# first line is for control groups version 2, the second for version 1.
 _QUOTAS = (
     ("/sys/fs/cgroup/cpu.max",),
     ("/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_period_us"),
@@ -27,7 +27,7 @@ _QUOTAS = (
 
 ENGINES = ("python", "compiled")
 
-# Part of the names of numba's cache files.
+# Version of Python, as in the names of numba's cache files.
 VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 
 # Time [s] to wait for another process's compilation before logging it, and the longest wait [s].
@@ -89,8 +89,8 @@ def _prepared(module: str, name: str, what: str) -> Any:
 def _compile_alone(
     compile: Callable[[Any], Any], folder: Path, module: str, name: str, what: str, signature: Any
 ) -> Any:
-    """Compile for a signature, or load the code that another process has compiled meanwhile."""
-    # Threads wait at _COMPILING, so they never wait for a file lock of their own process.
+    """Compile for a signature; if another process has compiled it meanwhile, load its code."""
+    # The lock _COMPILING admits one thread, so no thread waits for a file lock of its own process.
     with _COMPILING, _between_processes(folder / f"{module}.{name}.lock"):
         if not _kept(folder, module, name):
             _log.warning(
@@ -130,7 +130,7 @@ def _seconds_shown(what: str) -> Iterator[None]:
 def _between_processes(path: Path) -> Iterator[None]:
     """Hold the file lock of a function's machine code; the system frees it if the process dies.
 
-    The lock is skipped without the package filelock, in a folder that cannot be written, or after a
+    There is no lock if the package filelock is missing, if the folder is not writable, or after a
     long wait. At worst, two processes then compile the same function.
     """
     try:
@@ -161,8 +161,8 @@ def is_kept(module: str, name: str) -> bool:
 
 
 def _kept(folder: Path, module: str, name: str) -> list[Path]:
-    """Return a function's stored machine code if no source is newer."""
-    # numba compares only with the function's own file, not with the files of called functions.
+    """Return the index files of stored machine code that are newer than all sources."""
+    # numba checks the age of the function's own file only, not of the files of called functions.
     source = max(file.stat().st_mtime for file in _sources())
     entries = _entries(folder, module, name)
     return [entry for entry in entries if entry.stat().st_mtime >= source]

@@ -82,7 +82,7 @@ def _coriolis_transposed(work, at, along):
 
 @inlined
 def _passive_derivatives(work, tree, layout, loads):
-    """Write the derivatives of springs and dampers, and zeros in all other entries."""
+    """Write the derivatives of the spring and damper forces, and zeros in all other entries."""
     size = len(tree.row)
     n, width = size - 6, 2 * size
     for entry in range(size * width):
@@ -95,7 +95,7 @@ def _passive_derivatives(work, tree, layout, loads):
 
 @inlined
 def _add_column(work, at, width, force):
-    """Add a moment and force to the base rows of a column."""
+    """Add a moment and a force to the first six rows of a column, the rows of the base."""
     for index in range(3):
         vec.add(work, at + index * width, force[0][index])
         vec.add(work, at + (3 + index) * width, force[1][index])
@@ -103,7 +103,7 @@ def _add_column(work, at, width, force):
 
 @inlined
 def _joint_derivatives(work, tree, layout):
-    """Add the derivatives over each joint, and of each joint's force over omega_b."""
+    """Add the derivatives of all forces over each joint, and of each joint's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
     spin = vec.get3(work, layout.motion)
     for body in range(len(tree.parent) - 1, 0, -1):
@@ -179,14 +179,14 @@ def differentiate(work, tree, layout, loads):
 
 @inlined
 def _invert(work, robot):
-    """Write M^-1 and the sum of its couplings, which measures its accuracy."""
+    """Write M^-1, and the sum of couplings that measures its accuracy."""
     inertia.invert_factor(work, robot.tree)
     inertia.multiply(work, robot.tree, robot.judged)
 
 
 @inlined
 def _push(work, robot):
-    """Write the derivatives over the inputs: columns of M^-1 or combinations of columns."""
+    """Write the derivatives over the inputs: columns of M^-1, or linear combinations of them."""
     size, count, carried = len(robot.tree.row), len(robot.row), len(robot.loads.input)
     square, by_u = robot.tree.square, robot.by_u
     for row in range(size):
@@ -232,7 +232,8 @@ def derive(robot, points, out, lanes, work, moves):
     c, A, by_u, judged = out
     tree, layout, loads, size = robot.tree, robot.layout, robot.loads, len(robot.tree.row)
     for block in range(0, len(q), LANES):
-        # The last block overlaps the block before, so that all lanes are filled.
+        # If the last block has fewer than eight points, it overlaps the block before and fills all
+        # lanes.
         first = min(block, len(q) - LANES)
         inertia.pack(q, first, lanes.q)
         outwards(work, tree, lanes.q)
@@ -326,7 +327,7 @@ class RowAccelerations:
 
     def sound(self, q: Array, judged: Array) -> Mask:
         """Return whether (N,) M is well-conditioned and all angles are below 1e6 rad."""
-        # A zero pivot gives NaN, for which the comparisons are false.
+        # A zero pivot gives NaN, and comparisons with NaN are false.
         q_m = q[:, 7:]
         good = (self._least_coupling < judged) & (judged < Inertia.warning_coupling)
         if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:

@@ -38,8 +38,8 @@ class Mechanics(
       amplitudes); whether the joint has a spring or damper (`springy`); and the position at which
       the spring is relaxed (`rest`).
     - `row`: the coordinate that each input drives, -1 for a body-fixed wrench.
-    - `held`: the first of each three inputs that form a vector on the base in reference axes;
-      `triads`: the same for vectors in any axes.
+    - `held`: three inputs form each vector on the base in reference axes; this is the index of the
+      first. `triads`: the same for vectors in any axes.
     - `origin` (7,): placement of the world's origin relative to the reference.
     - `faults`: the `ActuatorFaults`.
     """
@@ -48,8 +48,8 @@ class Mechanics(
 class ActuatorFaults(namedtuple("ActuatorFaults", "gain bias until turn")):
     """Actuator faults: the input is gain u + bias (nu,) for a command u, and 0 after `until` [s].
 
-    `turn` has the columns of a matrix (9,) for each vector on the base: the directions in which its
-    three inputs really act.
+    For each vector on the base, `turn` holds the three columns (9,) of a matrix: the directions in
+    which the vector's inputs actually act.
     """
 
 
@@ -114,7 +114,7 @@ def seen(robot, q):
 
 @inlined
 def apply_faults(faults, triads, t, u, given):
-    """Write the inputs that faulty actuators produce for a command u at a time."""
+    """Write the inputs that faulty actuators produce for a command u at a time t."""
     for index in range(len(faults.gain)):
         value = load(faults.gain, index) * load(u, index) + load(faults.bias, index)
         store(given, index, chosen(t, load(faults.until, index), value, 0.0))
@@ -180,7 +180,7 @@ def accelerate(work, robot, point, rates, to):
     vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
 
 
-# Offsets in the sums: impulse and displacement of the centre of mass, up to the step and within it.
+# Offsets in `sums`: impulse and displacement of the centre of mass, up to the step and within it.
 IMPULSE, SHIFT, STEP_IMPULSE, STEP_SHIFT = 0, 6, 9, 15
 SUMS = 18
 
@@ -191,8 +191,8 @@ class MomentumReference(namedtuple("MomentumReference", "start weight per_mass s
     - `start` (12,): initial momentum (6,) and centre of mass (3,), and the point (3,) to which both
       are relative.
     - `weight` (3,): mass times gravity.
-    - `sums` (18,): impulse (6,), and displacement (3,) of the centre of mass in addition to the one
-      by its initial velocity; first up to the current step, then within it.
+    - `sums` (18,): the impulse (6,), and the displacement (3,) of the centre of mass that the
+      impulse causes. The first nine entries are up to the current step, the other nine within it.
     """
 
 
@@ -250,7 +250,7 @@ def kept_at(reference, t):
 
 @inlined
 def start_at(work, robot, reference, point):
-    """Write the conserved quantities at a point whose M is already computed."""
+    """Write the initial momentum and centre of mass at a point whose M is already computed."""
     axes, tree = vec.axes_of(point.q), robot.tree
     lever = vec.get3(work, tree.inertias + 1)
     nothing = vec.minus(lever, lever)
@@ -266,7 +266,7 @@ def start_at(work, robot, reference, point):
 
 @inlined
 def _momentum_error(work, robot, nu, momentum):
-    """Return a momentum in base axes, angular and linear, minus the momentum at velocity nu."""
+    """Return a given (angular, linear) momentum in base axes minus the robot's momentum at nu."""
     tree = robot.tree
     # The base rows of M nu: the base's rigid-body block, and the first six entries of each row.
     error = vec.minus6(momentum, spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0)))
@@ -281,10 +281,10 @@ def _momentum_error(work, robot, nu, momentum):
 
 @inlined
 def impose(work, robot, reference, point, t):
-    """Set the base's position and velocity so that momentum and centre of mass equal the reference.
+    """Set the base's position and velocity so that momentum and centre of mass match the reference.
 
-    M must be evaluated at the point. The velocity is corrected by the deviation of the momentum, so
-    the rounding errors of the solution are relative to this small correction.
+    M must be evaluated at the point. Only the deviation of the momentum is solved for, so the
+    solution's rounding errors are relative to this small correction.
     """
     tree, nu = robot.tree, point.nu
     axes = vec.axes_of(point.q)
@@ -296,7 +296,7 @@ def impose(work, robot, reference, point, t):
     angular = vec.across(axes, vec.minus(angular, vec.cross(position, linear)))
     linear = vec.across(axes, linear)
     angular, linear = _momentum_error(work, robot, nu, (angular, linear))
-    # Solve with the base's rigid-body block, by the inertia about the centre of mass.
+    # Solve with the base's rigid-body block of M, using the inertia about the centre of mass.
     xx, xy, xz = vec.get3(work, tree.inertias + 4)
     yy, yz, zz = vec.get3(work, tree.inertias + 7)
     d = vec.times(lever, per_mass)

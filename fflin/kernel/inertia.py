@@ -1,10 +1,10 @@
 """The joint-space inertia M by composite rigid bodies, its sparse factors, and its inverse.
 
 All vectors are in base axes, so no vector is rotated from joint to joint. Moments are about the
-joints: about the base origin, the inertia of a light tool at the end of a long arm would lose
-digits. Row i of the packed M holds the nonzero entries up to the diagonal. Their columns are the
-coordinates on the path from the base to i. The path of every coordinate on it is the beginning of
-this path.
+joints. About the base's origin, the inertia of a light tool on a long arm would lose digits. Row i
+of the packed M holds the nonzero entries up to the diagonal. Their columns are the coordinates on
+the path from the base to i. If a coordinate is on this path, its own path is the beginning of this
+path.
 
 References
 ----------
@@ -242,7 +242,7 @@ def pack(rows, first, lanes):
 
 @inlined
 def unpack(work, start, entries, out, first, offset):
-    """Copy entries of a laned array to the rows of eight points, starting at column `offset`."""
+    """Copy entries of a laned array to the rows of eight points, from column `offset` on."""
     for entry in range(entries):
         for lane in range(LANES):
             out[first + lane, offset + entry] = work[start + entry, lane]

@@ -1,8 +1,8 @@
 """Machine code of the operations of `kernel.lanes`, for one number or for eight at once.
 
 An array with one axis holds numbers. An array with a second axis of eight holds lanes: one robot
-per lane, and one instruction for all eight. A double is valid for every lane. So a function that is
-written for one number can be compiled for eight.
+per lane, and one instruction for all eight. A single double stands for eight equal numbers. So a
+function that is written for one number can be compiled for eight.
 
 LLVM does not vectorise loops over arrays that may overlap. So eight numbers are one value of the
 vector type `Lanes`, whose operations LLVM compiles to vector instructions. If the registers of a
@@ -62,7 +62,7 @@ def _spread(builder: Any, value: Any) -> Any:
 
 
 def _alike(builder: Any, values: Any) -> list[Any]:
-    """Convert all values to lanes if one of them is lanes."""
+    """Convert all values to lanes if one of them has lanes."""
     if any(value.type == _VECTOR for value in values):
         return [_spread(builder, value) for value in values]
     return list(values)
@@ -187,7 +187,7 @@ floor, whole, root = _rounding("floor"), _rounding("rint"), _rounding("sqrt")
 
 
 def _one(builder: Any, kind: Any, index: Any, lane: Any) -> Any:
-    """Return the flat index of a lane at an index; an array without lanes has one per entry."""
+    """Return the flat index of an entry's lane; without lanes, it is the index of the entry."""
     if _held(kind) == double:
         return index
     return builder.add(builder.mul(index, ir.Constant(index.type, LANES)), lane)

@@ -18,7 +18,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 # {function of the kernel: name of the decorator that says how it is compiled}.
 HOW: dict[Callable[..., Any], str] = {}
-# {operation by NumPy: loop that is compiled in its place}.
+# {function that uses NumPy: loop that is compiled in its place}.
 LOOPS: dict[Callable[..., Any], Callable[..., Any]] = {}
 
 
@@ -31,7 +31,7 @@ def _decorator(how: str) -> Callable[[F], F]:
 
 
 inlined = _decorator("inlined")
-# For functions that are called seldom, since inlined functions take longest to compile.
+# For functions that are rarely called: inlining saves little there, and takes long to compile.
 called = _decorator("called")
 # For functions called from Python; their machine code is stored on disk.
 compiled = _decorator("compiled")
@@ -55,12 +55,12 @@ def splat(array: Any, value: float) -> Any:
 
 
 def peek(array: Any, index: int, lane: int) -> Any:
-    """Return the number of a lane at an index."""
+    """Return the value of a lane at an index."""
     return array[index]
 
 
 def poke(array: Any, index: int, lane: int, value: float) -> None:
-    """Write the number of a lane at an index."""
+    """Write the value of a lane at an index."""
     array[index] = value
 
 
@@ -100,7 +100,8 @@ def remove_components(Q: Any, size: int, count: int, x: Any, found: Any, first: 
     basis = Q[: count * size].reshape(count, size)
     components = basis.dot(x)
     x -= components.dot(basis)
-    # Orthogonalise twice: after the first pass, rounding errors leave part of the components.
+    # Orthogonalise twice, because rounding errors leave part of the components after the first
+    # pass.
     rest = basis.dot(x)
     x -= rest.dot(basis)
     np.add(components, rest, found[first : first + count])
@@ -133,8 +134,8 @@ def _row_products(a: Any, size: int, b: Any, out: Any) -> None:
 
 @called
 def _remove_components(Q: Any, size: int, count: int, x: Any, found: Any, first: int) -> None:
-    # Modified Gram-Schmidt. Least squares by it are as accurate as by Householder's method, if the
-    # right-hand side is treated as the last column of the matrix.
+    # Modified Gram-Schmidt. If the right-hand side is treated as the last column of the matrix,
+    # the least squares solution is as accurate as with Householder's method.
     for index in range(count):
         share = _row_product(Q, index * size, x, 0, size)
         _add_row(x, 0, -share, Q, index * size, size)

@@ -35,8 +35,8 @@ class Method(namedtuple("Method", "h origin shift speed nodes weights moments"))
     - `shift`: rows with the weights of v and of the stages' accelerations in the displacement after
       each stage. The last row is a second displacement after the last stage.
     - `speed`: rows with the same weights for the velocity after each stage.
-    - `origin`: 0 if a displacement starts at the configuration of the first stage, 1 if it starts
-      at the second stage.
+    - `origin`: for each displacement, 0 if it starts at the configuration of the first stage, or 1
+      if it starts at the configuration of the second stage.
     - `nodes` [s]: times of the stages.
     - `weights`, `moments`: weights of the stages in an integral and in a double integral over the
       step, including h and h^2.
@@ -44,7 +44,7 @@ class Method(namedtuple("Method", "h origin shift speed nodes weights moments"))
 
 
 class StopConditions(namedtuple("StopConditions", "squares sign")):
-    """Stop condition: squared rate bounds (6 + n,), and the sign (1,) of q0 in the chart.
+    """Stop conditions: squared bounds of the rates (6 + n,), and the sign (1,) of q0 in the chart.
 
     The sign is 0 if there is no chart. In the Python engine, rates are in the order of v (nv,).
     """
@@ -130,7 +130,7 @@ def _act(work, channel, law, robot, point, step, stage, t):
 
 @inlined
 def _move(robot, method, stages, point, stage):
-    """Move the point from a stage with known acceleration to the next, or to the step's end."""
+    """Move the point from a stage with known acceleration to the next stage or the step's end."""
     rates, along = stages.rates, stages.along
     if stage == 1:
         vec.copy(point.q, 0, stages.second, 0, len(point.q))
@@ -149,8 +149,8 @@ def advance(words, clock, last, every, rows, work):
 
     `words` represent `Arguments`. The point, the momentum reference, and the memory of policy and
     channel are updated. clock (1,) is the number of finished steps. At the first step, the initial
-    momentum and centre of mass are written into the momentum reference. If `every` is not 0, each
-    `every` steps a row is written: q, nu, u, and the reference of momentum (6,) and centre of mass
+    momentum and centre of mass are written into the momentum reference. If `every` is not 0, a row
+    is written every `every` steps: q, nu, u, and the reference of momentum (6,) and centre of mass
     (3,). `work` has `Layout.size` entries.
     """
     of = _opened(words)
@@ -201,7 +201,7 @@ class RunStatistics(
     - `law` computes states.
     - Errors are relative to the state `x_ref` (nx,), whose attitude is in the point of `path`. With
       a moving reference, they are relative to the rows `q_ref` and `nu_ref`.
-    - `kind` (nx,) is the kind of each state: 0 without a kind, -1 if its error is not recorded.
+    - `kind` (nx,) is the kind of each state: 0 if it has none, -1 if its error is not recorded.
     - An error has settled when it stays below the fraction `settled` of its largest value, or below
       `tolerance` (kinds,).
     - At the `steps` (times,), the errors of kinds and states, and the inputs, are recorded.
@@ -230,7 +230,7 @@ def _size(value):
 
 @inlined
 def _grow(stats, index, value):
-    """Replace an entry by a number if the number is larger."""
+    """Replace an entry of the statistics by a value if the value is larger."""
     store(stats, index, chosen(load(stats, index), value, value, load(stats, index)))
 
 
@@ -279,7 +279,7 @@ def take(words, rows, first, count):
         for kind in range(len(sizes)):
             value = load(sizes, kind)
             _grow(stats.largest, kind, value)
-            # A new maximum is never within the bound, so it resets the settling time.
+            # A new maximum exceeds its own bound, so it resets the settling time.
             bound = stats.settled * load(stats.largest, kind)
             bound = chosen(bound, stats.tolerance[kind], stats.tolerance[kind], bound)
             store(stats.outside, kind, chosen(bound, value, float(step), load(stats.outside, kind)))

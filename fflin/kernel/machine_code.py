@@ -1,9 +1,10 @@
 """Compilation of the kernel's functions by numba, with the functions that they call.
 
 `translated` converts a function of the kernel to a numba function. By default, numba generates
-machine code for each function together with all functions that it calls. A function ten calls deep
-would be compiled ten times. Here a part (a function called only by compiled functions) remains LLVM
-code. It is compiled once, with the function that is called from Python.
+machine code for each function together with all functions that it calls. A function at the end of a
+chain of ten calls would be compiled ten times. Here a part (a function called only by compiled
+functions) remains LLVM code. It becomes machine code only once, as a piece of the function that
+Python calls.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _WORD, _DOUBLE = ir.IntType(64), ir.DoubleType()
 
 
 class _NoEnvironments:
-    """Code generator that sets no environments, because parts have no machine code."""
+    """numba code generator that sets no environment: a part has no machine code to refer to it."""
 
     def __init__(self, codegen: Any) -> None:
         self._codegen = codegen
@@ -60,12 +61,12 @@ class PartLibrary(CPUCodeLibrary):
         return _NoEnvironments(self._codegen)
 
     def finalize(self) -> None:
-        """Close the library without optimising its code."""
+        """Mark the library as complete without optimising its code."""
         self._raise_if_finalized()
         self._finalized = True
 
     def add_linking_library(self, library: Any) -> None:
-        """Record a library whose functions are called."""
+        """Record a library whose functions this part calls."""
         super().add_linking_library(library)
         self._reload_init.update(library._reload_init)
 
@@ -186,8 +187,8 @@ def opener(kind: Struct) -> Any:
 
 
 # A product and a sum may become one fused instruction, which rounds once. A division by zero gives
-# infinity. Counting references of arrays is off, because it would take three quarters of the time.
-# So kernel functions cannot allocate arrays.
+# infinity. Reference counting of arrays is off, because it would take three quarters of the
+# running time. So kernel functions cannot allocate arrays.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
 _PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
@@ -212,7 +213,7 @@ def translated(function: Any) -> Any:
 
 
 def _counterpart(value: Any) -> Any:
-    """Return what replaces a global value of a kernel module in compiled code."""
+    """Return the value that compiled code uses in place of a global of a kernel module."""
     if isinstance(value, Opener):
         return opener(value.kind)
     if isinstance(value, ModuleType) and value.__name__.startswith("fflin.kernel."):

@@ -41,11 +41,12 @@ class Path(
 
     - `q`, `u`: rows at the knots t (N,) [s]. If the trajectory `ends` before the run, a further row
       of q, u, nu and K applies at times t > `over` [s].
-    - `shift`: cubics (4, 6 + n) in the elapsed fraction of each interval for the displacement from
-      the knot; `speed`: cubics for nu.
-    - u is linear between knots, or constant if `hold` is true. It is evaluated `ahead` [s] of the
-      time. The three inputs from each index in `held` on are in world axes.
-    - `K`: `order` coefficients in the time since the latest of `starts`; constant after `last` [s].
+    - `shift`: cubics (4, 6 + n) for the displacement from the knot; `speed`: cubics for nu. Their
+      variable is the elapsed fraction of the interval.
+    - u is linear between knots, or constant if `hold` is true. It is evaluated `ahead` [s] after
+      the current time. At each index in `held`, three inputs in world axes begin.
+    - `K`: polynomials with `order` coefficients in the time since the latest of `starts`. K is
+      constant after `last` [s].
     - `along` (6 + n,), the error `e` (nx,) and the followed `point` are work space.
     """
 
@@ -85,7 +86,7 @@ def _latest(knots, time):
 
 @inlined
 def _placed(knots, time):
-    """Return the index of the interval that contains a time, and the elapsed fraction of it."""
+    """Return the index of the interval that contains a time, and its elapsed fraction."""
     last = len(knots) - 2
     k = min(_latest(knots, time), last)
     s = (time - knots[k]) / (knots[k + 1] - knots[k])
@@ -127,7 +128,7 @@ def _follow(robot, path, t):
 
 @inlined
 def error(robot, path, point):
-    """Write the error from the followed point, in the axes of that point."""
+    """Write the error of a point from the followed point, in the axes of the followed point."""
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
     (x, y, z), w = vec.attitude(there.q)
     vector, scalar = vec.quaternion_times(((-x, -y, -z), w), vec.attitude(q))
@@ -149,7 +150,7 @@ def error(robot, path, point):
 
 @inlined
 def track(robot, path, point, u, t):
-    """Write the inputs u* - K e at a time of the run."""
+    """Write the inputs u* - K e at the time t of the run."""
     after = _follow(robot, path, t)
     error(robot, path, point)
     starts, count, width = path.starts, len(path.point.u), len(path.e)
@@ -186,8 +187,8 @@ class Law(
       the next row, and the rows repeat.
     - `turned`: whether omega_b and v_b of the state are in reference axes.
     - `origin` (rows, 7): placement of the world's origin relative to the pose at which x is 0.
-      `near` (rows, n): positions that decide which turn of a continuous joint is used. Both have
-      one row per sample; the last row stays valid to the end.
+      `near` (rows, n): positions to which the angles of continuous joints are unwrapped. Both have
+      one row per sample; after the last sample, the last row applies.
     - `u`: the command, which `allocation` distributes if it has inputs.
     """
 
@@ -201,7 +202,7 @@ class Grid(namedtuple("Grid", "joint first values stride K offset at")):
 
 
 class Gyros(namedtuple("Gyros", "body axes")):
-    """Bodies (k,) with a gyroscope, and the columns (9 k,) of its axes in body axes."""
+    """Bodies (k,) with a gyroscope, and the gyroscopes' axes (9 k,) as columns in body axes."""
 
 
 class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
@@ -281,7 +282,7 @@ def _measure(work, robot, law, point, count):
 
 @inlined
 def _times(matrix, row, x):
-    """Return a row of a matrix times a vector."""
+    """Return the scalar product of a row of a matrix and a vector."""
     total, width = splat(x, 0.0), len(x)
     for index in range(width):
         total = total + load(matrix, row * width + index) * load(x, index)
@@ -290,7 +291,7 @@ def _times(matrix, row, x):
 
 @inlined
 def command(work, robot, law, point, t, count, stage):
-    """Write the commands of a policy at sample number `count` and a stage of a step."""
+    """Write the commands of a policy at sample number `count`, for one stage of a step."""
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
         return
@@ -305,7 +306,7 @@ def command(work, robot, law, point, t, count, stage):
 
 @inlined
 def _feed_back_between(robot, law, point):
-    """Write the commands by interpolating the feedback laws of a grid, lane by lane."""
+    """Write the commands that the interpolated feedback laws of a grid give, lane by lane."""
     grid, y, u = law.grid, law.y, law.u
     inputs, size = len(u), len(y)
     for axis in range(len(grid.joint)):
@@ -325,7 +326,7 @@ def _feed_back_between(robot, law, point):
 
 @inlined
 def _corner(grid, corner, lane):
-    """Return the interpolation weight of a corner of a lane's grid cell, and its gain's index."""
+    """Return a corner of a lane's grid cell as its interpolation weight and its gain's index."""
     weight, cell = 1.0, 0
     for axis in range(len(grid.joint)):
         first, last = grid.first[axis], grid.first[axis + 1] - 1

@@ -34,7 +34,7 @@ def joint_axis(work, tree, body):
 
 @inlined
 def motion_cross(velocity, along):
-    """Return velocity x along, the rate of a motion vector that is fixed in a moving body."""
+    """Return `velocity` x `along`: the rate of a motion vector that is fixed in a body."""
     w, v = velocity
     return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
 
@@ -54,7 +54,7 @@ def at_parent(work, place, force):
 
 @inlined
 def move_bodies(work, tree, layout, nu):
-    """Write velocities, and accelerations without c, outwards; v_b is taken as zero."""
+    """Write velocities and accelerations without c, from the base outwards, for v_b = 0."""
     for entry in range(MOTION):
         store(work, layout.motion + entry, 0.0)
     vec.put3(work, layout.motion, vec.get3(nu, 0))
@@ -111,7 +111,7 @@ def load_momenta(work, tree, layout, loads):
         w, v = vec.get6(work, layout.motion + body * MOTION + VELOCITY)
         h = vec.get3(work, own + 1)
         vec.put3(work, at + MOMENTUM, spatial_inertia_times(work, own, (w, v))[1])
-        # The second moments of mass are tr(I) / 2 times the identity, minus I.
+        # The matrix of second moments of mass is tr(I) / 2 times the identity, minus I.
         xx, xy, xz = vec.get3(work, own + 4)
         yy, yz, zz = vec.get3(work, own + 7)
         trace = 0.5 * (xx + yy + zz)
@@ -137,7 +137,7 @@ def stored_momentum(work, tree, loads, index):
 
 @inlined
 def carried_wrench(work, tree, loads, index):
-    """Return the wrench per unit of a body-fixed input, at the joint of its body."""
+    """Return the wrench of a unit body-fixed input about its body's joint, in base axes."""
     axes = vec.get_columns(work, tree.places + loads.body[index] * PLACE)
     moment, force = vec.get6(loads.wrench, 6 * index)
     return vec.product(axes, moment), vec.product(axes, force)
@@ -164,7 +164,7 @@ def write_columns(work, tree, layout, loads):
 
 @inlined
 def collect(work, tree, layout):
-    """Sum the forces of the bodies over subtrees, inwards, and write the bias forces."""
+    """Sum the bodies' forces over subtrees, from the tips inwards, and write the bias forces."""
     for index in range(len(tree.row)):
         store(work, layout.bias + index, 0.0)
     for body in range(len(tree.parent) - 1, 0, -1):
@@ -178,7 +178,7 @@ def collect(work, tree, layout):
 
 @inlined
 def collect_momenta(work, tree, layout):
-    """Sum the momenta of the bodies over subtrees, inwards."""
+    """Sum the bodies' momenta over subtrees, from the tips inwards."""
     for body in range(len(tree.parent) - 1, 0, -1):
         at = layout.load + body * LOAD
         above = layout.load + tree.parent[body] * LOAD
@@ -194,7 +194,7 @@ def collect_momenta(work, tree, layout):
 
 @inlined
 def accelerate_bodies(work, tree, layout):
-    """Add the contributions of c: accelerations and Psi'' outwards, then forces inwards."""
+    """Add what c contributes to accelerations and Psi'' (outwards), then to forces (inwards)."""
     vec.put6(work, layout.motion + ADDED, vec.get6(work, layout.c))
     for body in range(1, len(tree.parent)):
         at = layout.motion + body * MOTION

@@ -40,12 +40,13 @@ class Tree(
 
     - `parent`: its parent body.
     - `fixed` (12): rotation columns and origin of its joint in the parent, with z along the axis.
-    - `index`, `unbounded`: its joint's entry of q, and whether the entry is the cosine of an angle.
+    - `index`, `unbounded`: the index of its joint in q, and whether q has the cosine of an angle
+      there.
     - `turns`, `slides`: rotation about z and translation along z per unit of the joint coordinate.
     - `bodies` (10): m, m c, and inertia about the joint's origin as xx xy xz yy yz zz. It has a
       second axis of 8 if lanes differ.
-    - `axes`: rotation from these axes to Pinocchio's joint axes.
-    - `coordinate`, `factor`: the coordinate that moves the joint, and the joint's motion per unit.
+    - `axes`: rotation from the axes of `fixed` to Pinocchio's joint axes.
+    - `coordinate`, `factor`: the coordinate that moves the joint, and the motion per unit of it.
 
     `armature` is the inertia of rotors on the diagonal of M. Fields of the packed M:
 
@@ -53,7 +54,8 @@ class Tree(
     - `path`: the coordinate of each entry.
     - `common`: the number of coordinates that two rows have in common.
     - `target`, `share`: for each pair of a body and a body on its path inwards, the entry to which
-      the pair contributes, and its factor; after these, the first of the base's six entries.
+      the pair contributes, and the factor of the contribution. After the pairs of a body comes the
+      first of the base's six entries in its row.
 
     `entries` is the number of entries of the packed M. The following fields are offsets of the
     parts of the work space, and `size` is the size of the work space.
@@ -61,19 +63,19 @@ class Tree(
 
 
 class Layout(namedtuple("Layout", "motion load bias c columns lower held size")):
-    """Offsets of the arrays in the kernel's work space after the tree's arrays, and its size."""
+    """Offsets of the arrays that follow the tree's arrays in the work space, and its size."""
 
 
 class Loads(namedtuple("Loads", "body wrench input stored_body stored stiffness damping")):
     """Body-fixed inputs (body, unit wrench at its joint, index), stored momenta, and springs."""
 
 
-# Trees of the robots that exist; robots do not change.
+# Each robot's tree is computed once, because robots do not change.
 _TREES: WeakKeyDictionary[Robot, Tree | None] = WeakKeyDictionary()
 
 
 def batch_tree(robot: Robot) -> Tree | None:
-    """Return a robot's tree; None in orbit, or if a joint is no screw about a fixed axis."""
+    """Return a robot's tree; None in orbit, or if a joint is not a screw about a fixed axis."""
     if robot not in _TREES:
         _TREES[robot] = _tree(robot)
     return _TREES[robot]
@@ -115,7 +117,7 @@ def _tree(robot: Robot) -> Tree | None:
         target.append(row[coordinate[body]])
         share.append(factor[body])
     size = 6 + robot.n
-    # Number of coordinates that the paths of each two coordinates have in common.
+    # For each two coordinates, the number of coordinates that their paths have in common.
     common = np.array([[len({*one} & {*other}) for other in paths] for one in paths])
     entries = int(sum(map(len, paths)))
     parts = bodies * PLACE, bodies * INERTIA, bodies * INERTIA
@@ -165,7 +167,7 @@ def _screw(model: pin.Model, joint: Any) -> tuple[pin.SE3, float, float] | None:
 
 
 def _coordinates(robot: Robot) -> tuple[list[int], list[float]]:
-    """Return the coordinate that moves each body's joint, and the joint's motion per unit."""
+    """Return the coordinate that moves each body's joint, and the joint's motion per unit of it."""
     at = {joint.idx_v: (6 + index, joint.scale) for index, joint in enumerate(robot.joints)}
     for joint, leader, multiplier, _ in robot.followers:
         at[joint.idx_v] = (at[leader.idx_v][0], multiplier)
@@ -174,7 +176,7 @@ def _coordinates(robot: Robot) -> tuple[list[int], list[float]]:
 
 
 def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> Array:
-    """Return the rotor inertias that all joints of each coordinate add to M."""
+    """Return, for each coordinate, the rotor inertia that its joints add to the diagonal of M."""
     of_joints = model.armature
     armature = np.zeros(1 + max(coordinate))
     armature[:3], armature[3:6] = of_joints[PIN_ANGULAR], of_joints[PIN_LINEAR]
@@ -187,8 +189,8 @@ def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> A
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
     """Return the columns of each row of the factor, ending with its diagonal."""
     # With mimic joints, one coordinate moves several bodies, whose ancestors may be on different
-    # branches. Fill-in of the factor joins the ancestors' coordinates to one path (Liu's
-    # elimination tree).
+    # branches. Fill-in during the factorisation joins the coordinates of these ancestors to one
+    # path (Liu's elimination tree).
     reached: list[set[int]] = [set(range(index)) if index < 6 else set() for index in range(size)]
     for body in range(1, len(parent)):
         above = body

@@ -1,4 +1,4 @@
-"""Vectors (3), spatial vectors, attitudes and displacements, whose entries are numbers or lanes.
+"""Vectors (3), spatial vectors, attitudes and displacements; entries are numbers or lanes.
 
 A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force). A
 displacement has the order of the state: the base's rotation and translation in base axes, then the
@@ -147,7 +147,7 @@ def times6(s, value):
 def cosine_and_sine(x):
     """Return the cosine and sine of |x| < 1e6, accurate to one unit in the last place.
 
-    x is reduced to an octant in three steps, in which polynomials are evaluated. All coefficients
+    Three subtractions reduce x to |x| <= pi/4, where polynomials are evaluated. All coefficients
     are from fdlibm (Sun Microsystems, 1993).
     """
     turns = floor(x * (2.0 / np.pi) + 0.5)
@@ -230,7 +230,7 @@ def axes_of(q):
 
 @inlined
 def displace(tree, q, along, out):
-    """Displace q along a tangent vector and write the result; the base moves by the exponential."""
+    """Write q displaced along a tangent vector; the base moves by the exponential map."""
     w, v = get3(along, 0), get3(along, 3)
     square = dot(w, w)
     quarter = 0.25 * square

@@ -48,23 +48,25 @@ class Row(NamedTuple):
 
 
 _EPS = float(np.finfo(float).eps)
-# Rounding error [ulp] of a difference of outputs: two ulp from its weights, some from each output.
+# Rounding error [ulp] of a finite difference of outputs: its weights add two ulp, and the outputs
+# the rest.
 _ULPS = 8.0
 
-# Rounding error [ulp] of the accelerations whose difference approximates a derivative.
+# Rounding error [ulp] of the accelerations in a finite difference.
 _STEP_ULPS = 64.0
 
-# Tolerances for the analytic computation, relative to the largest entry of a block. The second is
-# for each unit of the condition number of M. It allows for a long chain of operations. The first
-# is the least tolerance, for a well-conditioned M.
+# Tolerances for the analytic computation, relative to the largest entry of a block. The first is
+# the least tolerance, for a well-conditioned M. The second is multiplied by the condition number
+# of M, and allows for a long chain of operations.
 _ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
-# The same for differences of sixth order, whose step size costs about four digits more.
+# Tolerances for sixth-order finite differences. Their step size costs about four more digits.
 _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
 
 # Assumed ratio of the error of ABA's derivatives to the residual of ABA's M^-1.
 _ROUTE_SAFETY = 10.0
 
-# Largest tolerance, even for an ill-conditioned M. A larger one would confirm less than two digits.
+# Largest tolerance, even for an ill-conditioned M. With a larger one, the check would confirm
+# fewer than two digits.
 _LOOSEST = 1e-2
 
 
@@ -106,7 +108,7 @@ class Check:
         return tuple(row for row in self.rows if not row.ok)
 
     def __str__(self) -> str:
-        """Return a text with the verdict and the largest error of each kind of comparison."""
+        """Return a text with the verdict, and with the largest error of each kind of comparison."""
         if failures := self.failures:
             names = [f"{row.block} ({row.test})" for row in failures[:6]]
             names += ["..."] * (len(failures) > 6)
@@ -177,7 +179,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 
 
 def held_to(tolerance: float | None, found: Check) -> Check:
-    """Return the errors with a given tolerance for all of them; None keeps their tolerances."""
+    """Replace the tolerance of every error in a check by the given one; None changes nothing."""
     if tolerance is None:
         return found
     rows = tuple(row._replace(tolerance=share("tolerance", tolerance)) for row in found.rows)
@@ -199,15 +201,15 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     A, B, inverse = aba_route(state, aba, q, v, lin.u0, moving=lin.moving)
     chart = state.chart(q)
     base_M = state.to_base(chart, state.to_base(chart, M).T).T
-    # Links far apart cost ABA digits that M keeps. ABA's derivatives are as inaccurate as its M^-1,
-    # whose error is the residual of M M^-1 = I.
+    # If links are far apart, ABA loses digits that M retains. ABA's derivatives are as inaccurate
+    # as its M^-1, and the error of M^-1 is the residual of M M^-1 = I.
     own_error = inertia_residual(base_M, inverse)
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     rows = [
         Row("ABA derivatives", *block, by_aba) for block in compare(state, actuation, lin, M, A, B)
     ]
     (steps, input_steps), nx = difference_steps(state, lin, M), state.nx
-    # f has terms beyond second order only in the attitude and the joint positions.
+    # Only over the attitude and the joint positions does f have terms beyond second order.
     bends = np.zeros(nx + len(input_steps), dtype=bool)
     bends[state.groups.q_b] = bends[state.groups.q_m] = True
     point, every = np.concatenate((lin.x0, lin.u0)), np.concatenate((steps, input_steps))
@@ -236,7 +238,7 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
 
 
 def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
-    """Check many models, and return the largest ratio of error to tolerance for each row."""
+    """Check many models; return the largest ratio of error to tolerance in each row of errors."""
     worst: dict[tuple[str, str], Row] = {}
     aba: Aba | None = None
     for lin in models:
@@ -251,9 +253,9 @@ def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
 def _point_errors(
     model: Nonlinear, lin: LinearModel, M: Array, q: Array, v: Array
 ) -> list[tuple[str, float]]:
-    """Return the errors of x0 and of each group of f0.
+    """Return the errors of x0 and of each state group of f0.
 
-    Errors of f0 are relative to the largest terms that may cancel in the group.
+    Errors of f0 are relative to the largest terms that may cancel within a state group.
     """
     state = model.state
     mobility, input_mobility = mobilities(M, lin.B)
@@ -297,7 +299,7 @@ def _output_rows(
     of_x, of_u = (np.ones(len(each), dtype=bool) for each in (step_x, step_u))
     C = jacobian(lambda rows: np.array([y(x, lin.u0) for x in rows]), lin.x0, step_x, of_x)
     D = jacobian(lambda rows: np.array([y(lin.x0, u) for u in rows]), lin.u0, step_u, of_u)
-    # Derivatives smaller than the rounding error of y divided by the step are noise.
+    # A derivative is noise if it is smaller than the rounding error of y divided by the step.
     scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
     for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
 
-# Rounding errors of M a and of the accelerations, relative to the terms that they sum.
+# Rounding errors of M a and of the accelerations, relative to the summed terms.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
@@ -215,7 +215,7 @@ class _Balance:
         self.residual, self.tolerance = self.left / mobility, rounding + terms
 
     def newton_step(self, linearizer: Linearizer, soft: Mask) -> Array:
-        """Return Newton's step (6 + n,), which moves only the coordinates in the mask `soft`."""
+        """Return the Newton step (6 + n,) that moves only the coordinates in the mask `soft`."""
         robot, lin = linearizer.robot, linearizer(self.lin.q, self.lin.v, self.u)
         hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
         own = np.sqrt(robot.springs.stiffness[soft[6:]])
@@ -231,7 +231,7 @@ class _Balance:
 
 
 def _require_steady(lin: LinearModel, drift: Array) -> None:
-    """Raise `EquilibriumError` if a joint moves on whose position the forces depend."""
+    """Raise `EquilibriumError` if a joint moves and the forces depend on its position."""
     moving = [
         f"{name} at {rate:.3g} {unit}/s"
         for name, unit, rate in zip(lin.state_names, lin.state_units, drift.tolist(), strict=True)
@@ -257,7 +257,7 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
 
 
 def _rounding(robot: Robot, lin: LinearModel, M: Array) -> Array:
-    """Return bounds of the rounding errors of the forces (6 + n,), where large terms cancel."""
+    """Return bounds of the rounding errors (6 + n,) that cancelling terms leave in the forces."""
     state = StateMap(robot)
     field = field_of(robot, lin.frame)
     speed = np.abs(state.velocities(field.absolute(lin.q, lin.v) if field else lin.v))
@@ -271,7 +271,7 @@ def _rounding(robot: Robot, lin: LinearModel, M: Array) -> Array:
 def _unbalanced(
     robot: Robot, residual: Array, sizes: Array, pushes: dict[str, str]
 ) -> EquilibriumError:
-    """Return the error that names the residual forces, largest effect first."""
+    """Build the error that names the residual forces, the largest effect first."""
     named = list(pushes.items())
     left = [
         f"{named[i][0]} {residual[i]:.3g} {named[i][1]}"
@@ -299,8 +299,8 @@ def least_norm(C: Array, d: Array, one_sided: Mask) -> tuple[Array, Array]:
 
         least, most = np.where(one_sided, 0.0, -np.inf), np.full(len(u), np.inf)
         u = nearest(C, d, least, most)
-        # Solve again without bounds for the nonzero inputs, to remove the rounding errors of the
-        # bounded problem.
+        # Solve again for the nonzero inputs alone, without bounds. This removes the rounding
+        # errors of the bounded solution.
         pushing = ~one_sided | (u > TOLERANCE * float(np.abs(u).max(initial=0.0)))
         polished: Array = np.zeros(len(u))
         polished[pushing] = _pseudo_solve(C[:, pushing], d)
@@ -313,6 +313,6 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
     """Return the minimum-norm u that minimises ``|C u - d|``."""
     u: Array = np.linalg.lstsq(C, d, rcond=None)[0]
     u += np.linalg.lstsq(C, d - C @ u, rcond=None)[0]
-    # Inputs below the rounding error of the largest input are noise, and set to zero.
+    # Inputs below the rounding error of the largest input are only noise, so they are set to zero.
     u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
     return u

@@ -281,7 +281,7 @@ def from_tool(
 def _jacobians_at(
     robot: Robot, lin: LinearModel, tool: str
 ) -> tuple[ToolCoordinates, Jacobians, Jacobians, Array]:
-    """Return a tool's coordinates, the derivatives of the model's and tool's states, and dy/dt."""
+    """Return a tool's coordinates, the Jacobians of the model and of the tool, and dy/dt."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError("lin lacks some states of the robot; use the full model of the robot")
@@ -296,14 +296,14 @@ def _jacobians_at(
 
 
 def transformed(source: Jacobians, to: Jacobians, A: Array, B: Array) -> tuple[Array, Array]:
-    """Transform A and B from one set of coordinates to another (15.3), (15.4)."""
+    """Transform A and B from the coordinates `source` to the coordinates `to` (15.3), (15.4)."""
     B = source.left @ B @ np.linalg.inv(source.V)
     A = source.left @ (A @ source.P - source.rate) + B @ (to.H - source.H)
     return (to.P @ A + to.rate) @ to.left + to.extra, to.P @ B @ to.V
 
 
 def _step(tool: str, dt: float | None) -> float:
-    """Return the checked time step, or 0 without one."""
+    """Return the checked time step, or 0 if dt is None."""
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(
@@ -325,6 +325,6 @@ def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array
 
 
 def _difference(name: str, given: ArrayLike | None, expected: Array) -> Array:
-    """Return the caller's matrix minus the expected matrix, or zero without a matrix."""
+    """Return the caller's matrix minus the expected matrix, or zeros if no matrix is given."""
     array = expected if given is None else shaped(name, given, expected.shape)
     return np.asarray(array - expected)

@@ -2,9 +2,9 @@
 
 A model in csv consists of several tables: one for each matrix, with names of rows and columns; one
 each for the states, inputs and outputs; one for the point in Pinocchio's order; and the table
-``info`` of texts and numbers, whose last line is the digest of all tables. The last column of a
-trajectory in csv repeats the digest of the other columns in every row. So other programs can read
-the columns by their names.
+``info`` of texts and numbers, whose last line is the digest of all tables. In a trajectory in csv,
+every row of the last column repeats the digest of the other columns. So the file has no extra
+lines, and other programs can read the columns by their names.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 FORMATS = (*record.FORMATS, ".csv")
 
 _SIGNALS = ("state", "input", "output")
-# Fields of a model in a file; each array with the kind of names along its dimensions.
+# Arrays of a model in a file: {field: kind of name along each dimension}.
 _ARRAYS: dict[str, tuple[str, ...]] = {
     "A": ("state", "state"),
     "B": ("state", "input"),
@@ -169,7 +169,7 @@ def _tables(entries: Record) -> dict[str, list[list[object]]]:
 
 
 def _columns_of(signal: str) -> list[str]:
-    """Return the entries that are the columns of a signal's table."""
+    """Return the entries of a model that form the columns of a signal's table."""
     vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
     return [f"{signal}_names", f"{signal}_units", *vectors]
 
@@ -206,7 +206,7 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
 
 
 def foreign_table(path: Path) -> Path | None:
-    """Return a file that a table of the model NAME.csv would overwrite, if it is not a model's."""
+    """Return a file that saving NAME.csv would overwrite and that no model wrote, or None."""
     info = _csv_path(path, "info")
     own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
     tables = [] if own else [_csv_path(path, key) for key in _TABLES]
@@ -310,7 +310,7 @@ def _digest(table: Sequence[Sequence[object]]) -> str:
 
 
 def _columns(path: Path) -> tuple[Record, bool]:
-    """Return the columns of a csv as {name: texts}, and whether a digest verifies them."""
+    """Return the columns of a csv as {name: texts}, and whether their digest was verified."""
     lines = csv.reader(io.StringIO(read_file(path, ".csv").decode("utf-8-sig"), newline=""))
     header, *rows = [[cell.strip() for cell in line] for line in lines if any(line)]
     if len({*header}) < len(header):
@@ -349,7 +349,8 @@ def _entries(columns: Record, state: StateMap) -> Record:
             raise unknown("state or input", name, (*known, *inputs))
     entries: Record = {key: columns[key][0] for key in ("hold", "frame") if key in columns}
     acting = [name for name in inputs if name in columns]
-    # The last row of inputs may be empty, because held inputs need none at the last knot.
+    # The last row of inputs may be empty: inputs that are constant between knots have no value
+    # there.
     short = bool(acting) and not any(columns[name][-1] for name in acting)
     for key, names in rows.items():
         entries[key] = np.column_stack([_numbers(name, columns[name]) for name in names])

@@ -16,7 +16,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
-# Names and units of signals, in the same order.
+# Names of signals, and their units in the same order.
 Signals: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
 
 
@@ -25,7 +25,7 @@ def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
     made, actuation = f"the model was made for '{lin.robot}'", Actuation(state)
     inputs = (lin.input_names, lin.input_units)
     require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
-    # A reduced model has only some of the states.
+    # A reduced model may lack states of the robot, so only its own states are compared.
     units = dict(zip(state.names, state.units, strict=True))
     there = tuple(name for name in lin.state_names if name in units)
     states = (lin.state_names, lin.state_units)

@@ -17,13 +17,14 @@ from fflin.dynamics.state import StateMap
 from fflin.robot.mass_properties import rotor_names
 
 # Steps are halved until the end of an interval has this accuracy, relative to the largest rates.
+# There are at most _MOST_STEPS steps.
 _ACCURACY, _MOST_STEPS = 1e-8, 128
 
-# Rounding errors of positions, and of accelerations relative to the terms that they sum.
+# Rounding errors of positions, and of accelerations relative to the summed terms.
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
-# Times within this fraction of an interval from a knot are taken as the knot.
+# A time that is less than this fraction of an interval away from a knot counts as the knot.
 _NEAR = 1e-9
 
 
@@ -41,11 +42,11 @@ class Flow:
 
     @cached_property
     def residual(self) -> Array:
-        """Errors (N - 1,) of the ends of all intervals; see `interval_errors`."""
+        """Error (N - 1,) at the end of each interval; see `interval_errors`."""
         return self.interval_errors(range(len(self._t) - 1))
 
     def interval_errors(self, intervals: Iterable[int]) -> Array:
-        """Return the relative errors of the integrated ends of intervals from the next knots."""
+        """Return the relative errors at the ends of integrated intervals, from the next knots."""
         # Rates are relative to an observer who moves at the base's median velocity (Galilean
         # invariance), and each rotor has its own scale. So neither a high orbital velocity nor a
         # fast wheel hides an error.
@@ -77,7 +78,8 @@ class Flow:
             return float(np.maximum(miss, jump).max())
 
         found, steps = [], 1
-        # Knots that are not a motion of the robot may diverge. The residual reports this.
+        # If the knots are not a motion of the robot, the integration may diverge. The residual
+        # shows it.
         with np.errstate(all="ignore"):
             for k in intervals:
                 steps, h = max(1, steps // 4), float(t[k + 1] - t[k])
@@ -109,7 +111,7 @@ class Flow:
         return q, v
 
     def at(self, t: float) -> tuple[Array, Array, Array]:
-        """Return q, v and u (base axes) at a time, from cubics with the robot's accelerations."""
+        """Return q, v and u (base axes) at a time, by cubics that match the accelerations."""
         q, v, u = self.points(np.array([t]))
         return q[0], v[0], u[0]
 
@@ -138,12 +140,12 @@ class Flow:
         return actuation.in_base_axes(state.charts(q), u) if actuation.held else u
 
     def rate(self, q: Array, v: Array, u: Array) -> Array:
-        """Return dv/dt (nv,) under inputs in the frame's axes."""
+        """Return dv/dt (nv,) for inputs u in the frame's axes."""
         return self._aba.acceleration(q, v, self._in_base_axes(q, u)).copy()
 
     @cached_property
     def cubics(self) -> tuple[Array, Array]:
-        """Coefficients (N - 1, 4, nv) of the displacement from the first knot, and of v."""
+        """Coefficients (N - 1, 4, nv) of v and of the displacement from each interval's start."""
         q, v, h = self._q, self._v, np.diff(self._t)[:, None]
         begin = np.array([self.rate(*each) for each in zip(q, v, self._u, strict=True)])
         end = begin[1:]
@@ -151,7 +153,8 @@ class Flow:
             end = np.array([self.rate(*each) for each in zip(q[1:], v[1:], self._u, strict=False)])
         apart = np.array([pin.difference(self._model, *pair) for pair in pairwise(q)])
         wheels = [joint.idx_v for joint in self._aba.state.robot.joints if joint.unbounded]
-        # The knots give the angle of a wheel only up to full turns. Its speed gives their number.
+        # The knots give the angle of a wheel only up to full turns. The wheel's speed gives the
+        # number of turns.
         turns = (0.5 * h * (v[1:] + v[:-1]) - apart)[:, wheels] / (2.0 * np.pi)
         apart[:, wheels] += 2.0 * np.pi * np.round(turns)
         slopes = [
@@ -165,14 +168,14 @@ class Flow:
 
 
 def _largest(rows: list[Array]) -> Array:
-    """Return the largest magnitudes (nv,) of rows, without entries that overflow."""
+    """Return the largest magnitudes (nv,) over rows; infinite or NaN entries count as zero."""
     sizes = np.abs(rows)
     largest: Array = np.where(sizes < np.inf, sizes, 0.0).max(axis=0)
     return largest
 
 
 def interval_of(t: Array, time: float) -> tuple[int, float]:
-    """Return the index of the interval that contains a time, and the elapsed fraction of it."""
+    """Return the index of the interval that contains a time, and its elapsed fraction."""
     last = len(t) - 2
     k = max(0, min(int(t.searchsorted(time, "right")) - 1, last))
     fraction = float((time - t[k]) / (t[k + 1] - t[k]))

@@ -256,7 +256,7 @@ def along(motion: Trajectory) -> LinearTrajectory:
 # Steps are halved until the transition matrix of a sample has this accuracy.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
-# Number of samples that are integrated at once.
+# Number of samples that one call integrates.
 _BATCH = 64
 
 
@@ -299,13 +299,14 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
 
 
 def _agree(whole: Array, coarse: Array) -> bool:
-    # Half steps are 16 times as accurate. A factor of 4 of this is assumed, the rest is a reserve.
+    # Half steps reduce the error 16 times. The estimate assumes only 4 times, to be on the safe
+    # side.
     apart, size = (np.abs(each).max(axis=0) for each in (whole - coarse, whole))
     return bool((0.25 * apart <= _ACCURACY * size).all())
 
 
 def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:
-    """Return the steps and transition of samples, with `parts` steps between their cuts."""
+    """Return the steps and the transition matrix of each sample, `parts` steps between cuts."""
     fraction = np.arange(parts) / parts
     start = [(t[:-1, None] + np.diff(t)[:, None] * fraction).ravel() for t in cuts]
     h = np.concatenate([np.repeat(np.diff(t) / parts, parts) for t in cuts])

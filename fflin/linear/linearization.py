@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Data that are the same for all points of linearisation of a robot; arrays are read-only."""
+    """Data that all points of linearisation of a robot share; arrays are read-only."""
 
     robot: Robot
     map: StateMap
@@ -61,7 +61,7 @@ class Prepared:
         return {**self.common, **self.rest, "_computed": asked, **other}
 
     def kernel(self) -> RowAccelerations:
-        """Return the compiled accelerations; raise `InputError` if the robot has none."""
+        """Return the compiled accelerations; raise `InputError` if they are not available."""
         from fflin.kernel.derivatives import RowAccelerations
         from fflin.kernel.tree import batch_tree
 
@@ -177,8 +177,9 @@ _STANDING: Chart = Standing()
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     """Return the names of the ignorable coordinates of a linear model of this robot."""
-    # They depend on the robot, not on the point. Uniform gravity is the same everywhere. Without
-    # gravity, error dynamics do not depend on the attitude. In orbit, position and attitude matter.
+    # The ignorable coordinates depend on the robot, not on the point. The position is ignorable
+    # because uniform gravity is the same everywhere. Without gravity, the error dynamics do not
+    # depend on the attitude either. In orbit, position and attitude both matter.
     if robot.orbit:
         return tuple(f"q_m.{name}" for name in rotor_names(robot))
     groups = ["r_b"] if any(robot.gravity) or not lin.moving else ["q_b", "r_b"]
@@ -278,9 +279,10 @@ class Linearizer:
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
-        # Default velocity and inputs: rest and zero.
+        # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
-        # If only inputs act at rest, a model at rest is known in advance except for M^-1 in B.
+        # Without springs, gravity, orbit and stored momentum, all of a model at rest except M^-1
+        # in B is known in advance.
         self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
@@ -303,7 +305,7 @@ class Linearizer:
                 return self._anywhere(q, v, u)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A copy needs its own work space, so it is built from the arguments.
+        # A copy needs its own work space, so it is built anew from the constructor's arguments.
         ready = self.prepared
         reference = None if ready.own_reference else ready.map.reference
         options: dict[str, Any] = {"frame": ready.map.frame, "reference": reference}

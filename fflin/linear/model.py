@@ -162,8 +162,8 @@ class LinearModel(StateSpace):
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     _drift: Array | None = None
-    # Of a discrete-time model: its fingerprint and its continuous-time model, which still has the
-    # exact zeros that the matrix exponential loses.
+    # For a discrete-time model: its fingerprint, and the continuous-time model from which it was
+    # made. The latter has exact zeros that the matrix exponential loses.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
@@ -456,6 +456,6 @@ def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
 
 
 def same_certificate(whole: LinearModel, fingerprint: str, made: LinearModel) -> Certificate:
-    """Return the certificate of a continuous-time model, if a model made from it is unchanged."""
+    """Return a continuous-time model's certificate if the model made from it is unchanged."""
     made.require(fingerprint)
     return whole.certificate

@@ -40,9 +40,9 @@ def assemble(
 ) -> Array:
     """Complete A (.., nx, nx) and the lower half of B at one or many points; return f0 (.., nx).
 
-    On entry, the upper half of A is the one of `at_rest`. `rates.slopes` is a view of the lower
-    half of A, and `rates.by_u` a view of the lower half of B. Both are converted in place from base
-    axes to the chart and the frame.
+    On entry, the upper half of A is the upper half of `at_rest`. `rates.slopes` is a view of the
+    lower half of A, and `rates.by_u` a view of the lower half of B. Both are converted in place
+    from base axes to the chart and the frame.
     """
     g, nv, lower = state.groups, state.nx // 2, rates.slopes
     omega_in_reference, v_in_reference = state.axes
@@ -53,7 +53,7 @@ def assemble(
     theta = _over_rotations(state, actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
 
-    # Attitude and position; at the reference, the remaining blocks are those of `at_rest`.
+    # Rows of attitude and position. At the reference, the other blocks are as in `at_rest`.
     if moving:
         A[..., g.q_b, g.q_b] = A[..., g.r_b, g.r_b] = -W  # (5.2), (5.3)
     else:
@@ -68,7 +68,7 @@ def assemble(
         if not v_in_reference:
             A[..., g.r_b, g.v_b] = chart.R
 
-    # Accelerations, still in base axes.
+    # Rows of the accelerations, which are still in base axes.
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
         # The columns of the base's linear velocity are zero, so they need no rotation.
@@ -103,16 +103,16 @@ def _over_rotations(
     rates: AccelerationDerivatives,
     W: Array,
 ) -> Array:
-    """Return the derivatives Theta (.., 6 + n, 3) of `rates` over base rotations (4.4)."""
+    """Return the derivatives (.., 6 + n, 3) of the accelerations over base rotations (4.4)."""
     omega_in_reference, v_in_reference = state.axes
-    # `by_turn`, the derivative in base axes, is zero without an orbit, so whenever omega is in
-    # reference axes; it is converted in place.
+    # `by_turn` is the derivative in base axes, and is converted in place. It is zero without an
+    # orbit, and so also if omega is in reference axes.
     theta, c = rates.by_turn, rates.c
     if omega_in_reference:
         theta = product(rates.by_nu[..., ANGULAR], W)
     for columns in actuation.held if np.count_nonzero(u) else ():
         theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
-    # A name for each part, because `x[part] -= y` would copy the part onto itself.
+    # Each part has its own name, because `x[part] -= y` would also copy the part onto itself.
     turning, shifting = theta[..., ANGULAR, :], theta[..., LINEAR, :]
     if omega_in_reference:
         turning -= skew(c[..., ANGULAR])
@@ -126,7 +126,7 @@ def _over_rotations(
 
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
-    """Return the state derivative (.., nx) of a moving reference, see below (5.3)."""
+    """Return the state derivative (.., nx) of a moving reference; see below (5.3)."""
     weight = (gravity * gravity).sum(axis=-1, keepdims=True) if state.falls else np.zeros(1)
     if not np.count_nonzero(weight):
         return f0

@@ -20,7 +20,8 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# Complex step along a motion. It is so small that its square vanishes, so derivatives are exact.
+# Complex step along a motion. Rounding removes its square from every sum, so derivatives are exact
+# to machine precision.
 _STEP = 1e-20j
 
 _NAMES = {"wxyz": ["quat.w", "quat.x", "quat.y", "quat.z"], "euler": ["roll", "pitch", "yaw"]}
@@ -51,7 +52,7 @@ TOOLS = {
 
 
 class Jacobians(NamedTuple):
-    """Derivatives of coordinates x' and inputs u' at a point, over y (15.1) and u in base axes."""
+    """Derivatives of x' and u' at a point, over y (15.1) and over u in base axes."""
 
     P: Array  # dx'/dy (15.2)
     rate: Array  # time derivative of P along the motion
@@ -80,7 +81,8 @@ class ToolCoordinates:
         if kind.stored in ("wxyz", "matrix") and robot.file_joints:
             self.joints.sort(key=lambda joint: _joint_path(robot, joint.name))
         self._idx_v = [joint.idx_v for joint in self.joints]
-        # Velocity in nu per unit of the tool's velocity. Only Pinocchio scales modal amplitudes.
+        # Velocity in nu per unit of the tool's velocity; it differs from 1 only for Pinocchio,
+        # which scales modal amplitudes.
         scales = np.array([1.0 if kind.stored == "xyzw" and tool else j.scale for j in self.joints])
         self._scales = scales
         self.actuation = acting = Actuation(state)
@@ -148,7 +150,7 @@ class ToolCoordinates:
         return robot.checked_configuration(at), robot.checked_velocity(speed)
 
     def _rotation(self, attitude: Array) -> Array:
-        """Return the rotation (3, 3) of an attitude stored in q."""
+        """Return the rotation (3, 3) of the attitude that a tool's q stores."""
         if self.convention.stored == "euler":
             return pin.rpy.rpyToMatrix(*attitude)
         if self.convention.stored == "matrix":
@@ -178,9 +180,9 @@ class ToolCoordinates:
         return rotation
 
     def _held(self, parts: Array) -> Array:
-        """Return the derivatives (6, 3) of world-fixed vectors in base axes over a rotation (4.4).
+        """Differentiate world-fixed vectors in base axes over a base rotation (4.4); return (6, 3).
 
-        Parts that are fixed in base axes have the derivative zero.
+        Vectors that are fixed in base axes have the derivative zero.
         """
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
@@ -188,8 +190,8 @@ class ToolCoordinates:
         """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) in base axes."""
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
         here, R_now = self._attitude(q)
-        # Complex step along the motion. With a moving reference, errors and tangent vectors do not
-        # change along the motion.
+        # Take a complex step along the motion. With a moving reference, errors and tangent vectors
+        # stay constant along it.
         twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
         moved = (not self._moving) * _STEP * twist.real
         turns = 0.5 * turning.product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
@@ -233,7 +235,7 @@ class ToolCoordinates:
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
-    """Return the coordinates of a tool; raise an error if the robot cannot have them."""
+    """Return the coordinates of a tool; raise an error if the tool cannot describe the robot."""
     if not isinstance(tool, str) or tool not in TOOLS:
         raise unknown("tool", str(tool), TOOLS)
     if tool[:5] != "euler":
@@ -251,7 +253,7 @@ def _centre(robot: Robot) -> pin.SE3:
 
 
 def _joint_path(robot: Robot, name: str) -> list[int]:
-    """Return the file indices of the joints from the root to a joint; unknown ones come last."""
+    """Return the file indices of the joints from the root to a joint; other joints come last."""
     frames, path, order = robot.model.frames, list[int](), robot.file_joints
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
     while at:
@@ -279,7 +281,7 @@ def _angles(R: Array) -> Array:
 
 
 def _of_angles(angles: Array, omega: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
-    """Return the G of angle rates = G omega, and the derivative of G omega over the angles."""
+    """Return G with (angle rates) = G omega, and the derivative of G omega over the angles."""
     (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
     G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
     _, pitch, yaw = G @ omega

@@ -324,7 +324,7 @@ class Trajectory(Design):
 
 
 def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
-    """Return q (count, nq); if continuous joints are given as angles, convert to (cos, sin)."""
+    """Return q (count, nq); convert continuous joints to (cos, sin) if they are given as angles."""
     rows, cosines = as_double("q", q), np.array(list(robot.unbounded), dtype=int)
     narrow = (count, robot.nq - len(cosines))
     if rows.shape == (count, robot.nq):
@@ -341,7 +341,7 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
 
 
 def along(motion: Any, robot: Robot | None) -> Trajectory:
-    """Convert a motion to a trajectory with constant or linear inputs, by the smaller residual."""
+    """Convert a motion to a trajectory with constant or linear inputs, whichever fits better."""
     if motion.phases:
         raise InputError(
             "the motion has several phases, each with its own robot; convert each phase separately"

@@ -31,8 +31,9 @@ from fflin.robot.robot import Robot
 
 Index: TypeAlias = slice | Indices
 
-# Terms that cancel exactly still leave rounding errors of 1e-16 of their size. The scale of errors
-# contains this fraction of such terms, which allows for the rounding and hides no larger error.
+# Terms that cancel exactly still leave rounding errors of 1e-16 of their size. Errors are
+# therefore relative to a scale that includes this fraction of such terms. It allows for the
+# rounding errors and hides no larger ones.
 _ROUNDING_FRACTION = 1e-3
 
 
@@ -67,16 +68,17 @@ def inertia_residual(M: Array, inverse: Array) -> float:
 def aba_route(
     state: StateMap, aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Return A and B from the derivatives of ABA, (4.9) and (15.3), and the M^-1 of ABA."""
+    """Return A and B from ABA's derivatives by (4.9) and (15.3), and M^-1 by ABA."""
     own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
-    # Pinocchio differentiates about the world's origin, where a distant base would cost digits. So
-    # the base is placed at the origin: no derivative depends on its position, not even in orbit.
+    # Pinocchio differentiates about the world's origin, and a base far from it would cost digits.
+    # So the base is placed at the origin: no derivative depends on its position, not even in
+    # orbit.
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
     there = own.jacobians(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
-    # Kinematics of the tangent displacement in axes that rotate with the base.
+    # Upper half of A: kinematics of the tangent displacement in axes that rotate with the base.
     A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
     A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
     A[LINEAR, ANGULAR] = -skew(nu[LINEAR])
@@ -97,11 +99,11 @@ def compare(
     steps: Array | None = None,
     rounding: float = 0.0,
 ) -> list[tuple[str, float]]:
-    """Return the errors of A and B from other matrices, block by block, such as "A[q_b, q_m]"."""
+    """Compare A and B with other matrices; return the errors of blocks such as "A[q_b, q_m]"."""
     # Errors are relative to the largest entry of a block. Rows of accelerations are divided by the
     # mobility sqrt((M^-1)_ii), so that a light joint does not hide a heavy one. Columns of B are
     # divided by the mobility of their input. If large terms cancel in a block, errors are relative
-    # to these terms, because differences have their rounding errors.
+    # to these terms, because the terms' rounding errors remain in the differences.
     nv = len(M)
     mobility, input_mobility = mobilities(M, B)
     row_scale = np.concatenate((np.ones(state.nx - nv), mobility))[:, None]
@@ -148,8 +150,9 @@ def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
 def _cancelling_terms(
     state: StateMap, lin: LinearModel, v: Array, mobility: Array, input_mobility: Array
 ) -> Array:
-    """Return the size (6, 6) of the terms that may cancel in each block of the scaled A."""
-    # The base's velocity is included only by its rounding errors in Pinocchio's derivatives.
+    """Return the size (6, 6) of the terms that may cancel, for each block of the scaled A."""
+    # The base's linear velocity counts only through the rounding errors that it causes in
+    # Pinocchio's derivatives.
     speed, rate, momentum = speeds(state, v)
     # Gyroscopic torque of the wheels on a rotating link, in the units of the rows.
     spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
@@ -159,7 +162,8 @@ def _cancelling_terms(
     accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
     forces = np.abs(lin.u0) * input_mobility
     size = _largest(accelerations) + _largest(forces) + rate * (_largest(resting) + spin)
-    # Effect of a unit velocity at the present rates, and for rotations at the base's speed too.
+    # Effect of a unit velocity at the present rates; for rotations, also at the present speed of
+    # the base.
     unit = 1.0 / mobility
     turning = rate * np.array([_largest(unit[part]) for part in (ANGULAR, LINEAR, slice(6, None))])
     turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
@@ -170,7 +174,7 @@ def _cancelling_terms(
 
 
 def speeds(state: StateMap, v: Array) -> tuple[Array, float, float]:
-    """Return speeds (6 + n,) without wheels, the largest rate, and the wheels' momentum."""
+    """Return speeds (6 + n,) with wheels at 0, the largest rate, and the wheels' momentum."""
     speed, robot = np.abs(state.velocities(v)), state.robot
     inertia = np.array([robot.wheels.get(name, 0.0) for name in robot.joint_names])
     momentum = float(inertia @ speed[6:])
@@ -205,7 +209,7 @@ def _in_frame(state: StateMap, q: Array, matrix: Array) -> Array:
     return state.to_frame(chart, state.to_frame(chart, matrix).T).T
 
 
-# Speed of the base [m/s] above which its rounding errors would hide the other velocities.
+# Speed of the base [m/s] above which rounding errors of this speed would hide other velocities.
 _FAST = 100.0
 
 # Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
@@ -259,7 +263,7 @@ class Nonlinear:
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         rate = state.velocities(a)
         if state.axes[1]:
-            # Derivative of the components in reference axes.
+            # Add the term by which the derivative of the components in reference axes differs.
             rate[:, LINEAR] += times(skew(angular), linear)
         turning = chart.q0 * angular + times(skew(chart.q_b), angular)
         position_rate, rates = times(chart.R, linear), state.velocities(v)[:, 6:]
@@ -277,7 +281,7 @@ class ErrorDynamics(Nonlinear):
         self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
 
     def after_motion(self, x: Array, q: Array, v: Array, a: Array, t: Array) -> Array:
-        """Return the errors after reference and robot have both moved for a time t."""
+        """Return the errors (N, nx) after reference and robot have moved for times t (N, 1)."""
         at, at_rest = np.tile(self._q, (len(t), 1)), np.zeros_like(a)
         ahead = super().after_motion(x, at, np.tile(self._v, (len(t), 1)), at_rest, t)
         errors = moving_errors("local", super().after_motion(x, q, v, a, t), ahead)
@@ -303,7 +307,7 @@ class ErrorDynamics(Nonlinear):
 def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask) -> Array:
     """Return the Jacobian of f by central differences; f maps rows of points to rows of values.
 
-    Columns with `is_curved` use sixth-order differences, the others use one difference.
+    Columns in the mask `is_curved` use sixth-order differences, the others second-order ones.
     """
     curved, straight = np.diag(steps)[is_curved], np.diag(steps)[~is_curved]
     offsets = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
@@ -318,11 +322,13 @@ def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved:
 def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array, Array]:
     """Return the steps for differences in x (nx,) and u (nu,) at a model's point."""
     groups, nv = state.groups, len(M)
-    # Small compared with the angles over which accelerations change if light links line up.
+    # The step is small compared with the rotations over which the accelerations of aligned light
+    # links change.
     step = np.full(state.nx, 2e-4)
-    # Well inside the chart, because f becomes steep near its limit |q_b| = 1.
+    # The step stays well inside the chart: f becomes steep near the limit |q_b| = 1.
     step[groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[groups.q_b]))
-    # f is quadratic in the velocities and linear in the inputs, so no step size causes truncation.
+    # f is quadratic in the velocities and linear in the inputs, so there is no truncation error at
+    # any step size.
     speed = np.abs(lin.x0[-nv:])
     step[-nv:] = 0.1 * max(1.0, float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
     step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
@@ -332,7 +338,7 @@ def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array
 
 
 def flow_error(model: Nonlinear, lin: LinearModel) -> float:
-    """Return the relative error of f from the differentiated states of short motions."""
+    """Return the relative error of f, compared with differentiated states of short motions."""
     model = copy(model)
     model.state = state = model.state.about(pin.SE3(lin.reference.rotation, np.zeros(3)))
     x = np.tile(lin.x0, (7, 1))

@@ -10,7 +10,7 @@ from urllib.parse import unquote
 from fflin.base.errors import FileError, InputError, require_known, unknown
 from fflin.base.writing import as_path, missing, shown
 
-# Robots of example-robot-data without a URDF of their own: code makes them from another robot.
+# Robots of example-robot-data that code builds from another robot, so they have no URDF.
 _MADE_BY_CODE = ("talos_legs",)
 
 
@@ -92,7 +92,7 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 
 
 def find_inputs(inputs: str | Path) -> Path:
-    """Find a file of inputs by the name of a bundled robot, or else by its path."""
+    """Find a file of inputs by the name of a bundled robot, or otherwise by the file's path."""
     path = as_path(inputs)
     bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
     if str(inputs) in bundled:
@@ -120,7 +120,8 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
         candidates = [Path(unquote(rest))]
     else:
         folders, inside = (*package_dirs, *urdf.resolve().parents), Path(*Path(rest).parts[1:])
-        # A given folder may contain the package folder, or be it, possibly with another name.
+        # A given folder may contain the package folder. Or it may be the package folder itself,
+        # possibly under another name.
         candidates = (folder / part for part in (rest, inside) for folder in folders)
     # Path.is_file would raise an error for a name that is too long.
     return next((path for path in candidates if os.path.isfile(path)), None)

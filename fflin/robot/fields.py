@@ -1,4 +1,4 @@
-"""Checks of the fields of a robot that the user may set, and the limits of a robot."""
+"""Checks of the robot's fields that the user may set, and the limits of a robot."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
@@ -25,6 +25,8 @@ from fflin.robot.orbit import checked_orbit
 from fflin.robot.outputs import Output, parse_output
 
 if TYPE_CHECKING:
+    import pinocchio as pin
+
     from fflin.robot.joints import Joint
     from fflin.robot.robot import Robot
 
@@ -38,20 +40,10 @@ _STATE = ("joints", "rpy", "position", "velocity")
 _WEIGHTS = ("rule", "q", "r", "bryson")
 
 
-class Scope(NamedTuple):
-    """Parts of a robot to which its fields refer by name."""
-
-    find: Find  # returns the joint with a name
-    joints: Sequence[str]
-    own: Sequence[str]  # joints except wheels
-    inputs: Sequence[Input]
-    urdf_damping: Mapping[str, float]
-
-
-def checked_fields(fields: Mapping[str, object], scope: Scope) -> dict[str, Any]:
+def checked_fields(fields: Mapping[str, object], robot: Robot) -> dict[str, Any]:
     """Return the checked fields of `Robot.replace`, except for passive joints and inputs."""
     require_known("field of a robot", fields, FIELDS)
-    return {name: FIELDS[name](value, scope) for name, value in fields.items()}
+    return {name: FIELDS[name](value, robot) for name, value in fields.items()}
 
 
 def checked_inputs(
@@ -90,13 +82,13 @@ def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[st
 
 
 def _input_keys(inputs: Sequence[Input]) -> tuple[str, ...]:
-    """Return the names of inputs with their groups, as `fflin.base.names.input_keys` does."""
+    """Return input names with groups, such as "thrust.NAME"; see `fflin.base.names.input_keys`."""
     pairs = ((item.GROUP, name) for item, names in named_inputs(inputs) for name in names)
     return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
 
 
 def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) -> dict[str, Range]:
-    """Return {input or state: (least, largest)} from one magnitude, or from limits by name."""
+    """Convert limits by name, or one for all inputs, to {input or state: (least, largest)}."""
     keys, states, named = _input_keys(inputs), state_keys(joints), named_inputs(inputs)
     names = [*(name for _, own in named for name in own), *states]
     floors = [0.0 if not item.PULLS else -math.inf for item, own in named for _ in own]
@@ -106,7 +98,7 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) 
     ranges = {str(key): range_of(key, value) for key, value in given.items()}
     of_inputs = {key: ranges[key] for key in ranges if stands_for_any(key, keys)}
     of_states = {key: ranges[key] for key in ranges if key not in of_inputs}
-    # A limit for all joints excludes wheels, because they are much faster than joints.
+    # A limit for all joints does not apply to wheels, because wheels are much faster.
     wheels = {f"{group}.{name}" for group in _OF_JOINTS for name, _ in named_wheels(inputs)}
     whole = {key: of_states.pop(key) for key in _OF_JOINTS if key in of_states}
     found = by_name("input or state", whole, (*keys, *states))
@@ -118,7 +110,7 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) 
     }
 
 
-def _outputs(value: object, _: Scope) -> tuple[Output, ...]:
+def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
     """Return outputs from `Output` objects or from texts as on the command line."""
     given = [value] if isinstance(value, str) else value
     if not isinstance(given, Sequence) or not given:
@@ -131,29 +123,27 @@ def _outputs(value: object, _: Scope) -> tuple[Output, ...]:
     return tuple(found)
 
 
-def _rest(value: object, scope: Scope) -> dict[str, float]:
-    if not isinstance(value, Mapping):
-        raise InputError(f"rest is {value!r}, expected {{joint: rest position}}")
-    return by_joint(numbers("rest", value, "joint", "rest of joint"), scope.own, scope.find)
+def _rest(value: object, robot: Robot) -> dict[str, float]:
+    return by_joint(numbers("rest", value, "joint", "rest of joint"), robot.own_joints, robot.joint)
 
 
-def _stiffness(value: object, scope: Scope, what: str = "stiffness") -> dict[str, float]:
+def _stiffness(value: object, robot: Robot, what: str = "stiffness") -> dict[str, float]:
     """Return {joint: value} from a mapping, or from one value for all joints except wheels."""
     if not isinstance(value, Mapping):
-        value = dict.fromkeys(scope.own, value)
+        value = dict.fromkeys(robot.own_joints, value)
     checked = numbers(what, value, "joint", f"{what} of joint")
     for name, entry in checked.items():
         if entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
-    return by_joint(checked, scope.own, scope.find)
+    return by_joint(checked, robot.own_joints, robot.joint)
 
 
-def _damping(value: object, scope: Scope) -> dict[str, float]:
+def _damping(value: object, robot: Robot) -> dict[str, float]:
     if not isinstance(value, str):
-        return _stiffness(value, scope, "damping")
+        return _stiffness(value, robot, "damping")
     if value != "urdf":
         raise InputError(f"damping is '{value}', expected 'urdf', a number or {{joint: damping}}")
-    return dict(scope.urdf_damping)
+    return dict(robot.urdf_damping)
 
 
 def range_of(name: str, value: Any) -> Range:
@@ -171,18 +161,18 @@ def range_of(name: str, value: Any) -> Range:
     return least, largest
 
 
-def _state(what: str, value: object, scope: Scope) -> dict[str, Any]:
+def _state(what: str, value: object, robot: Robot) -> dict[str, Any]:
     """Check a point, start or target of a robot, and replace patterns by the names of joints."""
     state = _parts(what, value, _STATE)
     if "joints" in state:
         values = numbers(f"{what} joints", state["joints"], "joint", f"{what} of joint")
-        state["joints"] = by_joint(values, scope.joints, scope.find)
+        state["joints"] = by_joint(values, robot.joint_names, robot.joint)
     for name in ("rpy", "position"):
         if name in state:
             state[name] = three_numbers(f"{what} {name}", state[name])
     if "velocity" in state:
         rates = numbers(f"{what} velocity", state["velocity"], "name", f"{what} velocity")
-        state["velocity"] = rates_by_name(scope.joints, rates)
+        state["velocity"] = rates_by_name(robot.joint_names, rates)
     return state
 
 
@@ -194,11 +184,11 @@ def of_joints(state: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]
     return {**state, **kept}
 
 
-def _weights(value: object, scope: Scope) -> dict[str, Any]:
+def _weights(value: object, robot: Robot) -> dict[str, Any]:
     """Check the weights of a robot's regulator; the keys are names of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)
     require_known("rule of weights", [str(weights.get("rule", RULES[0]))], RULES)
-    states, keys = state_keys(scope.joints), _input_keys(scope.inputs)
+    states, keys = state_keys(robot.joint_names), _input_keys(robot.inputs)
     parts = {
         "q": ("state", states),
         "r": ("input", keys),
@@ -234,7 +224,7 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, Any]:
 
 # Checks of the fields, in the order in which a file applies them: inputs come before the fields
 # that refer to their names.
-FIELDS: dict[str, Callable[[Any, Scope], object]] = {
+FIELDS: dict[str, Callable[[Any, Robot], object]] = {
     **dict.fromkeys(("passive", "inputs", "appendages"), lambda value, _: value),
     "outputs": _outputs,
     "stiffness": _stiffness,
@@ -242,15 +232,12 @@ FIELDS: dict[str, Callable[[Any, Scope], object]] = {
     "rest": _rest,
     "gravity": lambda value, _: three_numbers("gravity", value),
     "orbit": lambda value, _: checked_orbit(value),
-    "limits": lambda value, scope: given_limits(scope.inputs, scope.joints, value),
+    "limits": lambda value, robot: given_limits(robot.inputs, robot.joint_names, value),
     "weights": _weights,
     "point": partial(_state, "point"),
     "target": partial(_state, "target"),
     "start": partial(_state, "start"),
 }
-
-# Fields with entries by name: the entries of a call are added to the entries of a robot file.
-MERGED = ("stiffness", "damping", "rest", "limits")
 
 
 _OPEN: Range = (-math.inf, math.inf)
@@ -258,11 +245,12 @@ _OPEN: Range = (-math.inf, math.inf)
 
 def limits_of(robot: Robot) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} for all limits."""
-    # Limits of the URDF come first; a limit of zero means none, as exporters write it. Limits of
-    # the inputs replace them, and `Robot.limits` replaces both.
+    # Start with the limits of the URDF, where exporters write zero for no limit. Limits of the
+    # inputs replace them, and `Robot.limits` replaces both.
     found: dict[str, Range] = {}
     for joint in robot.joints:
-        found[f"q_m.{joint.name}"] = _travel(robot, joint)
+        low, high = travel_of(robot.model, joint)
+        found[f"q_m.{joint.name}"] = (low, high) if low < high else _OPEN
         found[f"qdot_m.{joint.name}"] = _either(float(robot.model.velocityLimit[joint.idx_v]))
     for item, names in named_inputs(robot.inputs):
         found |= dict(zip(names, item.ranges, strict=True))
@@ -279,7 +267,7 @@ def limits_of(robot: Robot) -> dict[str, Range]:
 def magnitudes_of(robot: Robot) -> dict[str, float]:
     """Return {input or state: magnitude} of all finite limits.
 
-    The magnitude of a joint position is its whole travel, and of a one-sided input its range.
+    For a joint position the magnitude is the whole travel, and for a one-sided input the range.
     """
     sizes = {
         name: largest - least if name.startswith("q_m.") or least >= 0.0 else min(-least, largest)
@@ -306,12 +294,12 @@ def chosen_limits(robot: Robot, limits: Any) -> tuple[dict[str, Range], dict[str
     return cutting | given, own | given
 
 
-def _travel(robot: Robot, joint: Joint) -> Range:
+def travel_of(model: pin.Model, joint: Joint) -> Range:
+    """Return the position limits of a joint in its model, infinite without limits."""
     if joint.unbounded:
         return _OPEN
-    low = _known(float(robot.model.lowerPositionLimit[joint.idx_q]))
-    high = _known(float(robot.model.upperPositionLimit[joint.idx_q]))
-    return (low, high) if low < high else _OPEN
+    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
+    return _known(float(lower[joint.idx_q])), _known(float(upper[joint.idx_q]))
 
 
 def _either(size: float) -> Range:

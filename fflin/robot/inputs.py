@@ -67,8 +67,8 @@ class Input:
     def names(self, count: int) -> tuple[str, ...]:
         """Return the names of this input's entries in u.
 
-        `count` is the number of this input among the inputs of its type; the default names of
-        thrusters and wheels contain it.
+        `count` numbers the inputs of one type; the default names of thrusters and wheels contain
+        this number.
         """
         return tuple(f"{self.GROUP}.{entry}" for entry in self.ENTRIES)
 
@@ -289,11 +289,9 @@ class ReactionWheel(WrenchInput):
                 f"wheel momentum is {self.momentum:g}, inertia is {self.inertia} and max_speed is "
                 f"{self.max_speed}; give either an inertia, whose speed is a state, or a momentum"
             )
-        if self.inertia is None:
-            return
-        hint = "; leave it out to model the wheel by its momentum alone"
-        inertia = positive("wheel inertia", self.inertia, "kg m^2", hint)
-        self._set("inertia", inertia)
+        if self.inertia is not None:
+            hint = "; leave it out to model the wheel by its momentum alone"
+            self._set("inertia", positive("wheel inertia", self.inertia, "kg m^2", hint))
 
     @property
     def wrench(self) -> Array:

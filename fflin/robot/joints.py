@@ -21,7 +21,7 @@ ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
 _CONFIGURATION = "a configuration in Pinocchio's order"
 
-# Rounding error of the length of a normalised quaternion: two ulp of 1.
+# Largest rounding error of the length of a normalised quaternion: two ulp of 1.
 ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
 # pin.Data contains third-order tensors of nv^3 entries. It takes about 32 nv^3 bytes.
@@ -35,14 +35,14 @@ class Joint(NamedTuple):
     """Joint with one degree of freedom."""
 
     name: str  # in the model
-    idx_q: int  # index of its first entry in Pinocchio's q
-    idx_v: int  # index of its entry in Pinocchio's v
-    unbounded: bool  # continuous: two entries (cos, sin) of q, but one angle in the state
-    prismatic: bool  # position is a length [m] instead of an angle [rad]
+    idx_q: int = 0  # index of its first entry in Pinocchio's q
+    idx_v: int = 0  # index of its entry in Pinocchio's v
+    unbounded: bool = False  # continuous: two entries (cos, sin) of q, but one angle in the state
+    prismatic: bool = False  # position is a length [m] instead of an angle [rad]
     # "joint", "slosh", or "modal" for the amplitude of a mode.
     kind: str = "joint"
     scale: float = 1.0  # entry of q per unit of q_m; 1 except for modal amplitudes
-    # Inertia of a mode if its link is clamped; 1 for a modal amplitude.
+    # Inertia of a mode when its link is fixed in space; 1 for a modal amplitude.
     inertia: float = 1.0
     # Rotation [rad] of the structure per unit of a mode; 0 without rotation.
     rotation: float = 0.0
@@ -63,7 +63,7 @@ class Joint(NamedTuple):
         return self.kind != "joint"
 
     def oscillation(self, stiffness: float, damping: float) -> tuple[float, float]:
-        """Return frequency [rad/s] and damping ratio of a mode on a spring, its link clamped."""
+        """Return a mode's frequency [rad/s] and damping ratio when its link is fixed in space."""
         omega = math.sqrt(stiffness / self.inertia)
         return omega, 0.5 * damping / (self.inertia * omega)
 
@@ -98,8 +98,12 @@ class Follower(NamedTuple):
         """Write the mimic joint's value, which follows from its leader's value, into q (nq,)."""
         self.joint.place(q, self.multiplier * self.leader.value(q) + self.offset)
 
+    def within(self, model: pin.Model) -> Follower:
+        """Return this mimic joint with the indices of its joints in another model."""
+        return self._replace(joint=self.joint.within(model), leader=self.leader.within(model))
 
-# Function that returns the joint with a name, or raises an error that names the problem.
+
+# Function that returns the joint with a given name, or raises an error that explains the problem.
 Find: TypeAlias = Callable[[str], Joint]
 
 
@@ -117,10 +121,10 @@ class Carried(NamedTuple):
 
 def frame_index(model: pin.Model, name: str) -> int:
     """Return the index of a frame; if a link and a joint share a name, return the link's frame."""
-    # Pinocchio's own search refuses a name that a link and a joint share, and takes a link named
-    # universe for the world.
+    # Pinocchio's own search refuses a name that a link and a joint share. It also mistakes a link
+    # named "universe" for the world.
     frames = {i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT}
-    # The type is checked because an array as name would give an array of comparisons.
+    # The type is checked because comparing a name with an array gives an array instead of a bool.
     found = [i for i, f in frames.items() if isinstance(name, str) and f.name == name]
     if not found:
         raise unknown("frame", str(name), [frame.name for frame in frames.values()])

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +12,6 @@ from fflin.base.errors import FflinWarning, ModelError
 from fflin.base.validation import instance, is_rotation
 from fflin.base.writing import remember
 from fflin.robot.catalog import RobotFile, find_mesh, find_robot, folders
-from fflin.robot.fields import MERGED
 from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import LinkMass, given_body, massless_note
 from fflin.robot.robot import Robot
@@ -96,7 +94,7 @@ def load(
         loaded = file.applied(loaded)
         if later:
             loaded = welded(loaded, later)
-    loaded = with_fields(loaded, fields)
+    loaded = loaded.merged(fields)
     gone = {name.rpartition("=")[0] for name in loaded.locked}
     notes = [*loaded.notes]
     for field, names, text in advice:
@@ -107,37 +105,24 @@ def load(
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     if loaded.idle_coordinates:
-        # A note instead of a warning, because every function that inverts M raises this error.
+        # Add a note instead of a warning, because every function that inverts M raises an error
+        # anyway.
         notes.append(massless_note(loaded))
     return replace(loaded, notes=tuple(notes))
-
-
-def with_fields(robot: Robot, fields: Mapping[str, object]) -> Robot:
-    """Return a robot with new fields; fields of joints are merged with the robot's."""
-    if not fields:
-        return robot
-    if robot.passive and isinstance(given := fields.get("passive"), list | tuple):
-        fields = {**fields, "passive": [*robot.passive, *given]}
-    changed = robot.replace(**fields)
-    over: dict[str, Any] = {
-        name: {**getattr(robot, name), **getattr(changed, name)}
-        for name in MERGED
-        if name in fields and getattr(robot, name)
-    }
-    return replace(changed, **over)
 
 
 def _load(
     found: RobotFile, lock: Lock | None, package_dirs: tuple[Path, ...]
 ) -> tuple[Robot, tuple[Advice, ...]]:
-    """Return the robot of a URDF, and warnings that fields of the robot may make unnecessary."""
+    """Return the robot of a URDF, and warnings that fields of the robot can resolve."""
     description = read_urdf(found.path)
     loaded = _robot(description.model, found.name, lock, description.mimics)
     dirs = (*package_dirs, *found.package_dirs)
-    # Meshes are read when the robot is drawn, so output files must not overwrite them before.
+    # Meshes are read only when the robot is drawn, so output files must not overwrite them.
     remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in description.meshes)))
     damping = {name: description.damping.get(name, 0.0) for name in loaded.joint_names}
-    # Damping of a mimic joint is added to its leader with equal dissipated power.
+    # Damping of a mimic joint is added to its leader so that the dissipated power remains the
+    # same.
     for joint, leader, multiplier, _ in loaded.followers:
         damping[leader.name] += multiplier**2 * description.damping.get(joint.name, 0.0)
     loaded = replace(
@@ -282,15 +267,11 @@ def _check_model(model: pin.Model, name: str) -> None:
             )
 
 
-def body_alone(inertia: pin.Inertia, name: str) -> Robot:
-    """Return a robot that consists of one body without joints."""
+def body_alone(payload: pin.Inertia, name: str) -> Robot:
+    """Return a robot that consists of one body without joints; the body must have a mass."""
+    inertia = given_body("payload", payload, payload)
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
     model.appendBodyToJoint(1, inertia, pin.SE3.Identity())
     model.addJointFrame(1)
     return from_model(model, name=name)
-
-
-def inertia_of(value: pin.Inertia) -> pin.Inertia:
-    """Return the inertia of a body, or raise `InputError` if it has no mass."""
-    return given_body("payload", value, value)

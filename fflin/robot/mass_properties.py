@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 _KEYS = ("mass", "com", "inertia")
 _SYMMETRIC = 1e-9
-# Relative rounding errors of a sum of bodies, and of a second moment.
+# Largest relative rounding errors of a sum of bodies, and of a second moment of mass.
 _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
 
 # Singular values below this fraction of the largest count as zero. Rounding errors are 1e-15 of the
 # largest, and the smallest true value, for links 1e7 m apart, is 1e-7 of the largest.
 _ZERO = 1e-12
 
-# A message names the coordinates whose component in a unit motion exceeds this.
+# A message names a coordinate if its component of a motion with unit norm exceeds this value.
 _INVOLVED = 0.1
 
 # Relative asymmetry up to which a body counts as symmetric, for the rounding of numbers in a URDF.
@@ -107,20 +107,15 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
     for index in range(ROOT, model.njoints):
         drawn = draw.uniform(-1.0, 1.0, (1, 7))
         if any(checked.values()):
-            sizes = checked["mass"], checked["com"], checked["inertia"]
-            parts = (size * x for size, x in zip(sizes, np.split(drawn, (1, 4), 1), strict=True))
-            heavier, shift, wider = parts
+            heavier, shift, wider = np.split(drawn, (1, 4), 1)
             body = model.inertias[index]
-            mass, com, about = stretched(body, heavier, shift * _radii(body), wider)
+            # Root mean square distances [m] of the body's mass from its centre, per axis.
+            second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
+            radii = np.sqrt(np.abs(second) / (body.mass or np.inf))
+            heavier, shift = checked["mass"] * heavier, checked["com"] * shift * radii
+            mass, com, about = stretched(body, heavier, shift, checked["inertia"] * wider)
             new[index] = pin.Inertia(float(mass[0]), com[0], about[0])
     return new
-
-
-def _radii(body: pin.Inertia) -> Array:
-    """Return the root mean square distances (3,) [m] of a body's mass from its centre, per axis."""
-    second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
-    radii: Array = np.sqrt(np.abs(second) / (body.mass or np.inf))
-    return radii
 
 
 def stretched(
@@ -129,14 +124,14 @@ def stretched(
     """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of N variants of a body.
 
     `mass` (N, 1) and `inertia` (N, 3) are relative changes. `com` (N, 3) [m] shifts the centre of
-    mass, and changes neither the mass nor the inertia about the centre. All are along the axes of
-    the body's frame.
+    mass, and changes neither the mass nor the inertia about the centre. Shifts and changes of
+    inertia are along the axes of the body's frame.
     """
     # A body that is stretched by S along its axes has the second moments S Sigma S, which remain
     # positive definite.
     heavier, unit = 1.0 + mass.reshape(-1), np.eye(3)
     second = 0.5 * np.trace(body.inertia) * unit - body.inertia
-    # A physically impossible body, as in some files, is scaled equally along all axes.
+    # Some files contain physically impossible bodies, which are scaled equally along all axes.
     sound = np.linalg.eigvalsh(second)[0] >= -_NO_MOMENT * np.trace(second)
     stretch = np.sqrt(1.0 + (inertia if sound else inertia[:, :1] * np.ones(3)))
     second = heavier[:, None, None] * second * stretch[:, :, None] * stretch[:, None]
@@ -220,7 +215,7 @@ def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
 
 
 def sums_of(pieces: Mapping[str, Piece]) -> set[str]:
-    """Return the names of bodies whose links are pieces as well."""
+    """Return the names of the pieces that are bodies whose links are pieces as well."""
     linked = {each.joint for each in pieces.values() if not each.whole}
     return {name for name, each in pieces.items() if each.whole and each.joint in linked}
 
@@ -236,7 +231,7 @@ def varied(
     """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of a link, in its joint's frame.
 
     `mass` (N,), `density` (N,) and `inertia` (N, 3) are relative changes; `com` (N, 3) [m] shifts
-    the centre of mass. Inertia and shift are along the axes of the link.
+    the centre of mass. Changes of inertia and shifts are along the axes of the link.
     """
     R = piece.frame.rotation
     own_axes = R.T @ piece.placement.rotation
@@ -273,10 +268,10 @@ def _squares(com: Array) -> Array:
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:
-    """Return the coordinates that can move together without moving mass; usually none."""
+    """Return the coordinates that can move together without moving mass; usually an empty tuple."""
     # A motion has no kinetic energy if it moves no mass, rotates no body about an axis with
-    # inertia, and moves no joint with armature. This depends on geometry alone, so the values of
-    # masses, whose rounding errors could hide it, are not used.
+    # inertia, and moves no joint with armature. This condition depends on geometry alone. Values
+    # of masses are not used, because their rounding errors could hide it.
     bodies = robot.model.inertias.tolist()[ROOT:]
     moments = [np.linalg.eigh(body.inertia) for body in bodies]
     if all(
@@ -322,7 +317,7 @@ def massless_note(robot: Robot) -> str:
 
 
 def require_inertia(robot: Robot) -> None:
-    """Raise an error if M is singular at every configuration; its factors may not show this."""
+    """Raise an error if M is singular at every configuration; a factorisation may not show this."""
     if robot.idle_coordinates:
         raise SingularInertiaError(massless_note(robot))
 
@@ -347,7 +342,8 @@ def rotor_names(robot: Robot) -> tuple[str, ...]:
     model = robot.model
     index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
     named = set(robot.used_frames)
-    # Joints that carry or lead another joint, or that have a spring, an input or an output.
+    # These joints are not rotors: they carry or lead another joint, or have a spring, input or
+    # output.
     busy = set(model.parents.tolist())
     busy |= {index_of[follower.leader.name] for follower in robot.followers}
     busy |= {index_of[name] for name, stiffness in robot.stiffness.items() if stiffness}

@@ -102,18 +102,15 @@ class CircularOrbit:
             )
         if self.mu is None:
             require_known("central body", [self.body], BODIES)
-        given = [value for value in (self.altitude, self.mean_motion) if value is not None]
-        if len(given) != 1:
+            mu, ground = BODIES[self.body]
+        else:
+            mu = positive("mu", self.mu)
+            ground = positive("body_radius", self.body_radius)
+        if (self.altitude is None) == (self.mean_motion is None):
             raise InputError(
                 f"altitude is {self.altitude} [m] and mean_motion is {self.mean_motion} [rad/s]; "
                 "give exactly one of them"
             )
-        size = self.mu, self.body_radius
-        mu, ground = (
-            BODIES[self.body]
-            if self.mu is None
-            else (positive(name, x) for name, x in zip(("mu", "body_radius"), size, strict=True))
-        )
         n = self.mean_motion
         if self.altitude is not None:
             altitude = number("altitude", self.altitude)
@@ -127,7 +124,7 @@ class CircularOrbit:
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
-            # No warning for a saved orbit, or for another body that is named earth.
+            # Do not warn if `mu` is given: the orbit was saved, or "earth" names another body.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
                 warnings.warn(
                     f"an altitude of {altitude:.8g} m over earth is too low for an orbit; "

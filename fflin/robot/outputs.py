@@ -18,7 +18,7 @@ class Output:
     WORD: ClassVar[str]
     # (name, unit) of each measured vector (3,); empty if the output consists of states.
     VECTORS: ClassVar[tuple[tuple[str, str], ...]] = ()
-    # Whether the output depends on accelerations, and so on the inputs.
+    # Whether the output depends on accelerations, and therefore on the inputs.
     FEELS_ACCELERATION: ClassVar[bool] = False
 
     @property
@@ -80,7 +80,7 @@ class JointOutput(Output):
     joints: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        # A string would be taken as a sequence of one-letter names.
+        # A string is refused because it would be taken as a sequence of one-letter names.
         if isinstance(self.joints, str):
             given = repr(self.joints)
             raise InputError(f"joints is {given}, expected a tuple of names: write ({given},)")
@@ -275,7 +275,7 @@ class Accelerometer(FrameOutput):
     FEELS_ACCELERATION = True
 
 
-# In the order of the list on the command line.
+# The command line lists the outputs in this order.
 KINDS: tuple[type[Output], ...] = (
     *(FullState, BasePose, JointPositions, JointVelocities, CenterOfMass, Momentum),
     *(FramePose, FrameVelocity, RelativePose, Gyroscope, Accelerometer),

@@ -17,7 +17,7 @@ from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import with_appendages, with_inputs
 from fflin.robot.equipment.mounting import difference, stored_momentum
-from fflin.robot.fields import Range, Scope, checked_fields, checked_passive
+from fflin.robot.fields import Range, checked_fields, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
 from fflin.robot.mass_properties import (
@@ -150,10 +150,10 @@ class Robot(Coordinates):
     appendages: tuple[Appendage, ...] = ()
     # The same robot without wheels and modes; None if no joint is a wheel or mode.
     _unequipped: Robot | None = None
-    # Wheels and modes that were removed when inputs or appendages were replaced.
+    # Names of wheels and modes that no longer exist, because inputs or appendages were replaced.
     _removed: tuple[str, ...] = ()
-    # The model, and a copy of it that shows whether the model was changed since this robot, or the
-    # robot that it derives from, was made.
+    # The model, and a copy of it. The copy shows whether the model has changed since it was
+    # copied.
     _as_made: tuple[pin.Model, pin.Model] | None = None
 
     def __post_init__(self) -> None:
@@ -237,6 +237,15 @@ class Robot(Coordinates):
             If the robot's Pinocchio model (``robot.model``) was modified after the robot was
             created.
         """
+        return self._replaced(fields, merged=False)
+
+    def merged(self, fields: Mapping[str, object]) -> Robot:
+        """Return a copy with other fields; joints and limits that are not named keep theirs."""
+        if self.passive and isinstance(given := fields.get("passive"), list | tuple):
+            fields = {**fields, "passive": [*self.passive, *given]}
+        return self._replaced({**fields}, merged=True)
+
+    def _replaced(self, fields: dict[str, object], *, merged: bool) -> Robot:
         self.require_unchanged()
         robot = self
         if "passive" in fields:
@@ -245,13 +254,12 @@ class Robot(Coordinates):
             robot = with_inputs(robot, fields.pop("inputs"))
         if "appendages" in fields:
             robot = with_appendages(robot, fields.pop("appendages"))
-        joints, own = robot.joint_names, robot._bare.joint_names
-        scope = Scope(robot.joint, joints, own, robot.inputs, self.urdf_damping)
-        checked = checked_fields(fields, scope)
-        for key in ("stiffness", "damping"):
-            if key in checked:  # modes keep their values unless they are named
-                old = getattr(robot, key)
-                kept = {joint.name: old[joint.name] for joint in robot.modes if joint.name in old}
+        checked = checked_fields(fields, robot)
+        # Without `merged`, only modes keep their values unless they are named.
+        modes = {joint.name for joint in robot.modes}
+        for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
+            if key in checked:
+                kept = {k: x for k, x in getattr(robot, key).items() if merged or k in modes}
                 checked[key] = kept | checked[key]
         robot = replace(robot, **checked)
         if robot.orbit and any(robot.gravity):
@@ -361,7 +369,8 @@ class Robot(Coordinates):
     @cached_property
     def pieces(self) -> dict[str, Piece]:
         """Mass properties {name: piece} of all links, and of all bodies with several links."""
-        # The joint indices of the bare robot change, because wheels are inserted between joints.
+        # Wheels are inserted between the joints, so the joints' indices differ from the bare
+        # robot's.
         names, at = self._bare.model.names, self.model.getJointId
         now = [at(name) if joint > ROOT else joint for joint, name in enumerate(names)]
         found = self._links_and_bodies[0]
@@ -452,8 +461,13 @@ class Robot(Coordinates):
         return tuple(joint for joint in self.joints if joint.mode)
 
     @property
+    def own_joints(self) -> tuple[str, ...]:
+        """Names of the independent joints except wheels and modes."""
+        return self._bare.joint_names
+
+    @property
     def _bare(self) -> Robot:
-        """The robot without wheels and modes."""
+        """The robot without its wheels and modes; itself if it has none."""
         return self._unequipped or self
 
     def _without_motors(self, passive: object) -> Robot:

@@ -19,10 +19,10 @@ from fflin.robot.welding import requested
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
-# Fields of a robot that are arrays of tables in a file: {field: names of the arrays}.
+# Fields that a TOML file writes as arrays of tables ([[input]]): {field: names of the arrays}.
 _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
-# Tables whose entries may be tables.
+# Tables of a robot file in which entries may be tables.
 _OF_PARTS = ("weights", "point", "target", "start")
 
 # Keys of a robot file, which the guide explains; a file without `urdf` contains only inputs.
@@ -83,7 +83,7 @@ class RobotToml:
 
 
 def _flat(key: str, value: object) -> Any:
-    """Return the value of a key with flat tables: nested keys are joined by dots."""
+    """Return the value of a key as one flat table: nested keys are joined by dots."""
     if not isinstance(value, dict):
         return value
     if key in _OF_PARTS:
@@ -195,7 +195,7 @@ def read_appendages(document: TomlFile) -> list[Appendage]:
         ("flexible", FlexibleAppendage, FlexibleAppendage.from_nastran),
         ("slosh", Slosh, Slosh.cylinder),
     ):
-        # Keys that are valid only for a Nastran file or for a cylinder.
+        # These keys are valid only for a Nastran file, or only for a cylinder.
         alone = set(signature(special).parameters) - set(signature(make).parameters)
         for index, table in enumerate(_tables(document, key)):
             values = {**table}

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.tables import counted, folded, grid, width
-from fflin.robot.fields import limits_of
+from fflin.robot.fields import limits_of, travel_of
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
@@ -73,11 +73,10 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
     for joint in sorted(kinds, key=lambda joint: joint.idx_v):
         index = model.getJointId(joint.name)
         depth[index] = depth[model.parents[index]] + 1
-        travel = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-        limits = (math.inf, math.inf) if joint.unbounded else travel
-        limits += model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]
-        mass = f"{masses[index]:.6g}"
-        rows.append(["  " * depth[index] + joint.name, kinds[joint], mass, *map(_limit, limits)])
+        rates = model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]
+        cells = (f"{x:.5g}" if abs(x) < 1e300 else "." for x in (*travel_of(model, joint), *rates))
+        name, mass = "  " * depth[index] + joint.name, f"{masses[index]:.6g}"
+        rows.append([name, kinds[joint], mass, *cells])
     of_modes = {joint.name for joint in robot.modes}
     frames = [
         frame.name
@@ -143,11 +142,6 @@ def _indented(text: str, below: str) -> str:
     return textwrap.fill(text, width(), initial_indent="  ", subsequent_indent=below)
 
 
-def _limit(value: float) -> str:
-    # Pinocchio stores a missing limit as the largest double or as infinity.
-    return "." if not math.isfinite(value) or abs(value) > 1e300 else f"{value:.5g}"
-
-
 def draft(robot: Robot, urdf: str) -> str:
     """Return the draft of a robot file for a robot that has only a URDF, with the path `urdf`."""
     from importlib.resources import files
@@ -194,7 +188,7 @@ def _lines(mark: str, values: Mapping[str, str]) -> str:
 
 
 def _order(model: pin.Model) -> Callable[[int], list[tuple[float, str]]]:
-    """Return a key that sorts frames by name, with the numbers in names by value."""
+    """Return a sort key for frames: by name, with numbers in the names compared by value."""
 
     def key(index: int) -> list[tuple[float, str]]:
         parts = re.split(r"([0-9]+)", model.frames[index].name)
@@ -204,7 +198,7 @@ def _order(model: pin.Model) -> Callable[[int], list[tuple[float, str]]]:
 
 
 def _candidate(robot: Robot, index: int) -> tuple[str, str]:
-    """Return the input that a link's name suggests, as TOML comments, and a wheel's joint."""
+    """Return the input that a link's name suggests, as TOML comments, and the joint of a wheel."""
     model, frame = robot.model, robot.model.frames[index]
     kind = next((kind for kind, look in _LOOKS.items() if look.search(frame.name)), "")
     if not kind or frame.type != pin.FrameType.BODY or frame.parentJoint < ROOT:

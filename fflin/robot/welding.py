@@ -59,11 +59,7 @@ def welded(robot: Robot, lock: Lock) -> Robot:
         robot,
         **{"model": model, "locked": (*robot.locked, *locked), "_unequipped": None},
         joints=tuple(joint.within(model) for joint in bare.joints if joint.name not in gone),
-        followers=tuple(
-            f._replace(joint=f.joint.within(model), leader=f.leader.within(model))
-            for f in bare.followers
-            if f.joint.name in left
-        ),
+        followers=tuple(f.within(model) for f in bare.followers if f.joint.name in left),
         passive=tuple(name for name in robot.passive if name not in gone),
         outputs=tuple(x for x in outputs if getattr(x, "joints", None) != ()),
         **fields,
@@ -72,7 +68,7 @@ def welded(robot: Robot, lock: Lock) -> Robot:
 
 
 def _without(of: object, gone: Iterable[str], left: Iterable[str]) -> Any:
-    """Remove the keys that match only removed joints from a mapping and its nested mappings."""
+    """Remove keys that match only removed joints, from a mapping and its nested mappings."""
     if not isinstance(of, Mapping):
         return of
     removed, others = (
@@ -88,7 +84,7 @@ def _without(of: object, gone: Iterable[str], left: Iterable[str]) -> Any:
 def locked_model(
     model: pin.Model, lock: Lock, mimics: Mapping[str, Mimic]
 ) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
-    """Weld joints and their mimic joints; return model, other mimic joints and welded joints."""
+    """Weld joints and their mimic joints; return model, remaining mimic joints, welded joints."""
     movable = list(model.names)[ROOT + 1 :]
 
     def found(name: str) -> str:
@@ -118,7 +114,7 @@ def locked_model(
 
 
 def requested(lock: Any) -> dict[str, float | None]:
-    """Return locks as {joint or pattern: value}, where None is the neutral value."""
+    """Return locks as {joint or pattern: value}; the value None means the neutral position."""
     try:
         names = [lock] if isinstance(lock, str) else list(lock)
     except TypeError:
@@ -164,14 +160,12 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     own = [each.within(model) for each in bare.joints]
     theirs = [renamed(each) for each in other.joints]
     followers = [
-        *(
-            f._replace(joint=f.joint.within(model), leader=f.leader.within(model))
-            for f in bare.followers
-        ),
+        *(f.within(model) for f in bare.followers),
         *(Follower(renamed(f.joint), renamed(f.leader), *f[2:]) for f in other.followers),
     ]
     both: dict[str, Any] = {
-        name: {**getattr(robot, name), **_prefixed(getattr(other, name), prefix)}
+        name: getattr(robot, name)
+        | {f"{prefix}.{key}": value for key, value in getattr(other, name).items()}
         for name in ("stiffness", "damping", "rest", "urdf_damping", "links")
     }
     if not other.links:  # a single body, whose mass properties get the name of the prefix
@@ -194,10 +188,6 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     return with_inputs(whole, robot.inputs)
 
 
-def _prefixed(values: Mapping[str, object], prefix: str) -> dict[str, Any]:
-    return {f"{prefix}.{name}": value for name, value in values.items()}
-
-
 def _require_new_names(robot: Robot, prefix: str) -> None:
     if not prefix or "." in prefix:
         raise InputError(f"prefix is {prefix!r}, expected a word without dots, such as 'payload'")
@@ -211,24 +201,16 @@ def _require_new_names(robot: Robot, prefix: str) -> None:
 def _joined(
     model: pin.Model, joint: int, other: pin.Model, placement: pin.SE3, prefix: str
 ) -> pin.Model:
-    """Return a model that has the other's joints after all joints carried by `joint`."""
+    """Return a model with the other model's joints inserted after all joints carried by `joint`."""
     bodies = model.inertias.tolist()
     bodies[joint] = bodies[joint] + placement.act(other.inertias[ROOT])
     names = [f"{prefix}.{name}" for name in other.names]
     parts = []
     for index in range(ROOT + 1, other.njoints):
         parent, at = other.parents[index], other.jointPlacements[index]
-        on_root = parent == ROOT
+        carrier, at = (joint, placement * at) if parent == ROOT else (names[parent], at)
         moved = joint_of(other, index)._replace(name=names[index])
-        parts.append(
-            Mounted(
-                moved,
-                joint if on_root else names[parent],
-                placement * at if on_root else at,
-                other.joints[index],
-                other.inertias[index],
-            )
-        )
+        parts.append(Mounted(moved, carrier, at, other.joints[index], other.inertias[index]))
     new = with_mounted(model, bodies, parts)
     on = new.getJointId(model.names[joint])
     others = {ROOT: on} | {

@@ -1,6 +1,6 @@
-"""Choice of the engine, and the compiled loop, which simulates eight runs of a plan at once.
+"""Choice of the engine; the compiled loop, which simulates eight runs of a plan at once.
 
-Each run has a lane. A single run fills all lanes.
+Each run has a lane. If there is only one run, all lanes compute it.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 # Number of steps above which a single run uses the compiled loop, if its machine code is stored.
 LONG = 20_000
-# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. It
-# takes about the given fraction of the time, and is compiled once in _COMPILING seconds.
+# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
+# compiled loop takes about _FRACTION of the time. Compiling it takes about _COMPILING seconds,
+# once.
 _FRACTION, _COMPILING = 0.1, 30.0
 
 _log = logging.getLogger("fflin")
@@ -53,7 +54,7 @@ def noise_generator(seed: float) -> np.random.Generator:
 
 
 def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]:
-    """Return the samples (k,) between two steps, and the policy's noise (k, size) in them."""
+    """Return the samples (k,) between two steps, and the policy's noise (k, size) at them."""
     times, noise = plan.times, noise_of(plan)
     at = np.arange(-(-step // times.sample), -(-last // times.sample))
     rows = np.zeros((len(at), size))
@@ -78,8 +79,8 @@ class Statistics(Protocol):
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Add rows (count, LANES, ..) of q, nu, u, momentum and centre of mass.
 
-        The first row is at step `first`. `raw` (count * width, LANES) contains the same values. The
-        same row may be added twice.
+        The first row is at step `first`. `raw` (count * width, LANES) contains the values of
+        `rows`. The same row may be added twice.
         """
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
@@ -153,11 +154,8 @@ class LaneLoop:
         span = max(1, min((len(space) // self.width - 1) * every, statistics.span))
         if self._noisy:
             span = min(span, SLOTS * times.sample)
-        clock, going, messages = (
-            np.zeros(1, dtype=np.intp),
-            np.ones(count, dtype=bool),
-            [""] * count,
-        )
+        clock, messages = np.zeros(1, dtype=np.intp), [""] * count
+        going = np.ones(count, dtype=bool)
         bar = Progress(self._plan.progress)
         try:
             while clock[0] < steps and going.any():
@@ -229,7 +227,7 @@ class LaneLoop:
         return sense if self._noisy else lambda *_: None
 
     def _end(self, statistics: Statistics, ending: Mask, stop: Array, out: Runs) -> None:
-        """Write the outcomes of the runs that end at the current step."""
+        """Write into `out` the outcomes of the runs that end at the current step."""
         count = len(ending)
         diverged = (stop == STOPS.index("diverged"))[:count]
 
@@ -241,7 +239,7 @@ class LaneLoop:
         if (ending & diverged).any():
             write(ending & diverged)
         if (ending & ~diverged).any():
-            # The last state is added, unless the run diverged and the state is not finite.
+            # The last state is added, except for diverged runs, whose state may not be finite.
             last = self.last_row()
             statistics.add(self.done, self.split(last), last)
             write(ending & ~diverged)
@@ -255,25 +253,15 @@ class LaneLoop:
 
 
 class LaneRows:
-    """Recorded rows of runs, one for each `every` steps, and the ends of the runs.
-
-    The rows of run k before its end are ``kept[:counts[k], :, k]``, with the columns of the loop.
-    """
+    """Recorded rows of a single run, one for each `every` steps, with the columns of the loop."""
 
     span = _SPAN
 
-    def __init__(self, loop: LaneLoop, every: int, count: int) -> None:
-        self.every, self._count = every, count
-        self.kept = np.empty((loop.steps // every + 2, loop.width, count))
-        self.ends = {"steps": np.zeros(count), "last": np.zeros((count, loop.width))}
-
-    @property
-    def counts(self) -> list[int]:
-        """Number of rows of each run before its end."""
-        return [-(-int(steps) // self.every) for steps in self.ends["steps"]]
+    def __init__(self, loop: LaneLoop, every: int) -> None:
+        self.every, self.kept = every, np.empty((loop.steps // every + 2, loop.width))
 
     def over(self, q: Array, v: Array) -> Mask:
-        """Return that no run ends early."""
+        """Return False for each run: no run ends early."""
         return np.zeros(len(q), dtype=bool)
 
     def reset(self) -> None:
@@ -281,22 +269,20 @@ class LaneRows:
 
     def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
         """Store rows; see `Statistics`."""
-        begin, self._next = -(-first // self.every), -(-first // self.every) + len(rows[0])
-        by_row = np.concatenate(rows, axis=2)[:, : self._count]
-        self.kept[begin : self._next] = by_row.transpose(0, 2, 1)
+        begin = -(-first // self.every)
+        self.kept[begin : begin + len(rows[0])] = np.concatenate(rows, axis=2)[:, 0]
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the step at which runs end, and the last added row."""
-        last = self.kept[self._next - 1].T
-        return {"steps": np.full(self._count, float(done)), "last": last}
+        """Return the step at which the run ends."""
+        return {"steps": np.full(LANES, float(done))}
 
 
 def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
     """Simulate a plan, or a single dispersed run of it (`runs`), with the compiled loop."""
     every, dt, loop = plan.times.every, plan.times.dt, LaneLoop(plan, plant, runs)
-    rows = LaneRows(loop, every, 1)
+    rows = LaneRows(loop, every)
     try:
-        [stopped] = loop.fly(rows, rows.ends, runs)
+        [stopped] = loop.fly(rows, {"steps": np.zeros(1)}, runs)
     except KeyboardInterrupt:
         if not loop.done:
             raise
@@ -307,7 +293,7 @@ def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
     count = -(-loop.done // every)
     t = np.append(every * np.arange(count) * dt, loop.done * dt)
     count += not stopped.startswith(("diverged", "interrupted"))
-    q, nu, u, momentum, center = (rows.kept[:count, part, 0] for part in loop.columns)
+    q, nu, u, momentum, center = (rows.kept[:count, part] for part in loop.columns)
     v = plant.state.spread(nu)
     return Recording(t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled")
 

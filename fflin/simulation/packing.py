@@ -47,7 +47,7 @@ def packed(plan: Plan, plant: Plant) -> loop.Arguments:
             moments=h * (np.array(method.moments) * h),
         ),
         law=_law(plan, plant, mechanics),
-        # Commands that would act after the end need no space in the delay line.
+        # Commands that would act only after the end of the run need no space in the delay line.
         channel=channel_of(
             plan.limits, plan.initial, plan.times.sample, min(plan.times.delay, plan.times.steps)
         )._replace(delay=[float(plan.times.delay)]),
@@ -127,7 +127,7 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> policies.Law
 
 
 def no_law(state: StateMap, u: Array) -> policies.Law:
-    """Return a law without commands, which only computes states and errors."""
+    """Return a law that gives no commands; it only computes states and errors."""
     law = empty(policies.LAW)
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
@@ -202,7 +202,7 @@ def _filtered(
 
 
 def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
-    """Return the allocation of one robot's commands (`asking`) to the other's inputs (`giving`)."""
+    """Return the allocation of commands for the robot `asking` to inputs of the robot `giving`."""
     names, tree = plant.actuation.names, batch_tree(asking.robot)
     assert tree is not None
     size, asks = plant.state.nx // 2, mechanics_of(asking, tree)

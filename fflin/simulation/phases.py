@@ -19,7 +19,8 @@ from fflin.robot.robot import ROOT, Robot
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
-# Largest difference of rates and displacements between the end and the beginning of phases.
+# Largest difference of rates and displacements between the end of a phase and the next phase's
+# start.
 _MET = 1e-6
 
 
@@ -120,7 +121,7 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
 
 
 def _inputs(whole: Motion, state: StateMap, motion: Motion, there: StateMap) -> Array:
-    """Return a motion's inputs (N, nu) in the order of the whole; missing inputs are zero."""
+    """Return a phase's inputs (N, nu) in the order of the whole motion; missing inputs are zero."""
     if more := [name for name in motion.input_names if name not in whole.input_names]:
         raise InputError(
             f"a phase has the input {more[0]}, which the first phase lacks; give the first robot "

@@ -15,12 +15,7 @@ from fflin.base.validation import Array, instance, truth, vector
 from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
 from fflin.control.linear_controller import growing
 from fflin.control.policies import axes_of, bound, fed_back, feedback_of
-from fflin.control.tracking import (
-    Reference,
-    followed,
-    reference_of,
-    tracking_of,
-)
+from fflin.control.tracking import Reference, followed, reference_of, tracking_of
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import Integrator, integrator
@@ -40,7 +35,7 @@ Event: TypeAlias = Callable[[float, Array, Array], float]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 Limits: TypeAlias = "float | str | Mapping[str, Any] | Sequence[Any]"
 
-# Fraction of a step by which the last stage is evaluated earlier if inputs jump at knots.
+# If inputs jump at knots, the last stage is evaluated earlier by this fraction of a step.
 _BEFORE = 1e-6
 
 
@@ -98,7 +93,7 @@ class Plan:
 
     @property
     def last_node(self) -> float:
-        """Time of the last stage, relative to the step; below 1 if inputs jump at knots."""
+        """Time of the last stage as a fraction of the step; below 1 if inputs jump at knots."""
         return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
 
     def channel(self) -> Channel | None:
@@ -116,11 +111,7 @@ class Plan:
 
 
 def start_of(
-    state: StateMap,
-    x0: ArrayLike | None,
-    q0: ArrayLike | None,
-    v0: ArrayLike | None,
-    reference: Reference | None,
+    state: StateMap, options: SimulationOptions, reference: Reference | None
 ) -> tuple[Array, Array]:
     """Return the initial configuration (nq,) and velocity (nv,)."""
 
@@ -130,7 +121,7 @@ def start_of(
             return q.copy(), v.copy()
         return points.start_of(state.robot)
 
-    q, v = points.point_of(state, x0, q0, v0, default)
+    q, v = points.point_of(state, options.x0, options.q0, options.v0, default)
     points.require_slow("the initial velocity", v)
     return q, v
 
@@ -153,7 +144,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
         said = f"target is a model in frame '{target.frame}', expected '{state.frame}'"
         raise InputError(f"{said}, the frame of the motion; q differs between orbital frames")
     goal = state.read(target.q, target.v)
-    # The base states of a model with another reference or frame cannot be copied.
+    # If the model has another reference or frame, its base states cannot be copied.
     same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)
     for name, value in zip(target.state_names, target.x0, strict=True):
         if same or group_of(name) == "q_m":
@@ -162,7 +153,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
 
 
 def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
-    """Bind the policy to the robot, and return the law, which checks its commands."""
+    """Bind the policy to the robot; return the law, which checks the policy's commands."""
     if policy is None:
         return None
     within = (limits.low, limits.high)
@@ -176,9 +167,9 @@ def planned(robot: Robot, policy: object, options: SimulationOptions) -> tuple[P
     policy = followed(policy, robot, held=times.sample * times.dt)
     lin, _ = feedback_of(policy)
     follows = reference_of(policy)
-    state = _state_of(robot, policy, options.frame, options.reference)
+    state = _state_of(robot, policy, options)
     plant = Plant(state, options.disturbance)
-    foresees = None if options.linear is False else predictor(plant, policy, options.linear)
+    foresees = predictor(plant, policy, options.linear)
     method = integrator(options.method)
     if times.fastest * times.dt > method.reach:
         raise InputError(
@@ -186,7 +177,7 @@ def planned(robot: Robot, policy: object, options: SimulationOptions) -> tuple[P
             f"{times.fastest:.4g} 1/s; take at most {method.reach / times.fastest:.2g} s, or "
             "give `sample`"
         )
-    q, v = start_of(state, options.x0, options.q0, options.v0, follows)
+    q, v = start_of(state, options, follows)
     if plant.field:
         plant.field.require_near(q)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=options.dt is None)
@@ -225,10 +216,9 @@ def planned(robot: Robot, policy: object, options: SimulationOptions) -> tuple[P
     return plan, plant
 
 
-def _state_of(
-    robot: Robot, policy: object, frame: Frame | None, reference: pin.SE3 | None
-) -> StateMap:
+def _state_of(robot: Robot, policy: object, options: SimulationOptions) -> StateMap:
     """Return the state map of a motion, with the frame and reference of its policy if known."""
+    frame, reference = options.frame, options.reference
     lin, _ = feedback_of(policy)
     own_frame, own_reference = axes_of(policy)
     if lin is not None and (frame is not None or reference is not None):
@@ -248,18 +238,15 @@ def _state_of(
             f"the policy was designed {made}, frame '{own_frame}', but '{robot.name}' is {flown}in "
             "orbit; design it for the robot that is simulated"
         )
-    return StateMap(
-        robot,
-        reference=own_reference if reference is None else reference,
-        frame=own_frame if frame is None else frame,
-    )
+    reference = own_reference if reference is None else reference
+    return StateMap(robot, reference=reference, frame=own_frame if frame is None else frame)
 
 
 def _initial_inputs(policy: Any, plant: Plant, limits: Saturation) -> Array:
-    """Return the inputs (nu,) before the first command; warn if the policy's exceed the limits."""
+    """Return the inputs (nu,) before the first command; warn if they exceed the limits."""
     robot, actuation, (lin, _) = plant.robot, plant.actuation, feedback_of(policy)
     along = tracking_of(policy)
-    # With allocation, the model's inputs differ from the robot's inputs.
+    # With allocation, the inputs of the policy's model are not the inputs of the robot.
     if lin is not None and lin.input_names == actuation.names:
         where, inputs, initial = "at its target", lin.u0[None], np.asarray(lin.u0)
     elif along is policy is not None:
@@ -284,10 +271,10 @@ def _checked_functions(events: Sequence[Event], callback: Callback | None) -> tu
 
 
 def _rotating(robot: Robot) -> Array:
-    """Return the indices in v of the angular velocities of the base and of all joints but rotors.
+    """Return the indices in v of the rotation rates of the base and of all joints except rotors.
 
-    Their rotation within a step is bounded. Rotors may spin fast, because nothing depends on their
-    angle.
+    The rotation of the base and of these joints within a step is bounded. Rotors may spin fast,
+    because nothing depends on their angle.
     """
     rotors = rotor_names(robot)
     joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]

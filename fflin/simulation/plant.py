@@ -30,7 +30,7 @@ from fflin.robot.robot import Robot
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
 _aba, _crba, _placement = pin.aba, pin.crba, pin.XYZQUATToSE3
-# Velocity above which an infinite disturbance is accepted, because the motion has diverged.
+# Velocity above which a disturbance need not be finite, because the motion has diverged.
 _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
@@ -88,8 +88,8 @@ class Plant:
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
         """Return dv/dt (nv,), and the external wrench (6,) without gravity, in base axes.
 
-        In orbit, the wrench is replaced by zeros behind the power [W] of inputs, disturbance and
-        dampers.
+        In orbit, the wrench is replaced by the power [W] of inputs, disturbance and dampers,
+        followed by zeros.
         """
         if self._faulty:
             given = np.empty(len(u))
@@ -115,7 +115,7 @@ class Plant:
         return rate, push
 
     def isolated(self, *, driven: bool) -> bool:
-        """Return whether no external force acts; with `driven`, the inputs count too."""
+        """Return whether no external force acts; if `driven`, wrenches of inputs count too."""
         driven = driven or bool(self.faults.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         outside = self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
@@ -144,8 +144,8 @@ class Histories(NamedTuple):
 class Conserved:
     """Energy, and momentum: linear, then angular about a fixed point, in world axes."""
 
-    # The fixed point is the base's position in `start`. It replaces the world's origin, because
-    # digits would be lost far away from the origin.
+    # The fixed point is the base's position in `start`. About the world's origin, digits would be
+    # lost if the robot were far away from it.
 
     def __init__(self, robot: Robot, start: Array) -> None:
         self._robot, self.mass = robot, robot.mass
@@ -178,9 +178,9 @@ class Conserved:
 
     def impose(self, q: Array, v: Array, momentum: Array, center: Array) -> None:
         """Set the base's position in `q` and velocity in `v` by centre of mass and momentum."""
-        # r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m). The velocity is corrected by the
-        # deviation of the momentum, so rounding errors are relative to this small correction. M is
-        # in base axes, so it does not depend on the base's position.
+        # r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m). Only the deviation of the
+        # momentum is solved for, so rounding errors are relative to this small correction. M is in
+        # base axes, so it does not depend on the base's position.
         _crba(self._model, self._data, q)
         if self._stored:
             pin.forwardKinematics(self._model, self._data, q)
@@ -225,7 +225,7 @@ class Conserved:
         return Histories(energy, momentum, center, sizes)
 
     def momentum_drift(self, history: Histories, expected: Array) -> Array:
-        """Return the error of the momentum (N,), relative to its upper bounds (11.5)."""
+        """Return the errors (N,) of the momentum, relative to the momentum's bounds (11.5)."""
         scale = history.sizes.max(axis=0)
         scale[1] += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
         missing = self.about_point(history) - expected
@@ -263,8 +263,8 @@ class MomentumReference:
         # Position and velocity of the centre of mass without external forces, as columns.
         self._line = np.column_stack((self._start, self.momentum[:3] * per_mass))
         self._time = np.ones(2)
-        # Rows: the impulse; the displacement that it causes in addition to the initial velocity;
-        # the wrenches of a step. Without external forces all are exactly zero.
+        # Rows: the impulse; the displacement that the impulse causes; the wrenches of a step.
+        # Without external forces all rows are exactly zero.
         self._stack = np.zeros((2 + len(method.weights), 6))
         self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
         weights, moments = h * np.array(method.weights), h * h * np.array(method.moments)
@@ -277,7 +277,7 @@ class MomentumReference:
         return position
 
     def advance(self) -> None:
-        """Advance by a step with the written wrenches."""
+        """Advance by a step under the wrenches that were written for its stages."""
         self._sums[:] = impulse, displacement = self._after.dot(self._stack)
         self.momentum = self._momentum + impulse
         self._line[:, 0] = self._start + displacement[:3]
@@ -308,7 +308,7 @@ class Jacobi(Conserved):
         return found._replace(energy=found.energy + potential)
 
     def momentum_drift(self, history: Histories, expected: Array) -> Array:
-        """Return the relative error of the integral from its initial value plus the work done."""
+        """Compare the integral with its initial value plus the work; return relative errors."""
         missing = np.abs(history.energy - history.energy[0] - expected[:, 0])
         return missing / (self._scale or 1.0)
 

@@ -38,7 +38,7 @@ _GROUPS = {
 _WHEELS = {"speed": "wheel speeds", "wheel": "wheel torques", "momentum": "wheel momenta"}
 
 
-# A limit is drawn if a curve reaches this fraction of it.
+# A limit is drawn if the curve reaches this fraction of the limit.
 _NEAR = 1.0 / 3.0
 
 # A target that moves less than this between rows, in SI units, is at rest.
@@ -46,7 +46,7 @@ _STILL = 1e-12
 
 
 class Curve(NamedTuple):
-    """Values (N,) of a state or input, limits (2,), and prediction and reference (N,), if any."""
+    """Values (N,) of a state or input, limits (2,), and any prediction and reference (N,)."""
 
     key: str  # GROUP.NAME
     group: str  # "speed" and "momentum" of wheels
@@ -64,15 +64,9 @@ class Curve(NamedTuple):
 
     @property
     def near(self) -> list[float]:
-        """Limits that are close to the values."""
+        """Limits that the values come close to."""
         levels: list[float] = self.limits[np.isfinite(self.limits)].tolist()
         return [level for level in levels if level and (self.values / level).max() >= _NEAR]
-
-    def momentum(self, inertia: float) -> Curve:
-        """Convert the speed of a wheel to its momentum [N m s]."""
-        linear, reference = (None if x is None else inertia * x for x in self[6:])
-        scaled = inertia * self.values, inertia * self.limits, linear, reference
-        return Curve(self.key, "momentum", self.name, "N m s", *scaled)
 
 
 def curves(motion: Motion, wheels: Mapping[str, float]) -> Iterator[Curve]:
@@ -89,10 +83,10 @@ def curves(motion: Motion, wheels: Mapping[str, float]) -> Iterator[Curve]:
         if group not in ("q_m", "qdot_m") or entry not in wheels:
             yield Curve(name, group, name, unit, *values)
         elif group == "qdot_m":
-            speed = Curve(name, "speed", name, unit, *values)
-            yield speed
-            if wheels[entry]:
-                yield speed.momentum(wheels[entry])
+            yield Curve(name, "speed", name, unit, *values)
+            if size := wheels[entry]:
+                momenta: Any = (None if x is None else size * x for x in values)
+                yield Curve(name, "momentum", name, "N m s", *momenta)
     inputs = zip(
         input_keys(motion), motion.input_names, motion.input_units, motion.u.T, strict=True
     )
@@ -195,7 +189,7 @@ def _draw_panels(
                 axes.margins(y=0.3)  # room for the names above the curves
             axes.legend(ncols=2 if many else 1, handlelength=1.6)
     if joints is not None:
-        # One legend below, because three panels share the joints, whose names are long.
+        # Put one legend below, because three panels show the same joints and joint names are long.
         limit = {"limit": lines.pop("limit")} if "limit" in lines else {}
         _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
 
@@ -289,7 +283,7 @@ def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -
 
 
 def _drifts(axes: Axes, motion: Motion) -> None:
-    # Drifts below the rounding error of 1 are raised to it, since a logarithmic axis has no zero.
+    # A logarithmic axis has no zero, so smaller drifts are raised to the machine epsilon.
     drifts = {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift}
     shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}
     for color, (label, drift) in zip(COLORS, shown.items(), strict=False):

@@ -20,9 +20,10 @@ LinearLaw: TypeAlias = Callable[[Array], Array]
 
 
 class Predictor(NamedTuple):
-    """Linear model, and a function that creates its law in the initial state.
+    """Linear model, and a function that creates a new instance of its control law.
 
-    States of a continuous-time controller follow the robot's states in the deviation.
+    In the deviation, the robot's states come first, then the states of a continuous-time
+    controller.
     """
 
     lin: LinearModel
@@ -66,7 +67,7 @@ def _checked(plant: Plant, policy: object, linear: object) -> LinearModel:
 
 
 def _law(policy: object, lin: LinearModel) -> Callable[[], LinearLaw] | None:
-    """Return a function that creates a policy's law in deviations; None for a nonlinear policy."""
+    """Return a function that creates a policy's linear law; None for a nonlinear policy."""
     if policy is None:
         return lambda: lambda _: np.zeros(len(lin.u0))
     if isinstance(policy, LinearController):
@@ -88,10 +89,10 @@ def _law(policy: object, lin: LinearModel) -> Callable[[], LinearLaw] | None:
     return lambda: lambda e: own.u0 - K @ (e[fed] + apart)
 
 
-# An overflow is no reason to warn: the prediction is then omitted.
+# After an overflow the prediction is omitted, so NumPy need not warn.
 @np.errstate(over="ignore", invalid="ignore")
 def predict(plan: Any, x: Array, steps: int) -> Array:
-    """Return the predicted states (N, nx) of the linear model in closed loop, if there are any."""
+    """Return the states (N, nx) that the linear closed loop predicts; no rows if it cannot."""
     lin = plan.predictor and plan.predictor.lin.generator
     if lin is None:  # no model, or one in discrete time without its motion between samples
         return x[:0]

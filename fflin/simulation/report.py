@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 # An error has settled when it stays below this fraction of its largest value.
 SETTLED = 0.02
 
-# An error [SI units] that never exceeds THERE is at the target throughout. An error below _NOTHING
-# is not shown. Rounding errors move a robot at rest by less than both.
+# If an error [SI units] never exceeds THERE, the motion is at the target throughout. An error
+# below _NOTHING is not shown. Rounding errors move a robot at rest by less than both limits.
 THERE, _NOTHING = 1e-9, 1e-14
 
-# Fraction of the rows, at the end, for which a settled error must have stayed small.
+# Fraction of the rows at the end of a run in which a settled error must remain small.
 DWELL = 0.05
 
-# Smallest violation of a limit, relative to the limit; less may be an integration error.
+# Smallest reported violation, relative to the limit; a smaller one may be an integration error.
 _SHARE = 1e-3
 
 _MOST, _NAMED = 8, 4  # most lines of a list, and most saturated inputs named in the first line
@@ -47,7 +47,8 @@ _OF_MODES = {"q_m": ("modes", "slosh"), "qdot_m": ("mode rates", "slosh rates")}
 _ALL_OF_MODES = {title for titles in _OF_MODES.values() for title in titles}
 _MODAL = "kg^0.5 m"  # unit of the amplitudes of flexible appendages
 
-# Rotation [deg] up to which a modal amplitude is accurate; the model is linear in it.
+# Rotation [deg] up to which a modal amplitude is accurate, because the model is linear in the
+# amplitude.
 _LINEAR = 5.0
 
 
@@ -102,7 +103,7 @@ def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
         Saturated(name, limit, unit, float(held[near].sum() / held.sum()))
         for name, values, unit, limits in histories
         for limit in limits[np.isfinite(limits) & (limits != 0.0)].tolist()
-        # A wheel speed approaches its limit slowly; an input is cut exactly at its limit.
+        # A wheel speed only approaches its limit, but an input is clipped exactly at its limit.
         if held[
             near := np.abs(values - limit) <= (1e-3 if "qdot_m." in name else 1e-9) * abs(limit)
         ].any()
@@ -135,7 +136,7 @@ def _shown(value: float) -> str:
 
 
 def settled_at(sizes: Array) -> Indices:
-    """Return the row from which errors (N, ..) have settled; N for errors that have not."""
+    """Return the row from which each error (N, ..) has settled; N if an error has not settled."""
     outside = sizes > np.maximum(SETTLED * sizes.max(axis=0), THERE)
     first = len(sizes) - outside[::-1].argmax(axis=0)
     return np.where(outside.any(axis=0), first, 0)
@@ -144,7 +145,7 @@ def settled_at(sizes: Array) -> Indices:
 def is_late(settled: Array | Indices | int, count: int) -> Mask | bool:
     """Return whether errors settle too late in a run of `count` rows to count as settled.
 
-    So an error that only passes through zero at the end does not count as settled.
+    An error that merely passes through zero at the end therefore does not count as settled.
     """
     return settled > (1.0 - DWELL) * count
 
@@ -164,7 +165,7 @@ class ErrorHistory(NamedTuple):
 
     @property
     def late(self) -> bool:
-        """Whether the error has not settled."""
+        """Whether the error settles too late or not at all."""
         return bool(is_late(self.settled, len(self.size)))
 
     @property
@@ -265,7 +266,7 @@ def motion_record(motion: Motion) -> dict[str, object]:
 
 
 def _phases(motion: Motion) -> list[list[str]]:
-    """Return the table of phases; it has no impacts for a motion from a file."""
+    """Return the table of phases; for a motion from a file, the table lacks the impacts."""
     table = [["phase", "", "t [s]", "energy [J]", "|p| [N s]", "|h| [N m s]"]]
 
     def row(name: str, when: str, time: float, energy: float, momentum: Array) -> None:
@@ -323,7 +324,7 @@ def pushed(of: object) -> bool:
 
 
 def verdict(motion: Motion, kinds: list[ErrorHistory]) -> str:
-    """Return one line: whether a motion settled at its target, and why not."""
+    """Return one line: whether a motion settled at its target, and if not, why."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
@@ -351,7 +352,7 @@ def verdict(motion: Motion, kinds: list[ErrorHistory]) -> str:
 
 
 def _full(motion: Motion) -> str:
-    """Return the inputs and wheels that were at a limit, with their fraction of the run."""
+    """Return the inputs and wheels at a limit, each with the fraction of the run spent there."""
     shares: dict[str, float] = {}  # sum for both limits
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share
@@ -396,5 +397,5 @@ def _largest_inputs(motion: Motion) -> str:
             key = (group_of(name), unit.replace(" ", "\u00a0"))
             kinds[key] = max(kinds.get(key, 0.0), float(value))
     shown = [f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()]
-    # Non-breaking spaces keep name, value and unit on one line.
+    # Non-breaking spaces keep a name, its value and the unit on one line.
     return folded([f"largest inputs: {', '.join(shown) or 'none'}"])

@@ -16,7 +16,7 @@ from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Conserved, MomentumReference, Plant
 from fflin.simulation.times import LARGEST_TURN
 
-# Function that takes one step from (t, q, v) with initial inputs u, and returns q and v at its end.
+# Function that takes one step from (t, q, v) with initial inputs u; returns q and v at the end.
 Advance: TypeAlias = Callable[[float, Array, Array, Array], tuple[Array, Array]]
 
 STOPS = ("", "diverged", "left the chart", "stopped")
@@ -112,7 +112,7 @@ def _advance(
 
         def f(t: float, q: Array, v: Array) -> Array:
             nonlocal stages
-            # The policy has already been evaluated at the first stage.
+            # At the first stage, u is already the policy's command.
             a, push = stage(t, q, v, ask(min(t, last), q, v) if ask and stages else u)
             if pushed:
                 wrenches[stages][:] = wrench(q, push)
@@ -138,7 +138,7 @@ def stop_conditions(plan: Plan) -> StopConditions:
 
 
 def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array], str]:
-    """Return a function that returns why a run ends, or an empty text if the run continues."""
+    """Build a function that returns why a run ends, or an empty text if the run continues."""
     # The entries of a list are read faster than the entries of an array.
     stop = stop._replace(squares=stop.squares.tolist())
     anywhere = stop._replace(sign=[0.0])

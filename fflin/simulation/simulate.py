@@ -239,7 +239,7 @@ def motion_of(plan: Plan, plant: Plant, conserved: Conserved, run: Recording) ->
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
         momentum_drift=conserved.momentum_drift(history, run.momentum),
-        # In orbit, the centre of mass does not move along a straight line.
+        # In orbit, the centre of mass does not move along a straight line even without forces.
         com_drift=np.linalg.norm(history.center - run.center, axis=1)[: 0 if robot.orbit else None],
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,

@@ -20,15 +20,16 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from fflin.simulation.plan import SimulationOptions
 
-# Bounds of an automatic duration [s], and the step of the linear loop that determines it [s].
+# Bounds of an automatic duration [s], and the time step [s] of the linear loop that determines it.
 SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
 LARGEST_TURN = 1.0  # [rad] largest rotation within a step for which integrators are accurate
 _STEP = 0.01  # [s]
 _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
-# Steps above which an automatically chosen step is reported (half a minute of computing), and
-# refused (some hours).
+# If the step is chosen automatically, a larger number of steps than the first causes a warning
+# (half a minute of computing). A larger number than the second is refused (some hours).
 _MANY_STEPS, _ENDLESS = 50_000, 10_000_000
-# Rows above which only some steps are recorded, and the number of rows then.
+# With more rows than the first number, only some steps are recorded, in about as many rows as the
+# second.
 _MANY_ROWS, _FEW_ROWS = 100_000, 10_000
 _FOREVER = 1e100  # [s]; its inverse squared does not underflow
 
@@ -64,7 +65,7 @@ class Times(NamedTuple):
 
     @property
     def slow(self) -> float:
-        """Square of the largest angular velocity at which the rotation per step is small enough."""
+        """Square of the largest angular velocity for which rotations per step are small enough."""
         return float((LARGEST_TURN / self.dt) ** 2)
 
     def require_room(self, width: int, *, chosen: bool) -> None:
@@ -118,10 +119,7 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
     steps = max(1, round(duration / dt))
     if abs(steps * dt - duration) > 1e-6 * duration:
         if sample or delay:
-            raise InputError(
-                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s, "
-                "because the input is sampled or delayed; choose dt accordingly"
-            )
+            _in_steps("duration", duration, dt)  # raises an error
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
     if sample is None:
@@ -145,7 +143,7 @@ def _fastest_pole(policy: object, follows: TrajectoryFeedback | None) -> float:
 
 
 def _in_steps(name: str, time: float, dt: float) -> int:
-    """Convert a time [s] to a number of steps."""
+    """Convert a time [s] to a number of steps; raise `InputError` unless it is a multiple of dt."""
     if abs(round(time / dt) * dt - time) > 1e-6 * dt:
         raise InputError(
             f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
@@ -155,7 +153,7 @@ def _in_steps(name: str, time: float, dt: float) -> int:
 
 
 def _part_of(sample: float, largest: float, *times: float) -> float:
-    """Return a step of which the sample time and, if possible, the other times are multiples."""
+    """Return a step that divides the sample time and, if possible, the other times."""
     least = int(np.ceil(sample / largest))
     for parts in range(least, least + 1000):
         dt = sample / parts

@@ -1,7 +1,7 @@
 r"""Derivatives of a linear model with respect to the robot's parameters.
 
-M and RNEA are linear in the ten dynamic parameters of each body. So the derivative with respect to
-a parameter is M or RNEA of a robot whose bodies consist only of the unit change.
+M and RNEA are linear in the ten dynamic parameters of each body. So their derivative with respect
+to a dynamic parameter is M or RNEA of a robot in which this parameter is 1 and all others are 0.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ WEIGH = (CenterOfMass, Momentum)
 
 # Step of a finite difference: the relative change of M by the changed parameter.
 _STEP = 2e-3
-# Smallest relative change of A or B by such a step that rounding errors do not hide.
+# If such a step changes A or B by less than this fraction, rounding errors hide the change.
 _LEAST = 1e-6
 
 
@@ -75,8 +75,8 @@ class ModelDerivatives:
     def over(self, parameters: Sequence[Parameter]) -> tuple[Array, ...]:
         """Return dA, dB, dC, dD, df0 and dy0 (P, ..)."""
         rates = derivatives_of(parameters, self.bodies, self._of_bodies, self._u)
-        # A, B and f0 are affine in the rates. A last row with zero rates gives the constant part,
-        # which is subtracted below.
+        # A, B and f0 are affine in the rates. The additional last row has zero rates, so it gives
+        # the constant part, which is subtracted below.
         ready, state, nu = self._ready, self._ready.map, self._ready.map.velocities(self.lin.v)
         count, nv = len(rates.c) + 1, len(nu)
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
@@ -106,9 +106,9 @@ class ModelDerivatives:
         return A, B, C, D, f0, y0[..., 0]
 
     def _seen(self, parameters: Sequence[Parameter], rates: AccelerationDerivatives) -> Array:
-        """Return dC, dD and dy0, side by side (P, ny, ..), of outputs that depend on masses."""
-        # The robot's mass times such an output is quadratic in a parameter, if the rates change
-        # linearly with it. So a difference of three values is exact for any step.
+        """Return dC, dD and dy0 side by side (P, ny, ..), for outputs that depend on masses."""
+        # If the rates change linearly with a parameter, the robot's mass times such an output is
+        # quadratic in the parameter. So a difference of three values is exact for any step.
         lin, now = self.lin, self._rates
         found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
         outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)
@@ -143,7 +143,7 @@ class ModelDerivatives:
 
 
 def with_bodies(robot: Robot, one: Parameter, size: float) -> dict[int, pin.Inertia]:
-    """Return {joint: body} of the bodies that change if a parameter grows by `size`."""
+    """Return {joint: body} with the changed bodies if a parameter grows by `size`."""
     found = {}
     for joint, change in one.bodies.items():
         changed = robot.model.inertias[joint].toDynamicParameters() + size * change
@@ -155,7 +155,7 @@ def with_bodies(robot: Robot, one: Parameter, size: float) -> dict[int, pin.Iner
 
 
 def difference(derivatives: ModelDerivatives, one: Parameter) -> float:
-    """Return the relative error of the derivatives of A and B, by fourth-order differences."""
+    """Compare the derivatives of A and B with fourth-order differences; return the error."""
     if not one.bodies:
         raise InputError(
             f"'{one.name}' is not a parameter of a link or body; only such parameters can be "
@@ -202,7 +202,8 @@ def _units() -> Array:
 
 
 UNITS = _units()
-# Valid bodies whose parameters span all ten: a mass at the joint, masses beside it, and inertias.
+# Valid bodies whose parameters span all ten: a mass at the joint, masses away from it, and
+# inertias.
 _BODIES = (
     pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3))),
     *(pin.Inertia(1.0, axis, np.zeros((3, 3))) for axis in _E),
@@ -334,7 +335,7 @@ def derivatives_of(
 
 
 def _of_force(parameter: Parameter, at: BodyDerivatives, u: Array) -> AccelerationDerivatives:
-    """Return the derivatives over a parameter that changes only forces, not bodies."""
+    """Return the derivatives of the rates over a parameter that changes only forces, not bodies."""
     state, rates, size = at.state, at.rates, len(at.inverse)
     F: Array = np.zeros(size)
     B = np.zeros_like(rates.by_u)

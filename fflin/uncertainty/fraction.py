@@ -6,10 +6,9 @@ The force F that accelerates a link with the accelerations a is
 
 X is the Jacobian of the link's centre of mass in the axes of its inertia, D = blkdiag(m E, I), and
 T is the shift of an uncertain centre of mass (otherwise the identity E). The numbers of signals
-that parameters multiply are: 3 for a mass, 6 for a density, 1 for an entry on the diagonal of the
-inertia, 2 for an entry beside it, and 2 in T and 2 in T^T for a coordinate of the centre of mass.
-These numbers are minimal: they are the ranks of the changes of M, since X has full rank on a free
-base.
+that parameters multiply are: 3 for a mass, 6 for a density, 1 for a diagonal entry of the inertia,
+2 for an off-diagonal entry, and 2 in T and 2 in T^T for a coordinate of the centre of mass. These
+numbers are minimal: they are the ranks of the changes of M, since X has full rank on a free base.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ class Block(NamedTuple):
 
     @property
     def repeats(self) -> int:
-        """Number of signals that the delta multiplies."""
+        """Number of signals that the block's delta multiplies."""
         return sum(each.repeats for each in self.ranges)
 
     def values(self, value: float) -> dict[str, float]:
@@ -75,8 +74,8 @@ class Block(NamedTuple):
         return {each.parameter.name: each.middle + each.half * delta for each in self.ranges}
 
 
-# Number of signals for each part. "inertia" is an entry beside the diagonal, or a wheel's inertia,
-# which is subtracted from its carrier. "frequency" is squared.
+# Number of signals for each part. "inertia" is an off-diagonal entry, or a wheel's inertia, which
+# is also subtracted from the wheel's carrier. "frequency" is squared.
 _REPEATS = {"mass": 3, "density": 6, "com": 4, "inertia": 2, "frequency": 2}
 
 
@@ -143,7 +142,8 @@ class _Form:
         self.unit = np.eye(self.ends[-1])
         self.next = list(np.cumsum((0, *repeats[:-1])))
         self.z = np.zeros((sum(repeats), self.ends[-1]))
-        # Inertial and spring forces minus input forces, which is zero by the equation of motion.
+        # Inertial and spring forces minus input forces. The equation of motion sets this sum to
+        # zero.
         self.force = np.zeros((len(M), self.ends[-1]))
         g, (stiffness, damping, _) = state.groups, state.robot.springs
         a, x, u, _ = self.parts(self.force)
@@ -157,7 +157,7 @@ class _Form:
     def times(self, at: int, signals: Array) -> Array:
         """Return a parameter's change times signals: (shift + half * delta) * signals.
 
-        The varying part is a new w, and `half` times the signals is added to z.
+        The product delta * half * signals is a new w, and `half` times the signals is added to z.
         """
         one, first = self.ranges[at], self.next[at]
         self.next[at] += len(signals)

@@ -77,7 +77,7 @@ class Parameters(dict[str, Parameter]):
         return [names[i] for i in matching("parameter", key, names)]
 
     def ranked(self, only: str | None) -> list[str]:
-        """Return the matches of a name, part or pattern, without bodies whose links match."""
+        """Return the matches of a name, part or pattern, but no body if its links match."""
         found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
         found = found or self.find(str(only))
         return [name for name in found if self[name].of not in self._sums] or found
@@ -124,7 +124,7 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
 
 
 def _of_mode(joint: Joint, index: int, stiffness: float, damping: float) -> Iterator[Parameter]:
-    r"""Yield the frequency and damping ratio of a mode with inertia I and a clamped link.
+    r"""Yield the frequency and damping ratio of a mode with inertia I, for a link fixed in space.
 
     The stiffness is :math:`I \omega^2` and the damping :math:`2 \zeta I \omega`.
     """
@@ -152,7 +152,8 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
             joint, placement = find_frame(robot.model, item.frame)
             where, along = np.array(item.position), np.array(item.direction)
             for letter, d in zip(AXES, np.eye(3), strict=True):
-                # The direction has unit length, so only the perpendicular part of d changes it.
+                # The direction has unit length, so only the part of d perpendicular to it has an
+                # effect.
                 turned = d - along * (along @ d)
                 moved = np.concatenate((np.zeros(3), np.cross(d, along)))
                 tilted = np.concatenate((turned, np.cross(where, turned)))
@@ -184,7 +185,7 @@ class Variants:
         self.pieces = robot.pieces
 
     def refusal(self, values: Mapping[str, float]) -> str:
-        """Return why {parameter: value} are not physically realisable, or an empty string."""
+        """Return why {parameter: value} is not physically realisable; an empty string if it is."""
         try:
             changed = self._changed(values)
             if self._robot.wheels or self._robot.modes:  # a link may be too light for them
@@ -276,9 +277,9 @@ def _piece(piece: Piece, parts: Mapping[str, float]) -> tuple[Piece, float]:
 
 
 def _no_body(before: Piece, piece: Piece, name: str) -> str:
-    """Return why a changed link is physically impossible, or an empty text.
+    """Return why a changed link is physically impossible, or an empty text if it is possible.
 
-    A link that was impossible before the change is accepted unless it becomes worse.
+    A link that was impossible before the change is accepted unless the change makes it worse.
     """
     if not piece.mass > 0.0:
         return f"the mass of '{name}' is {piece.mass:.4g} kg, expected above 0"

@@ -23,7 +23,7 @@ from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.parameters import Parameter, Variants
 from fflin.uncertainty.worst import Worst, searched
 
-# Number of rejected draws per valid draw above which the ranges are refused.
+# Ranges are refused if there are more rejected draws per valid draw than this.
 _TRIES = 1000
 
 

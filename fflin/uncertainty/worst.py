@@ -22,28 +22,30 @@ if TYPE_CHECKING:
     from fflin.uncertainty.uncertain import Uncertain
 
 _CORNERS = 256
-# Number of steps of a climb, and step lengths relative to half a range; 1e9 leads to a corner.
+# Number of steps of a local search, and step lengths relative to half a range; 1e9 leads to a
+# corner.
 _STEPS, _LENGTHS = 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
-# Number of candidates with an exact criterion in each step, number of frequencies for the quick
-# criterion, and step of finite differences.
+# Number of candidates in each step for which the exact criterion is computed, number of
+# frequencies for the quick criterion, and step of finite differences.
 _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
 
 # Function of rows of deltas that returns a criterion; larger values are worse.
 Figure: TypeAlias = Callable[[Array], Array]
 
-# Largest number of signals for slycot, whose time grows with the fifth power of this number.
+# Largest number of signals for which slycot is used. Its time grows with the fifth power of this
+# number.
 _SIGNALS = 24
 # Number of frequencies in the first grid, number of frequencies checked inside an interval, and
 # largest number of divided intervals or slycot calls.
 _LOOK, _INSIDE, _DIVISIONS = 120, 5, 100
-# An interval is not divided if its bound is within this factor of the bound at one frequency.
+# An interval is not divided if its bound is at most this factor times the bound at some frequency.
 _NEAR = 1.01
 
 Scaling: TypeAlias = tuple[Array, Array]  # d > 0 and g, (n,) each
 
 
 class Figures(NamedTuple):
-    """One criterion of a loop: from a few frequencies, exact, and as a test against a bound."""
+    """One criterion of a loop: at a few frequencies, exact, and as a test against a bound."""
 
     quick: Figure
     exact: Figure
@@ -130,7 +132,7 @@ def searched(of: Uncertain, lft: LFT, gain: Any, samples: int, seed: int) -> Wor
     else:
         corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
     physical = np.array([of.makes(corner) for corner in corners])
-    # Draws come last, so that a search with more draws repeats the search with fewer draws first.
+    # Draws come last, so a search with more draws begins like a search with fewer draws.
     tried = np.vstack((middle, corners[physical], draws))
     # The disk margin uses (S - T)/2 with inputs scaled by sqrt(R_ii), as in control.gain.
     scale = np.sqrt(getattr(gain, "R", np.eye(len(K))).diagonal())
@@ -166,7 +168,7 @@ class Gain(NamedTuple):
 
 
 class Loops:
-    """Closed loops u = -K x of an LFT at rows of deltas (N, k)."""
+    """Closed loops of an LFT with u = -K x, at rows of deltas (N, k)."""
 
     def __init__(self, lft: LFT, K: Array) -> None:
         self.lft, self.K = lft, K
@@ -177,7 +179,7 @@ class Loops:
         return A - B @ self.K, B
 
     def undamped(self, rows: Array) -> Array:
-        """Return minus the least damping ratio (N,); it is 0 or more for an unstable loop."""
+        """Return the negative of the least damping ratio (N,); it is >= 0 for an unstable loop."""
         poles = np.linalg.eigvals(self.matrices(rows)[0])
         found: Array = (poles.real / np.maximum(np.abs(poles), 1e-300)).max(axis=-1)
         return found
@@ -194,7 +196,7 @@ class Loops:
         return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(found))
 
     def figures(self, of: Gain) -> Figures:
-        """Return the criterion of a channel's largest gain."""
+        """Return the criterion "largest gain" of a channel."""
         middle = np.zeros((1, len(self.lft.repeats)))
         sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))
         at = np.argsort([-self.gains(of, middle, np.array((w,)))[0] for w in sizes])
@@ -224,7 +226,7 @@ class Loops:
 def _largest(figures: Figures, tried: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
     """Maximise a criterion from the first sample, and from each sample worse than the result.
 
-    So the result is at least as bad as each sample, and never less bad with more samples.
+    The result is at least as bad as each sample, and more samples never make it less bad.
     """
     best, at = _climbed(figures, tried[0], makes)
     ahead = tried[1:]
@@ -274,12 +276,12 @@ def _safe(loops: Loops) -> float:
 
 
 # Upper bounds of the structured singular value mu for real repeated parameters. With real
-# parameters, mu may be discontinuous in the frequency. Bounds on a grid of frequencies then do not
-# hold between them. So one scaling is used for a whole interval of frequencies.
+# parameters, mu may be discontinuous in the frequency, so bounds on a grid do not hold between its
+# frequencies. Therefore one scaling is used for a whole interval of frequencies.
 
 
 def perron(Z: Array) -> Array:
-    """Return scalings d > 0 (.., n, 1) with small d Z / d, from the Perron vectors of |Z|."""
+    """Return scalings d > 0 (.., n, 1) that make d Z / d small, from the Perron vectors of |Z|."""
     sizes = np.abs(Z) + 1e-9 * np.abs(Z).max(axis=(-2, -1), keepdims=True) + 1e-300
     right, left = np.ones((2, *Z.shape[:-1], 1))
     for _ in range(100):
@@ -339,7 +341,7 @@ def largest_bound(
 
 
 def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
-    """Return candidate scalings for Z, including the one of AB13MD if blocks are given."""
+    """Return candidate scalings for Z, including the scaling by AB13MD if blocks are given."""
     none: Array = np.zeros(len(Z))
     found: list[Scaling] = [(perron(Z)[:, 0], none)]
     if len(Z) == 1 and len(blocks) and Z[0, 0].imag:

@@ -33,8 +33,8 @@ _ARGUMENTS = (
     *("--disable-dev-shm-usage", "--disable-extensions"),
 )
 
-# Chromium reads commands from descriptor 3 and answers on descriptor 4. It ends when they are
-# closed, so it never outlives this process.
+# Chromium reads commands from file descriptor 3 and answers on file descriptor 4. It ends when
+# they are closed, so it never outlives this process.
 _WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 
 _PATIENCE = 120.0  # [s] time limit, long enough for a slow machine without a graphics card
@@ -90,8 +90,8 @@ def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[in
 def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) -> list[bytes]:
     """Return a PNG of the page at each time.
 
-    Pictures show only the scene, with a legend on the first `keys` of them. If `keys` is negative,
-    they show the whole page.
+    Pictures show only the scene, and the first `keys` pictures also a legend. If `keys` is
+    negative, all pictures show the whole page.
     """
     program = find_chromium()
     try:
@@ -113,7 +113,7 @@ def _shots(
     for index, moment in enumerate(times):
         if keys >= 0:
             browser.evaluate(f"fflin.plain(true, {json.dumps(index < keys)})")
-        # Wait for two animation frames: the first draws, the second follows the display.
+        # Wait for two animation frames: the first draws the scene, the second follows its display.
         browser.evaluate(
             f"fflin.seek({float(moment)!r}); new Promise(done => requestAnimationFrame(() => "
             "requestAnimationFrame(() => done(1))))"
@@ -133,8 +133,9 @@ def _browser(program: str, patience: float) -> Iterator[_Browser]:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            # Its temporary files are removed with the folder. A long folder name is not used: the
-            # path of its socket may have only about a hundred characters.
+            # The browser's temporary files are removed with the folder. The folder's name is
+            # short, because the path of the browser's socket may have only about a hundred
+            # characters.
             env={**os.environ, **({"TMPDIR": folder} if len(folder) < 56 else {})},
             start_new_session=True,
         )
@@ -203,7 +204,7 @@ class _Browser:
         self._session = {"sessionId": attached["sessionId"]}
 
     def quit(self) -> None:
-        """Ask the browser to quit, so that it removes its files; if killed, it would not."""
+        """Ask the browser to quit; unlike a killed browser, it then removes its temporary files."""
         self._session = {}
         self.tell("Browser.close")
 

@@ -22,14 +22,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.view.page import (
-    Recorder,
-    build_page,
-    corner_points,
-    rounded,
-    stage_info,
-    subtitle,
-)
+from fflin.view.page import Recorder, build_page, corner_points, rounded, stage_info, subtitle
 from fflin.view.playback import body_poses
 from fflin.view.scene import Drawing, Visualizer, body_paths
 
@@ -147,7 +140,7 @@ class Live:
         self.close()
 
     def _forward(self, command: bytes) -> None:
-        # Until the server exists, the recorder stores the commands.
+        # Until the server exists, the recorder only stores commands.
         if hasattr(self, "_server"):
             self._server.send(command)
 
@@ -174,14 +167,11 @@ def _joints(robot: Robot) -> list[dict[str, Any]]:
     for joint in robot.joints:
         if joint.name in robot.wheels:
             continue
-        low, high = -np.pi, np.pi
+        high = 1.0 if joint.prismatic else np.pi
+        low = -high
         if not joint.unbounded:
-            low = max(
-                float(model.lowerPositionLimit[joint.idx_q]), -1.0 if joint.prismatic else -np.pi
-            )
-            high = min(
-                float(model.upperPositionLimit[joint.idx_q]), 1.0 if joint.prismatic else np.pi
-            )
+            low = max(float(model.lowerPositionLimit[joint.idx_q]), low)
+            high = min(float(model.upperPositionLimit[joint.idx_q]), high)
             if not low < high:
                 low, high = low - 1.0, low + 1.0
         found.append({"name": joint.name, "low": low, "high": high, "length": joint.prismatic})
@@ -189,7 +179,7 @@ def _joints(robot: Robot) -> list[dict[str, Any]]:
 
 
 class Server:
-    """Server of a page and its updates; it ends with its process."""
+    """Server of a page and its updates; it stops when its process ends."""
 
     def __init__(
         self,
@@ -284,7 +274,7 @@ def _listen(port: int) -> socket.socket:
 
 
 class _Guarded(RequestHandler):
-    """Handler that accepts only this machine's names as host, to refuse pages of other sites."""
+    """Handler that accepts only this machine's names as host, and so refuses other sites' pages."""
 
     def initialize(self, hosts: set[str], **fields: Any) -> None:
         self._hosts = hosts
@@ -305,7 +295,7 @@ class _Page(_Guarded):
 
 
 class _Socket(_Guarded, WebSocketHandler):
-    """Connection to one browser, which gets the newest state when the previous one has arrived."""
+    """Connection to one browser, which gets the newest state after the previous has arrived."""
 
     _busy = False
     _behind = False

@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from fflin.analysis.modes import Mode, Modes
     from fflin.linear.model import LinearModel
 
-# Number of poses in a period, and its duration on the screen [s]. The amplitude is limited by the
-# largest rotation [rad], and by the largest displacement relative to the robot's size.
+# Number of poses in a period, and the period's duration on the screen [s]. The amplitude is
+# limited by the rotation _ANGLE [rad], and by the displacement _SHARE relative to the robot's
+# size.
 _PHASES, _PERIOD = 48, 2.0
 _ANGLE, _SHARE = 0.5, 0.14
 
@@ -98,7 +99,7 @@ def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size
             found.append(body_poses(robot, data, state.to_pinocchio(x)[0]))
         return np.array(found)
 
-    # Displacement of the corners per unit amplitude, from a small amplitude.
+    # Displacement of the corners per unit amplitude, computed with a small amplitude.
     small = 1e-4
     rest = corner_points(drawing, body_poses(robot, data, lin.q))
     moved = np.array([corner_points(drawing, each) - rest for each in poses(small)])

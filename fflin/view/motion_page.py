@@ -24,14 +24,8 @@ from fflin.view.page import (
     thrusters,
 )
 from fflin.view.panel import panel
-from fflin.view.playback import (
-    Playback,
-    body_poses,
-    frame_indices,
-    payloads,
-    play_back,
-)
-from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
+from fflin.view.playback import Playback, body_poses, frame_indices, payloads, play_back
+from fflin.view.scene import Drawing, Visualizer, animation, body_paths
 
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
@@ -43,8 +37,8 @@ Moving: TypeAlias = "tuple[Drawing, Array]"
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
 
-# Length of the arrow of the largest force, and the path length above which the camera follows the
-# base by default, both in robot sizes.
+# Length of the largest force's arrow. The camera follows the base by default if its path is longer
+# than _FAR. Both are in robot sizes.
 ARROW, _FAR = 0.62, 20.0
 
 
@@ -61,7 +55,8 @@ def motion_page(
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and notes about missing drawings; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
-    t, state = motion.t[shown], chart_of(robot, motion)
+    frame = cast("Frame", motion.frame)
+    t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(robot, state, t, motion.q[shown], motion.u[shown], tool)
     goal = _target(motion, state, shown) if target is None else target[None]
     data = robot.model.createData()
@@ -84,7 +79,7 @@ def motion_page(
     for each, poses in moving:
         each.place(poses[0])
         clips += each.tracks(t - t[0], poses)
-    window.send(Animation(clips))
+    window.record(animation(clips))
 
     # Robots of the phases, if known. After a capture, the robot includes the payload.
     flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
@@ -98,14 +93,14 @@ def motion_page(
         scene=scene,
         subtitle=about[0],
         tool=tool,
-        frame=motion.frame,
+        frame=frame,
         held=[each for each, _ in held.values()],
     )
     size = info["size"]
     points = _points(film, size, (drawing, goals), held.values())
     info["floor"][2] = float(points[:, 2].min())
     if follow is None:
-        # If a long path were in view as a whole, the robot would be a dot.
+        # If the whole of a long path were in view, the robot would be only a dot.
         follow = bool(np.ptp(points, axis=0).max() > _FAR * size)
     if follow:
         points = frame_points(drawing, film, size, follow=True)
@@ -153,18 +148,9 @@ def _points(film: Playback, size: float, goal: Moving, held: Iterable[Moving]) -
     """Return corners (M, 3) of the robot, its target and its payloads at some frames."""
     points = [frame_points(goal[0], film, size)]
     for drawing, rows in (goal, *held):
-        points += [corner_points(drawing, poses) for poses in rows[:: _step(rows)]]
+        step = max(1, len(rows) // 24)
+        points += [corner_points(drawing, poses) for poses in rows[::step]]
     return np.concatenate(points)
-
-
-def _step(rows: Array) -> int:
-    """Return the step between rows that selects about 24 of them."""
-    return max(1, len(rows) // 24)
-
-
-def chart_of(robot: Robot, motion: Motion) -> StateMap:
-    """Return the state map with a motion's frame and reference."""
-    return StateMap(robot, reference=motion.reference, frame=cast("Frame", motion.frame))
 
 
 def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
@@ -175,7 +161,7 @@ def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
 
 
 def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool = False) -> Array:
-    """Return points (M, 3) for the camera: body corners and tips of forces at some frames."""
+    """Return points (M, 3) that the camera must show: body corners and force tips."""
     chosen = np.unique(np.linspace(0, len(film.t) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []

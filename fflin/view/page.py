@@ -44,12 +44,12 @@ _SCRIPTS = (
 
 
 def build_page(info: dict[str, Any], commands: Iterable[bytes] = (), connect: str = "") -> str:
-    """Build the page from `info` for its scripts and from the commands of a `Recorder`.
+    """Build the page from `info`, which its scripts read, and from the commands of a `Recorder`.
 
     The page may open connections only to `connect`.
     """
     info = {**info, "commands": [_base64(command) for command in commands]}
-    # In a script element, only its end tag and the start of a comment are special.
+    # In a script element, only the end tag and the start of a comment have a special meaning.
     data = json.dumps(info, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     fields = {
         "title": escape(info["title"]),
@@ -85,7 +85,7 @@ def _asset(name: str) -> str:
 def _scripts() -> str:
     body = "\n".join(_asset(f"{name}.js") for name in _SCRIPTS)
     body = re.sub(r"(?m)^ *(//.*\n)?", "", body)  # indentation and comments
-    # A function scope separates these names from the names in meshcat's bundle.
+    # A function scope separates the names in these scripts from the names in meshcat's bundle.
     return f'(() => {{\n"use strict";\nconst THREE = MeshCat.THREE;\n{body}\nmain();\n}})();'
 
 
@@ -107,8 +107,11 @@ class Recorder:
         self._animation: Lowered | None = None
 
     def send(self, command: Any) -> None:
-        """Record and forward a meshcat command."""
-        lowered = command.lower()
+        """Record and forward a command of meshcat."""
+        self.record(command.lower())
+
+    def record(self, lowered: Lowered) -> None:
+        """Record and forward a command in the form that is sent."""
         kind, path = lowered["type"], lowered.get("path", "")
         # The browser ignores empty parts of a path.
         path = "/" + "/".join(part for part in path.split("/") if part)
@@ -122,27 +125,22 @@ class Recorder:
             key = f"{kind} {lowered.get('property', '')}"
             self._nodes.setdefault(path, {})[key] = lowered
         if self._forward:
-            self._forward(_message(lowered))
+            self._forward(umsgpack.packb(lowered))
 
     def commands(self) -> Iterator[bytes]:
         """Yield the messages with which meshcat's page builds the recorded scene."""
         for node in list(self._nodes.values()):
             # An object replaces the previous object, so it comes before its properties.
             for key in sorted(node, key=lambda key: key != "set_object "):
-                yield _message(node[key])
+                yield umsgpack.packb(node[key])
         if self._animation:
-            yield _message(self._animation)
+            yield umsgpack.packb(self._animation)
 
     def wait(self) -> None:
-        """Do nothing, because no browser has to connect."""
+        """Do nothing: a recorder does not wait for a browser."""
 
     def close(self) -> None:
-        """Do nothing, because nothing is open."""
-
-
-def _message(lowered: Lowered) -> bytes:
-    packed: bytes = umsgpack.packb(lowered)
-    return packed
+        """Do nothing: a recorder has no open connection."""
 
 
 def subtitle(robot: Robot) -> str:
@@ -154,7 +152,7 @@ def subtitle(robot: Robot) -> str:
 
 
 def rounded(points: Array, size: float) -> list[list[float]]:
-    """Round points (M, 3) to the digits that a robot of that size [m] needs."""
+    """Round points (M, 3) to the digits that a robot of the given size [m] needs."""
     digits = max(4, 4 - math.floor(math.log10(size)))
     found: list[list[float]] = points.round(digits).tolist()
     return found
@@ -190,7 +188,7 @@ def stage_info(
     sun, direction, orbit = np.array(SUN), np.array(VIEWS[scene]), dict[str, object]()
     field = field_of(robot, frame_of(robot, frame)) if scene == "space" else None
     if field and robot.orbit:
-        # z is away from the central body, and x along the orbit.
+        # The z axis points away from the central body, and the x axis along the orbit.
         radial, along, normal = field.axes.T
         sun, direction = (along * x + normal * y + radial * z for x, y, z in (sun, direction))
         far = robot.orbit.radius / robot.orbit.body_radius
@@ -213,7 +211,7 @@ def stage_info(
     }
 
 
-# Distance between wheels at one point, which are drawn apart along their axes, in robot sizes.
+# Wheels at the same point are drawn apart along their axes, at this distance in robot sizes.
 _APART = 0.1
 
 
@@ -245,7 +243,7 @@ def equipment(
 
 
 def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
-    """Return name, joint, and position and force direction in the joint's frame, per thruster."""
+    """Return each thruster's name, joint, and position and force direction in the joint's frame."""
     found: list[tuple[str, int, Array, Array]] = []
     actuation = Actuation(StateMap(robot))
     names = [actuation.names[index] for index in actuation.groups.get("thrust", ())]

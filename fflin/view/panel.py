@@ -16,7 +16,7 @@ from fflin.view.page import packed
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
-# Values below this, in SI units, are rounding errors.
+# Values below this, in SI units, count as rounding errors.
 _NOTHING = 1e-14
 
 # Lines below this fraction of the largest line of their plot are not drawn.
@@ -24,7 +24,7 @@ _UNSEEN = 1e-6
 
 _NONE = np.zeros(0)
 
-# {(group, unit): title of its plot}. In plots of one dictionary, a name has one colour.
+# {(group, unit): title of the plot}. A name has the same colour in all plots of one dictionary.
 _CHARTS: tuple[dict[tuple[str, str], str], ...] = (
     {("tau_b", "N m"): "base torque"},
     {("F_b", "N"): "base force"},
@@ -90,13 +90,9 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     lines = _lines(robot, motion, shown, followed=len(target) > 1)
     for family, charts in enumerate(_CHARTS):
         for key, title in charts.items():
-            found_here = lines.get(key, [])
-            sizes = [_size(curve) for curve in found_here]
-            seen = [
-                (curve.key.partition(".")[2], curve)
-                for curve, size in zip(found_here, sizes, strict=True)
-                if size > _UNSEEN * max(sizes)
-            ]
+            near = lines.get(key, [])
+            least = _UNSEEN * max(map(_size, near), default=0.0)
+            seen = [(each.key.partition(".")[2], each) for each in near if _size(each) > least]
             plot = _plot(title, key[1], seen, family)
             # Plots of rates are shown only if a limit is near.
             if any(each["limits"] or not title.endswith("rates") for each in plot["lines"]):
@@ -134,7 +130,7 @@ def _size(curve: Curve) -> float:
 def _plot(
     title: str, unit: str, lines: list[tuple[str, Curve]], family: int = -1
 ) -> dict[str, Any]:
-    """Return a plot of labelled curves, with the limits that a curve comes near."""
+    """Return a plot of labelled curves, with each limit that a curve comes near."""
     return {
         "title": title,
         "unit": unit,

@@ -21,7 +21,8 @@ from fflin.simulation.motion import Motion
 from fflin.simulation.plant import Plant
 from fflin.view.shapes import bendings
 
-# Largest step [s] of a payload's flight before capture, and largest phase of its swing [rad].
+# Limits of one integration step of a payload's flight before capture: time [s], and phase [rad] of
+# the fastest oscillation.
 _STEP, _SWING = 0.05, 0.3
 
 # Largest number of frames; more would enlarge the file without a visible effect.

@@ -20,8 +20,6 @@ from fflin.view.shapes import PLAIN, Indices, Mesh, Shape, bendings, load_mesh, 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # from packages that meshcat imports
     from meshcat import Visualizer
-    from meshcat.commands import SetAnimation, SetTransform
-    from meshcat.geometry import Mesh as MeshcatMesh
 
 # Cylinders are along y in three.js, and along z in URDF.
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
@@ -29,32 +27,25 @@ _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1
 # Extension types of msgpack-lite, which the page decodes as typed arrays.
 _TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
 
-# Placeholder for a mesh that the page has already.
+# Placeholder for a mesh that the page already has.
 _ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 
-class _Piece(MeshcatMesh):
-    """three.js mesh in the form that is sent; the page has its material and earlier geometry."""
-
-    def __init__(
-        self, geometry: dict[str, object], matrix: Array, about: dict[str, object]
-    ) -> None:
-        self._geometry, self._matrix, self._about = geometry, matrix, about
-
-    def lower(self) -> dict[str, object]:
-        return {
-            "metadata": {"version": 4.5, "type": "Object"},
-            "geometries": [self._geometry],
-            "materials": [{"uuid": "material", "type": "MeshStandardMaterial"}],
-            "object": {
-                "uuid": "object",
-                "type": "Mesh",
-                "geometry": self._geometry["uuid"],
-                "material": "material",
-                "matrix": self._matrix.T.ravel().tolist(),
-                "userData": self._about,
-            },
-        }
+def _object(geometry: dict[str, Any], matrix: Array, about: dict[str, object]) -> dict[str, object]:
+    """Return a three.js mesh as sent to the page, which has its material and known geometry."""
+    return {
+        "metadata": {"version": 4.5, "type": "Object"},
+        "geometries": [geometry],
+        "materials": [{"uuid": "material", "type": "MeshStandardMaterial"}],
+        "object": {
+            "uuid": "object",
+            "type": "Mesh",
+            "geometry": geometry["uuid"],
+            "material": "material",
+            "matrix": matrix.T.ravel().tolist(),
+            "userData": about,
+        },
+    }
 
 
 def body_paths(robot: Robot) -> list[str]:
@@ -93,7 +84,9 @@ class Drawing:
                     shown = _ELSEWHERE if geometry["uuid"] in sent else geometry
                     sent.add(geometry["uuid"])
                 placed = shape.placement.homogeneous @ matrix
-                node[f"{index}_{part}"].set_object(_Piece(shown, placed, about))
+                self._send(
+                    "set_object", node[f"{index}_{part}"], object=_object(shown, placed, about)
+                )
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
         self.bodies = list(corners)  # Pinocchio joints
         self.corners = [
@@ -103,8 +96,11 @@ class Drawing:
     def place(self, poses: Array) -> None:
         """Set the poses of all bodies: (njoints - 1, 7) with x, y, z and quaternion x, y, z, w."""
         for path, pose in zip(self._paths, poses, strict=True):
-            node = self._visualizer[path]
-            node.window.send(SetTransform(pin.XYZQUATToSE3(pose).homogeneous, node.path))
+            matrix = pin.XYZQUATToSE3(pose).homogeneous.T.ravel().tolist()
+            self._send("set_transform", self._visualizer[path], matrix=matrix)
+
+    def _send(self, kind: str, node: Visualizer, **entries: object) -> None:
+        node.window.record({"type": kind, "path": node.path.lower(), **entries})
 
     def tracks(self, t: Array, poses: Array) -> list[dict[str, object]]:
         """Return the animation of all bodies by times t (N,) and poses (N, njoints - 1, 7)."""
@@ -134,16 +130,10 @@ def _link(robot: Robot, shape: Shape) -> list[float]:
     return [mass, *pin.SE3ToXYZQUAT(at).round(6).tolist()]
 
 
-class Animation(SetAnimation):
-    """Animation of all moving nodes, in the form that is sent."""
-
-    def __init__(self, clips: Sequence[dict[str, object]]) -> None:
-        self._clips = list(clips)
-
-    def lower(self) -> dict[str, object]:
-        """Return the command."""
-        options = {"play": True, "repetitions": 1}
-        return {"type": "set_animation", "animations": self._clips, "options": options, "path": ""}
+def animation(clips: Sequence[dict[str, object]]) -> dict[str, object]:
+    """Return the command that animates all moving nodes."""
+    options = {"play": True, "repetitions": 1}
+    return {"type": "set_animation", "animations": [*clips], "options": options, "path": ""}
 
 
 def typed(array: Array | Indices, kind: str = "<f4") -> Any:
@@ -163,10 +153,9 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
         ]
     color = shape.color or PLAIN
     if shape.kind == "box":
-        width, height, depth = shape.size
-        sides = {"width": width, "height": height, "depth": depth}
+        sides = dict(zip(("width", "height", "depth"), shape.size, strict=True))
         box = {"uuid": "box", "type": "BoxGeometry", **sides}
-        return [(box, unit, color, _symmetric(width / 2.0, height / 2.0, depth / 2.0))]
+        return [(box, unit, color, _symmetric(*(side / 2.0 for side in shape.size)))]
     radius = shape.size[0]
     fineness: dict[str, Any] = {"widthSegments": 32, "heightSegments": 20}
     ball = {"uuid": "sphere", "type": "SphereGeometry", "radius": radius, **fineness}
@@ -179,8 +168,7 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
     pieces = [(tube, _Y_TO_Z, color, _symmetric(radius, length / 2.0, radius))]
     if shape.kind == "capsule":
         for end in (-length / 2.0, length / 2.0):
-            lifted = unit.copy()
-            lifted[2, 3] = end
+            lifted = pin.SE3(np.eye(3), np.array((0.0, 0.0, end))).homogeneous
             pieces.append((ball, lifted, color, around))
     return pieces
 

@@ -95,7 +95,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         frame = robot.model.frames[frame_id]
         if frame.parentJoint < ROOT:
             continue
-        joint, at = node_of(frame, bent)
+        joint, at = _node_of(frame, bent)
         for visual in link.find_all("visual"):
             try:
                 kind, size, mesh = _geometry(visual)
@@ -104,22 +104,18 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
             except (ValueError, LookupError):
                 odd.append(str(visual.line))
                 continue
-            file = None
-            if mesh is not None:
-                file = find_mesh(mesh, path, robot.package_dirs)
-                if file is None:
-                    missing.append(shown(mesh))
-                    continue
+            file = None if mesh is None else find_mesh(mesh, path, robot.package_dirs)
+            if mesh is not None and file is None:
+                missing.append(shown(mesh))
+                continue
+            if file is not None:
                 try:
                     load_mesh(file)
                 except ValueError:
                     unreadable.append(file.name)
                     continue
             yield Shape(joint, kind, size, placement, color, finish, file, frame.name)
-    yield from (
-        Shape(joint, kind, size, pin.SE3(np.eye(3), position))
-        for joint, kind, size, position in balls(robot, bent)
-    )
+    yield from _balls(robot, bent)
     if missing:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
         notes.append(
@@ -194,16 +190,17 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
         squares = 6.0 / inertia.mass * (moments.sum() - 2.0 * moments)
         sides = np.sqrt(np.maximum(squares, 0.0))
         sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
-        size = (float(sides[0]), float(sides[1]), float(sides[2]))
+        size = tuple(sides.tolist())
         placement = pin.SE3(axes, inertia.lever)
         link = "base" if joint == ROOT else robot.model.names[joint]
         yield Shape(joint, "box", size, placement, finish="inertia", link=link)
 
 
 class Bending(NamedTuple):
-    """First-order motion of an appendage's links by its modes: a rotation about its frame.
+    """First-order motion of an appendage's links by its modes, as a rotation about its frame.
 
-    The rotation is the best fit to mode shapes with the given participation.
+    The rotation is the best fit to mode shapes with the given participation. If no mode has a
+    rotation part, the motion is a translation.
     """
 
     node: int  # Pinocchio joint of the first mode; its scene node carries the links
@@ -242,7 +239,7 @@ def bendings(robot: Robot) -> dict[str, Bending]:
 
 
 def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
-    """Return {link: bending} of the links of a URDF that are fixed to an appendage's frame."""
+    """Return {link: bending} for the links of a URDF that are fixed to an appendage's frame."""
     children: dict[str, list[str]] = {}
     for joint in root.find_all("joint"):
         ends = [joint.find_all(end) for end in ("parent", "child")]
@@ -263,31 +260,28 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
     return found
 
 
-def node_of(frame: pin.Frame, bent: dict[str, Bending]) -> tuple[int, pin.SE3]:
-    """Return the Pinocchio joint whose node carries a link's frame, and the frame on this node."""
+def _node_of(frame: pin.Frame, bent: dict[str, Bending]) -> tuple[int, pin.SE3]:
+    """Return the Pinocchio joint whose node carries a link's frame, and its placement there."""
     if bending := bent.get(frame.name):
         return bending.node, bending.frame.actInv(frame.placement)
     return frame.parentJoint, frame.placement
 
 
-def balls(
-    robot: Robot, bent: dict[str, Bending]
-) -> list[tuple[int, str, tuple[float, ...], Array]]:
-    """Return joint, kind, size [m] and position of shapes that represent undrawn appendages."""
-    found: list[tuple[int, str, tuple[float, ...], Array]] = []
+def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
+    """Yield the shapes that represent undrawn appendages."""
     for item in robot.appendages:
         if isinstance(item, Slosh):
             joint = robot.model.getJointId(item.modes[1])
             lever = robot.model.inertias[joint].lever
-            found.append((joint, "sphere", (_radius(item.mass),), lever))
+            yield Shape(joint, "sphere", (_radius(item.mass),), pin.SE3(np.eye(3), lever))
         elif item.frame not in bent:
             bending = bendings(robot)[item.title]
             mass = float(np.square(item.participation[:3, 0]).sum())
             size = _radius(mass or 1.0)
-            # Without mass, a box is drawn, because its rotation is visible.
+            # Without mass the appendage only rotates, so a box is drawn: unlike a sphere, it shows
+            # rotation.
             kind, sides = ("sphere", (size,)) if mass else ("box", (size,) * 3)
-            found.append((bending.node, kind, sides, bending.center))
-    return found
+            yield Shape(bending.node, kind, sides, pin.SE3(np.eye(3), bending.center))
 
 
 def _radius(mass: float) -> float:
@@ -324,7 +318,7 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
 
 @lru_cache(maxsize=256)
 def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
-    # A changed time or size of the file is a new key of the cache, so a changed file is read again.
+    # The cache's key contains time and size of the file, so a changed file is read again.
     parts = _colored(path) if path.suffix.lower() == ".dae" else []
     parts = parts or [(*_triangles(path), None)]
     corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
@@ -389,7 +383,7 @@ def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    # Several triangles may have become the same.
+    # After the merge, several triangles may be equal.
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(kept)]
     used, compact = np.unique(faces, return_inverse=True)

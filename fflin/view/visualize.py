@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from warnings import warn
 
 from fflin.base.errors import FflinWarning, FileError, InputError
-from fflin.base.validation import Array, instance, number, truth, whole
+from fflin.base.validation import Array, instance, number, positive, truth, whole
 from fflin.base.writing import as_path, check_distinct, check_output_path, write_atomically
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.points import start_of
@@ -171,7 +171,8 @@ def visualize(
         from fflin.view.live import Live
 
         how: Any = {"scene": scene, "tool": tool, "follow": bool(follow), "frame": frame}
-        live = Live(robot, start, **how, speed=_speed(speed, 1.0), port=port)
+        pace = positive("speed", 1.0 if speed is None else speed)
+        live = Live(robot, start, **how, speed=pace, port=port)
         for note in live.notes:
             warn(note, FflinWarning, stacklevel=2)
         if opened is not False:
@@ -210,10 +211,8 @@ def visualize(
 
 
 def _temporary(name: str) -> Path:
-    safe = re.sub(r"\W+", "_", name, flags=re.ASCII)[:40]
-    with tempfile.NamedTemporaryFile(
-        "wb", prefix=f"fflin-{safe}-", suffix=".html", delete=False
-    ) as file:
+    prefix = f"fflin-{re.sub(r'[^a-zA-Z0-9_]+', '_', name)[:40]}-"
+    with tempfile.NamedTemporaryFile(prefix=prefix, suffix=".html", delete=False) as file:
         return Path(file.name)
 
 
@@ -248,14 +247,9 @@ def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float
     if not 0.0 < fps <= 240.0:
         raise InputError(f"fps is {fps:g}, expected more than 0 and at most 240")
     nice = [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5]
-    return fps, _speed(speed, next((s for s in nice if duration <= s * _LONGEST), 1e6))
-
-
-def _speed(speed: float | None, default: float) -> float:
-    speed = number("speed", default if speed is None else speed)
-    if not speed > 0.0:
-        raise InputError(f"speed is {speed:g}, expected more than 0")
-    return speed
+    if speed is None:
+        speed = next((s for s in nice if duration <= s * _LONGEST), 1e6)
+    return fps, positive("speed", speed)
 
 
 def _robot_of(robot: Robot, motion: Motion) -> Robot:
@@ -299,7 +293,7 @@ def _pictures(
 
     start, end = float(motion.t[0]), float(motion.t[-1])
     if times is None:
-        # A motion that settles is fastest at the beginning; tracking moves all the time.
+        # A motion that settles is fastest at the beginning, but a tracking motion never stops.
         fractions = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
         times = [start + fraction * (end - start) for fraction in fractions]
     times = check_times(times, start, end)

@@ -48,8 +48,9 @@ def test_the_chain_goes_from_a_file_to_gains(flown):
     assert code == 0
     assert fflin.LinearTrajectory.load(folder / "sampled.npz", robot).dt == 0.1
 
-    code, out, err = run("check", *mat)
+    code, out, err = run("check", *mat, "--plot", folder / "check.png")
     assert (code, err) == (0, "")
+    assert (folder / "check.png").stat().st_size
     assert "A and B are verified" in out
 
     weights = ("--bryson", "q_b=0.05", "--bryson", "tau_m=0.5", "--qf", "q_b=9")
@@ -73,6 +74,8 @@ def test_what_is_no_motion_is_said_and_what_is_no_trajectory_refused(flown):
     assert says(out, "usual causes")
     assert "--joint" in refused("linearize", *given, "--joint", "joint_1=0.2")
     assert "--rpy" in refused("check", *given, "--rpy", "1", "0", "0")
+    assert "--plot" in refused("linearize", *given, "--plot", folder / "none.png")
+    assert not (folder / "none.png").exists()
     assert "--reduce" in refused("tvlqr", *given, "--reduce")
     assert "'q_m.joint_4'" in refused("linearize", "ets_vii", "--trajectory", folder / "flown.csv")
     assert "nosuch.csv" in refused("tvlqr", "planar_detumble", "--trajectory", "nosuch.csv")

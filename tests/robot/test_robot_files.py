@@ -223,7 +223,7 @@ CASES = {
     URDF + "[stiffness]\n'hinge_*' = 1": ":3: 'hinge_*'",
     URDF + "[damping]\njoint_1 = inf": ":3: 'joint_1'",
     URDF + "damping = 'all'": ":2: 'all'",
-    URDF + "rest = 1": ":2: position",
+    URDF + "rest = 1": ":2: rest",
     URDF + "lock = ['joint_1']\n[rest]\njoint_1 = 1": ":4: 'joint_1'",
     URDF + "weights = 3": ":2: weights",
     URDF + "[weights]\nQ.q_b = 3": ":3: 'Q'",

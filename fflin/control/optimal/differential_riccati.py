@@ -153,8 +153,8 @@ def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Inter
 def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
     """Return times, and P at these times, integrated backwards from the last knot.
 
-    `at` returns the coefficients (k, nx, nx) at times (k,). If P changes too fast, `LinAlgError` is
-    raised.
+    `at` returns the coefficients (k, nx, nx) at times (k,). If P changes too fast, raise
+    `LinAlgError`.
     """
     times, values = [float(knots[-1])], [P]
     for last in range(len(knots) - 1, 0, -_BATCH):
@@ -164,16 +164,17 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
             interval, P = pending.pop(), values[-1]
             start, end, middle = *interval[:2], 0.5 * (interval.start + interval.end)
             error = math.inf
-            # The mixed coefficients of a long step can be indefinite. Shorter steps are then
-            # tried.
+            # If the coefficients of a long step are indefinite, the solution fails and shorter
+            # steps are tried.
             with suppress(np.linalg.LinAlgError):
                 single, half = interval.whole.back(P), interval.late.back(P)
                 double = interval.early.back(half)
-                # Value at the middle of the cubic that has these values and derivatives.
+                # `between` is the value of the Hermite cubic at the middle of the interval.
                 bend = interval.at_start.rate(double) - interval.at_end.rate(P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
-                # Two half steps are sixteen times as accurate as one whole step, so that their
-                # error is a fifteenth of the difference. To be safe, a quarter is assumed.
+                # The error of two half steps is a sixteenth of the error of one whole step, so it
+                # is a fifteenth of their difference. To be safe, a quarter of the difference is
+                # assumed.
                 error = 0.25 * max(_apart(double, single), _apart(half, between))
             if error <= _ACCURACY:
                 times += [middle, start]
@@ -193,7 +194,7 @@ def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array
     for weights, whole in stages:
         total = weights + whole.T @ P @ whole
         K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
-        # A sum of squares, which stays positive.
+        # This form is a sum of squares, so P stays positive semidefinite.
         law = np.vstack((np.eye(nx), -K))
         P = _symmetric(law.T @ total @ law)
         if not np.isfinite(P).all():
@@ -208,7 +209,7 @@ def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array
 def bounded_by(remedy: str) -> Iterator[None]:
     """Raise `InputError` with a `remedy` if P changes too fast."""
     try:
-        # A P that overflows raises an error, so NumPy's warnings are not needed.
+        # If P overflows, an error is raised, so NumPy's warnings are not needed.
         with np.errstate(over="ignore", invalid="ignore"):
             yield
     except np.linalg.LinAlgError:

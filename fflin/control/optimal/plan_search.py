@@ -16,39 +16,42 @@ from fflin.control.optimal.stage_qp import StageQP, StageRows
 # Accuracy [rad, m, s] with which the goal and the limits are met.
 _ENDS = 1e-8
 
-# A state is limited at a point within an interval once an iterate exceeds its limit there by the
-# first fraction. The limit is tightened by the second fraction, because the motion may exceed it
-# between the points.
+# A state is limited at a point within an interval once an iterate exceeds the limit there by the
+# fraction _LIMITED. The limit is tightened by the fraction _TIGHTER, because the motion may exceed
+# it between the points.
 _LIMITED, _TIGHTER = 0.002, 0.005
 
-# Intervals with gaps of at most this size are integrated as one motion.
+# If no gap exceeds this, the intervals are integrated as one motion.
 _MEETS = 1e-10
 
-# If a single motion has a larger error at the end, the error is not corrected.
+# If the total error of a single motion exceeds half of this, the error is not corrected.
 _NEARLY = 1e-3
 
-# Integration accuracy of interval ends, during the search and at its end.
+# _SEEKS is the integration accuracy of interval ends during the search, and _FLIES is the accuracy
+# at the end of the search.
 _SEEKS, _FLIES = 1e-6, 1e-8
 
-# The search ends if an iteration saves less than this fraction of the effort, or after _MOST
+# The search ends if an iteration saves less than the fraction _SAVED of the effort, or after _MOST
 # iterations.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 
-# Cost of a step of wheel states relative to other states, because wheels may have any state.
+# Cost of a step of wheel states relative to other states; it is small, because wheels may have any
+# state.
 _OF_WHEELS = 1e-6
 
 # The search also ends if the quadratic programs violate the goal or a limit at the knots, and this
 # violation does not fall by a tenth in this number of iterations.
 _STAGNANT = 10
 
-# Penalty on a violation of the goal or a limit by 1 rad or 1 m, in efforts of the guess.
+# Penalty on a violation of the goal or a limit by 1 rad or 1 m, relative to the effort of the
+# guess.
 _PRICE = 1e3
 
 Flags = NDArray[np.bool_]
 
 
 class Trial(NamedTuple):
-    """Trial with knots, inputs, gaps between intervals, and distances to the limits of states."""
+    """Trial: knots, inputs, gaps between intervals, and distances of states from their limits."""
 
     q: Array  # (N + 1, nq)
     v: Array  # (N + 1, nv)
@@ -84,7 +87,7 @@ class Search(NamedTuple):
     report: Callable[[str], None]  # receives a line of text in each iteration
 
     def best(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return q, v and u at the knots with least effort, or closest to the end.
+        """Return the knots q, v and the inputs u of least effort, or closest to the end state.
 
         The search begins at the given knots and inputs.
         """
@@ -134,7 +137,7 @@ class Search(NamedTuple):
 
     @property
     def _size(self) -> Array:
-        """Magnitudes of the limits of states (nx,), zero without limits."""
+        """Magnitudes of the limits of states (nx,), or zero for states without limits."""
         size: Array = np.abs(np.where(np.isfinite(self.bounds), self.bounds, 0.0)).max(axis=0)
         return size
 
@@ -169,7 +172,7 @@ class Search(NamedTuple):
             return None
         try:
             A, B, D, inside = self.shooting.jacobians(trial.q, trial.v, u, self.parts)
-        except InputError:  # it has diverged
+        except InputError:  # the motion has diverged
             return None
         k, part, state = np.nonzero(limited)
         least, largest = trial.inside[:, k, part, state]
@@ -205,7 +208,8 @@ class Search(NamedTuple):
                 last = one.outside(limited)
                 if last <= _ENDS:
                     return one
-                # Errors may grow so much along a single motion that its end cannot be corrected.
+                # If all intervals integrated as one motion do not at least halve the violation,
+                # errors grow too much along this motion. The trial before it is then returned.
                 if not last <= 0.5 * before:
                     return trial
                 trial = one
@@ -218,7 +222,7 @@ class Search(NamedTuple):
         return trial if trial.gap <= _MEETS else self._flown(trial.u)
 
     def _flown(self, u: Array) -> Trial:
-        """Return the motion from the start under the inputs, which has no gaps."""
+        """Return the motion from the start under the inputs, as a trial without gaps."""
         trial = self._trial(*self.shooting.flown(self.start, u), u)
         return trial._replace(missed=0.0 * trial.missed)
 
@@ -245,5 +249,5 @@ def cost_of_inputs(shooting: Shooting, R: Array, u: Array) -> Array:
 
 
 def excess(room: Array) -> Array:
-    """Return by how much points exceed limits, from how far they may move down and up."""
+    """Return by how much points exceed limits; `room` is how far they may move down and up."""
     return np.maximum(np.maximum(room[0], -room[1]), 0.0)

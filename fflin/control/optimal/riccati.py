@@ -14,7 +14,7 @@ from fflin.base.validation import Array, Values
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
-# A solution with a smaller residual is exact up to rounding error.
+# A solution whose residual is below this is exact up to rounding error.
 _SOUND = 1e-11
 _STEPS = 25
 
@@ -58,7 +58,7 @@ class Riccati:
     def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
         self.discrete = bool(dt)
-        # For a sampled system, use A - I, because the difference of P and A' P A would cancel.
+        # For a sampled system, use A - I, because P - A' P A would lose accuracy by cancellation.
         self.rate = A - np.eye(len(A)) if dt else A
         self.R_factor, indefinite = dpotrf(R, lower=1)
         self.definite = not indefinite
@@ -106,7 +106,8 @@ def solve(
 ) -> Solution:
     """Return the stabilising solution, by the half-size method or SciPy, or raise `LinAlgError`.
 
-    Newton's method refines both (D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968).
+    Newton's method refines the solution (D. L. Kleinman, IEEE Trans. Automatic Control 13(1),
+    1968).
     """
     equation = Riccati(A, B, Q, R, N, dt)
     start = _half_size(equation)
@@ -135,7 +136,7 @@ def half_size(
 
 
 def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
-    """Solve from the modes of a loop in which velocities are scaled by 1 + `apart`."""
+    """Solve by the modes of a loop in which velocities are scaled by 1 + `apart`."""
     found = None
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
@@ -157,20 +158,21 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
         found = _finished(equation, *_refined(equation, P, modes), "structured")
     if apart or (found is not None and found.residual <= _SOUND):
         return found
-    # Coinciding modes, as in critical damping, have no inverse. Newton's method then starts from a
+    # If modes coincide, as in critical damping, V is singular. Newton's method then starts from a
     # slightly different loop.
     return _half_size(equation, _APART) or found
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
-    """Return the continuous equation that has the same P (10.6)."""
+    """Return the continuous equation that has the solution P of a sampled one (10.6)."""
     A, B, Q = equation.A, equation.B, equation.Q
     N = np.zeros_like(B) if equation.N is None else equation.N
     F = np.linalg.inv(A + np.eye(len(A)))
     FB = F @ B
     R = equation.R - N.T @ FB - FB.T @ N + FB.T @ Q @ FB
     Bc = 2.0**0.5 * FB
-    # Rows that should be zero contain rounding errors. Newton's method uses the original equation.
+    # Rows that should be zero contain rounding errors, so they are set to zero. Newton's method
+    # uses the original equation.
     Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
     N = 2.0**0.5 * F.T @ (N - Q @ FB)
     continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
@@ -190,7 +192,7 @@ def _finished(
 def _refined(
     equation: Riccati, P: Array, modes: ModalMatrix | None
 ) -> tuple[_Trial, ModalMatrix | None]:
-    """Refine P by Newton steps; `modes` belong to a closed loop near the loop of P, if known."""
+    """Refine P by Newton steps; `modes`, if given, belong to a loop near the loop of P."""
     enough = 0.5 * _EPS * len(P) ** 0.5
     trial = best = equation.trial(P)
     fresh = False
@@ -202,7 +204,8 @@ def _refined(
             modes, fresh = ModalMatrix.of(F, equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
-        # Far from the solution, the first step may raise the residual and still improve P.
+        # Far from the solution, the first step may raise the residual and still improve P, so it is
+        # accepted.
         if gain > 1.0 or (fresh and trial.residual > _NEAR):
             trial = better
         if trial.residual < best.residual:
@@ -211,8 +214,8 @@ def _refined(
             if gain < 2.0:
                 break
         elif gain < 10.0:
-            # Progress is slow, because the modes belong to a closed loop that is too far from the
-            # closed loop of the current P. So new modes are computed.
+            # Progress is slow if the modes belong to a closed loop that differs too much from the
+            # closed loop of the current P. New modes are then computed.
             if fresh and trial is not better:
                 break
             modes = None
@@ -220,7 +223,7 @@ def _refined(
 
 
 def _general(equation: Riccati, unit: bool) -> Array:
-    """Solve by SciPy, which takes a badly scaled R for singular; `unit` scales R to I."""
+    """Solve by SciPy; `unit` scales R to I, because SciPy takes a badly scaled R for singular."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     solver = solve_discrete_are if equation.discrete else solve_continuous_are
@@ -241,7 +244,7 @@ def _norm(matrix: Array) -> float:
 
 
 class ModalMatrix:
-    """Modes V (n, n) of a real matrix F, with complex pairs side by side."""
+    """Modes V (n, n) of a real matrix F; conjugate modes are adjacent columns."""
 
     def __init__(self, V: Values, poles: Values, discrete: bool) -> None:
         self.V, self.inverse, self.values = V, np.linalg.inv(V), poles
@@ -269,8 +272,8 @@ class ModalMatrix:
         M = self.inverse @ F @ self.V
         values = M.diagonal().astype(complex)
         M.flat[:: len(M) + 1] = 0.0
-        # A relative perturbation X moves the eigenvalues of a normal matrix by at most the norm of
-        # X, relatively.
+        # A relative perturbation X of a normal matrix changes its eigenvalues by at most the norm
+        # of X, relative to their magnitude.
         if np.linalg.norm(M / np.abs(values)) > 1e-7:
             return np.linalg.eigvals(F)
         real, first = self.values.imag == 0.0, np.flatnonzero(self.values.imag)[::2]
@@ -287,14 +290,14 @@ class OptimalLoop(NamedTuple):
 
 
 def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalLoop | None:
-    """Return a stable loop, optimal except for odd powers (10.5), or None for other systems."""
+    """Return a loop that is optimal if odd powers (10.5) are neglected, or None if impossible."""
     nx = len(A)
     m = nx // 2
     if nx != 2 * m or B[:m].any():
         return None
     white = _lower(R_factor, B[m:].T)
-    # The inverse weight on forces is S = Ls Ls'. Computing S itself would square the condition
-    # number.
+    # The inverse weight on forces is S = Ls Ls'. S is not computed, because this would square the
+    # condition number.
     triangle = np.asarray(np.linalg.qr(white, mode="r"))
     Ls = triangle.T
     sizes = np.abs(Ls.diagonal())

@@ -20,7 +20,7 @@ _FEWEST_STEPS, _MOST_STEPS = 4, 128
 # Least number of steps per interval in a trial, because limits also apply between the steps.
 _STEPS = 16
 
-# Jacobians are integrated in a quarter of the steps of the motion, but in at most this number.
+# Jacobians are integrated with a quarter of the steps of the motion, but with at most this number.
 _MOST_OF_JACOBIANS = 16
 
 Point = tuple[Array, Array]
@@ -45,7 +45,8 @@ class Shooting:
         self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
         self._aba = Aba(self.state)
-        # The engine is fixed, so that a plan is the same bit for bit whatever ran before.
+        # The engine is fixed, so that a plan is the same bit for bit regardless of earlier
+        # computations.
         self._linearizer = Linearizer(robot, moving=True)
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
@@ -189,8 +190,8 @@ class Shooting:
         axis = axis / (np.linalg.norm(axis) or 1.0)
         rounds = np.round((mean[PIN_ANGULAR] - turn) @ axis / (2.0 * np.pi))
         difference[PIN_ANGULAR] = turn + 2.0 * np.pi * rounds * axis
-        # Final rate of the rotation vector. Its Jacobian is singular after whole turns about the
-        # axis.
+        # The final rate of the rotation vector is a least-squares solution, because its Jacobian is
+        # singular after full rotations about the axis.
         jacobian = pin.Jexp3(difference[PIN_ANGULAR])
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(jacobian, rates[1, PIN_ANGULAR], rcond=1e-6)[0]
         late, bend = 3 * difference - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * difference

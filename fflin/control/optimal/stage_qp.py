@@ -20,7 +20,7 @@ class StageSolution(NamedTuple):
 
 
 class StageRows(NamedTuple):
-    """Soft limits low - s <= G (x[k], u[k], u[k + 1]) <= high + s of combined variables."""
+    """Soft limits low - s <= G (x[k], u[k], u[k + 1]) <= high + s of linear combinations."""
 
     k: Indices  # (m,)
     G: Array  # (m, nx + 2 nu)

@@ -22,19 +22,21 @@ from fflin.robot.equipment.mounting import Mounted, difference, inertia_of, turn
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.mass_properties import Piece, as_inertia
 
-# Eigenvalues of M_rr - L L^T below minus this fraction of the largest of M_rr count as negative.
+# An eigenvalue of M_rr - L L^T counts as negative if it is below minus this fraction of the
+# largest eigenvalue of M_rr.
 _NEGATIVE = 1e-9
-# Largest relative difference at which mass properties of a file and of the URDF agree.
+# A larger relative difference between mass properties of a file and of the URDF causes a warning.
 _AGREE = 1e-2
-# Largest fraction of a body's mass in the balls of its modes. CRBA sums inertias inwards, which
-# needs a positive mass for each sum.
+# Largest fraction of a body's mass in the balls of its modes. CRBA sums inertias inwards, and the
+# mass of each sum must be positive.
 _LARGEST_SHARE = 0.9
 # Least distance of a ball from its appendage's frame, relative to the body's radius of gyration,
 # for which the ball's motion counts as a rotation about the frame.
 _SHORTEST = 0.05
 # Least mass of a ball, relative to the mass with which no rotor is needed.
 _LIGHTEST = 1e-6
-# Translation (or rotation) part of a participation below this fraction of the other part is zero.
+# If the translation part of a participation is below this fraction of the rotation part, or vice
+# versa, it counts as zero.
 _NONE = 1e-14
 
 
@@ -140,7 +142,7 @@ def _compare_inertia(item: _Modes, bodies: list[pin.Inertia], links: Mapping[str
 
 
 def _radius_of_gyration(mass: float, inertia: Array) -> float:
-    """Return the root mean square distance [m] of a body's mass from the origin of its inertia."""
+    """Return the root mean square distance [m] of a mass from the point that `inertia` is about."""
     return math.sqrt(max(float(np.trace(inertia)), 1e-300) / max(2.0 * mass, 1e-300))
 
 
@@ -164,7 +166,7 @@ def _require_inertia(body: pin.Inertia, of: str, found: Sequence[_Modes]) -> Non
 
 
 def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> Array:
-    """Return the least eigenvalues (N,) of M_rr - L L^T, relative to the largest of M_rr.
+    """Return the least eigenvalue (N,) of M_rr - L L^T, relative to the largest one of M_rr.
 
     M_rr follows from masses (N,), centres of mass (N, 3), and inertias (N, 3, 3) about them.
     """
@@ -190,9 +192,9 @@ def first_impossible(
     appendages: Sequence[Appendage],
     bodies: Mapping[int, tuple[Array, Array, Array]],
 ) -> int | None:
-    """Return the index of the first of N rows in which modes need more inertia than their body has.
+    """Return the first of N rows in which modes need more inertia than their body has.
 
-    `bodies` are masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) by joint of `model`.
+    `bodies` maps joints of `model` to masses (N,), centres of mass (N, 3) and inertias (N, 3, 3).
     Return None if all rows are possible.
     """
     found = [_seen(model, item) for item in appendages]
@@ -219,8 +221,9 @@ class _Ball(NamedTuple):
     def rotation(self) -> float:
         r"""Rotation [rad] of the structure per unit of the amplitude.
 
-        The ball rotates by w, and moves by v at the distance c from the appendage's frame. The
-        value is the upper bound :math:`|w| + |v| / |c|` of the rotation.
+        Per unit of the amplitude, the ball rotates by w and moves by v. It is at the distance c
+        from the appendage's frame. The value is the upper bound :math:`|w| + |v| / |c|` of the
+        rotation.
         """
         turned = float(np.linalg.norm(self.r)) / self.moment if self.moment else 0.0
         moved = float(np.linalg.norm(self.t)) / self.mass if self.mass else 0.0
@@ -249,16 +252,8 @@ class _Ball(NamedTuple):
             origin, motion = self.center, pin.JointModelPZ()
         R = turned_to(axis)
         own = inertia_of(mass, R.T @ (self.center - origin), sphere)
-        mode = Joint(
-            self.name,
-            idx_q=0,
-            idx_v=0,
-            unbounded=False,
-            prismatic=not turning,
-            kind="modal",
-            scale=scale,
-            rotation=self.rotation,
-        )
+        pure = not turning
+        mode = Joint(self.name, prismatic=pure, kind="modal", scale=scale, rotation=self.rotation)
         if abs(rotor) < 1e-13:
             rotor = 0.0
         return Mounted(mode, joint, pin.SE3(R, origin), motion, own, rotor / scale**2), removed
@@ -273,13 +268,13 @@ def _balls(item: _Modes, body: pin.Inertia) -> list[_Ball]:
     balls = []
     for name, column in zip(item.appendage.modes, item.L.T, strict=True):
         t, r = column[:3], column[3:]
-        # Participation about the appendage's frame: only there, a pure translation has r = 0.
+        # Refer participation to the appendage's frame: only there, a pure translation has r = 0.
         r = r - np.cross(p, t)
         square = float(t @ t)
         center = np.zeros(3)
         if math.sqrt(square) * size > _NONE * float(np.linalg.norm(r)):
             center = np.cross(t, r) / square
-            # The ball's distance is at most the body's radius of gyration.
+            # Limit the ball's distance to the body's radius of gyration.
             center *= min(1.0, size / max(float(np.linalg.norm(center)), 1e-300))
         else:
             t, square = np.zeros(3), 0.0
@@ -297,7 +292,7 @@ def _balls(item: _Modes, body: pin.Inertia) -> list[_Ball]:
 
 
 def _liquid(slosh: Slosh, item: _Modes, bodies: list[pin.Inertia]) -> list[Mounted]:
-    """Return two joints with the mass on the second, and subtract the mass from the body."""
+    """Return a slosh mass as two joints, the second with the mass; subtract it from the body."""
     joint, placement = item.joint, item.placement
     x, y, z = (placement.rotation @ slosh.axes).T
     at, point = placement * np.array(slosh.position), np.zeros((3, 3))
@@ -307,17 +302,9 @@ def _liquid(slosh: Slosh, item: _Modes, bodies: list[pin.Inertia]) -> list[Mount
     slides = slosh.length is None
     arm = (slosh.length or 0.0) * z
     first, second = (turned_to(axis) for axis in ((x, y) if slides else (-y, x)))
+    inertia, rotation = slosh.modal_mass, float(not slides)
     across = [
-        Joint(
-            name,
-            idx_q=0,
-            idx_v=0,
-            unbounded=False,
-            prismatic=slides,
-            kind="slosh",
-            inertia=slosh.modal_mass,
-            rotation=0.0 if slides else 1.0,
-        )
+        Joint(name, prismatic=slides, kind="slosh", inertia=inertia, rotation=rotation)
         for name in slosh.modes
     ]
     motion = pin.JointModelPZ if slides else pin.JointModelRZ

@@ -1,7 +1,7 @@
 r"""Flexible appendages and slosh: passive degrees of freedom of a link, as bodies on joints.
 
-An appendage that is clamped to a frame with the twist V, and has modal amplitudes :math:`\eta` of
-unit modal mass and the participation L (6, k), has the kinetic energy
+Let an appendage be clamped to a frame that moves with the twist V. With modal amplitudes
+:math:`\eta` of unit modal mass and the participation L (6, k), its kinetic energy is
 
 .. math:: T = \tfrac12 V^T M_{rr} V + V^T L \dot\eta + \tfrac12 \dot\eta^T \dot\eta.
 
@@ -25,7 +25,8 @@ from fflin.base.validation import Array, FrozenArrays, as_double, number, positi
 from fflin.robot.equipment.mounting import about_origin, inertia_of
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
-# First root of J_1'(x) = 0, which is k R of the first lateral mode in a circular cylinder.
+# First root of J_1'(x) = 0: the wavenumber times the radius of the first lateral mode in a
+# circular cylinder.
 _FIRST_ROOT = 1.8411837813406593
 _FASTEST = 1e12  # [Hz]
 
@@ -111,8 +112,8 @@ class FlexibleAppendage(Appendage):
     rotation: Any
     damping: Any = 0.005
     name: str | None = None
-    # M_rr (6, 6) from a file, about the frame's origin, with translation before rotation; `rigid`
-    # is true if it replaces the inertia of the URDF.
+    # M_rr (6, 6) from a file, about the frame's origin, with translation before rotation. `rigid`
+    # is true if this inertia replaces the inertia of the URDF.
     inertia: Array | None = field(default=None, kw_only=True)
     rigid: bool = field(default=False, kw_only=True)
 
@@ -478,7 +479,7 @@ class Slosh(Appendage):
 
 
 def checked_appendages(value: object) -> tuple[Appendage, ...]:
-    """Return flexible appendages and slosh, or raise `InputError`."""
+    """Return the given flexible appendages and slosh if they are valid, or raise `InputError`."""
     if isinstance(value, Appendage):
         value = [value]
     if not isinstance(value, Sequence) or not all(isinstance(item, Appendage) for item in value):

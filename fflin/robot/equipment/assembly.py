@@ -61,7 +61,7 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
 
 
 def _with_rigid(bare: Robot, item: FlexibleAppendage) -> Robot:
-    """Return a robot whose link at an appendage's frame has the inertia of the appendage's file."""
+    """Return a robot in which the appendage's link has the inertia from the appendage's file."""
     assert item.inertia is not None
     joint, placement = find_frame(bare.model, item.frame)
     of_file, body = rigid_inertia(item.inertia), bare.model.inertias[joint]
@@ -92,10 +92,7 @@ def _equipped(robot: Robot, inputs: object, appendages: Sequence[Appendage]) -> 
             model.addJointFrame(model.getJointId(part.name))
         placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
-        followers = tuple(
-            each._replace(joint=each.joint.within(model), leader=each.leader.within(model))
-            for each in followers
-        )
+        followers = tuple(each.within(model) for each in followers)
     names = [joint.name for joint in joints]
     own = {joint.name for joint in robot.joints if joint.mode}
     by_joint: dict[str, Any] = {

@@ -14,7 +14,8 @@ from fflin.robot.urdf.links import is_impossible
 
 _Z = np.array([0.0, 0.0, 1.0])
 
-# Arrays of a Pinocchio model with an entry for each degree of freedom, and for each entry of q.
+# Arrays of a Pinocchio model: first those with an entry for each entry of v, then for each entry
+# of q.
 _OF_VELOCITY = (
     *("armature", "damping", "rotorInertia", "rotorGearRatio"),
     *("lowerEffortLimit", "upperEffortLimit", "lowerVelocityLimit", "upperVelocityLimit"),
@@ -45,8 +46,8 @@ class Mounted(NamedTuple):
 
 def inertia_of(mass: float, lever: Array, inertia: Array) -> pin.Inertia:
     """Return a spatial inertia that need not be the inertia of a real body."""
-    # Pinocchio's constructor refuses physically impossible inertias. But the rest of a link without
-    # its mounted bodies is only a term of a sum, and may be impossible.
+    # Pinocchio's constructor refuses physically impossible inertias. But a link minus its mounted
+    # bodies is only a term of a sum, so it may be impossible.
     value = pin.Inertia.Zero()
     value.mass, value.lever, value.inertia = mass, lever, inertia
     return value
@@ -103,7 +104,8 @@ def with_mounted(
     for part in parts:
         armature[new.idx_vs[added[part.name]]] = part.armature
     new.armature = armature
-    # Frames refer to their parents by index, so old frames keep their order; new ones come last.
+    # Frames refer to their parent frames by index. So old frames keep their order, and new frames
+    # come last.
     for frame in model.frames.tolist()[1:]:
         copy = pin.Frame(frame)
         copy.parentJoint = moved[frame.parentJoint]
@@ -114,7 +116,7 @@ def with_mounted(
 def _depth_first(
     model: pin.Model, on: Mapping[int | str, Sequence[Mounted]], root: int | str
 ) -> Iterator[int | Mounted]:
-    """Yield the joints carried by a root, and the mounted bodies of each after all other joints."""
+    """Yield a root and all that it carries; mounted bodies come after a joint's other joints."""
     # CRBA needs the joints in depth-first order.
     if isinstance(root, int):
         yield root
@@ -156,7 +158,7 @@ def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[in
 def mounted_wheels(
     model: pin.Model, bodies: list[pin.Inertia], inputs: Sequence[Input]
 ) -> list[Mounted]:
-    """Return the wheels with an inertia, and subtract each wheel from its body."""
+    """Return the wheels that have an inertia, and subtract each from the body that includes it."""
     parts = []
     for name, wheel in named_wheels(inputs):
         if not wheel.inertia:
@@ -166,7 +168,7 @@ def mounted_wheels(
         rest = difference(bodies[joint], spinning)
         moments = np.linalg.eigvalsh(rest.inertia).tolist()
         about = float(axis @ bodies[joint].inertia @ axis)
-        # If a wheel is mounted on its own link, only rounding errors of the inertia remain.
+        # If the link is the wheel itself, only rounding errors of its inertia remain.
         if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
             of = "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
             lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
@@ -179,7 +181,7 @@ def mounted_wheels(
         bodies[joint] = rest
         placement = pin.SE3(turned_to(axis), np.zeros(3))
         own = pin.Inertia(0.0, np.zeros(3), float(wheel.inertia) * np.outer(_Z, _Z))
-        turning = Joint(name, 0, 0, unbounded=True, prismatic=False)
+        turning = Joint(name, unbounded=True)
         parts.append(Mounted(turning, joint, placement, pin.JointModelRUBZ(), own))
     return parts
 

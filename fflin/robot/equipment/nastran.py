@@ -10,7 +10,7 @@ import numpy as np
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array, Mask, vector, whole
-from fflin.base.writing import as_path, remember
+from fflin.base.writing import as_path, reason, remember
 
 LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254, "ft": 0.3048}  # [m]
 MASSES = {
@@ -21,16 +21,20 @@ MASSES = {
     "slug": 14.593902937206364,
     "lbf s^2/in": 175.12683524647636,
 }  # [kg]
-# Names of the mass and stiffness matrices in files of different origin.
+# Names that different programs give to the mass and stiffness matrices.
 _MASS, _STIFFNESS = ("mxx", "maa", "maax"), ("kxx", "kaa", "kaax")
 
-# Largest rounding error relative to the largest entry. A larger asymmetry, coupling stiffness of
-# boundary and modes, or stiffness of the rigid interface is refused.
+# Largest rounding error, relative to the largest entry of a matrix. If the asymmetry, the
+# stiffness that couples boundary and modes, or the stiffness of the rigid interface is larger, the
+# file is refused.
 _SHARE = 1e-6
 
 
 class Superelement(NamedTuple):
-    """Modes clamped at a rigid interface, about its origin, in SI units and basic axes."""
+    """Modes with a fixed interface, in SI units and the axes of Nastran's basic frame.
+
+    `L` and `inertia` are about the origin of the interface, which is rigid.
+    """
 
     frequency: Array  # (k,) [Hz]
     L: Array  # (6, k): translation [kg^0.5] before rotation [kg^0.5 m]
@@ -49,11 +53,9 @@ def read_superelement(
     boundary, rigid, points = _boundary(files[1])
     M, K = _matrices(files[0], len(boundary))
     rigid = rigid[boundary]
-    center = (
-        points.mean(axis=0)
-        if origin is None
-        else vector("origin", origin, 3, "a point") / (LENGTHS[length])
-    )
+    center = points.mean(axis=0)
+    if origin is not None:
+        center = vector("origin", origin, 3, "a point") / LENGTHS[length]
     # Convert rigid motions about the file's basic origin to motions about the interface's origin.
     x, y, z = center
     shift = np.eye(6)
@@ -81,7 +83,7 @@ def read_superelement(
 
 
 def _boundary(path: Path) -> tuple[Mask, Array, Array]:
-    """Return the mask of boundary degrees of freedom, the rigid motions of all, and the grids."""
+    """Return the mask of boundary degrees of freedom, all rigid motions, and the grid points."""
     try:
         with np.printoptions():  # pyYeti changes them for the whole process
             from pyyeti import nastran
@@ -91,7 +93,8 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
         ) from None
     punched = path.suffix == ".asm" and path.with_suffix(".pch").is_file()
     try:
-        # A .pch file lists the kept degrees of freedom of each grid; without it all six are kept.
+        # A .pch file lists the degrees of freedom that each grid point retains; without the file
+        # it retains all six.
         uset, _, boundary, *kept = nastran.asm2uset(
             str(path), try_rdextrn="pv_only" if punched else False
         )
@@ -100,7 +103,7 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
     except Exception as error:  # pyYeti raises whatever its parsing meets
         raise InputError(
             f"{path} cannot be read as the assembly file (.asm) of an external superelement: "
-            f"{_line(error)}"
+            f"{reason(error)}"
         ) from None
     keep = kept[0] if kept else np.ones(len(rigid), dtype=bool)
     boundary = np.asarray(boundary, dtype=bool)
@@ -119,9 +122,8 @@ def _matrices(path: Path, size: int) -> tuple[Array, Array]:
     try:
         found: Mapping[str, object] = op4.read(str(path), sparse=False)
     except Exception as error:  # pyYeti raises whatever its parsing meets
-        raise InputError(f"{path} cannot be read as an output4 file (.op4): {_line(error)}") from (
-            None
-        )
+        said = f"{path} cannot be read as an output4 file (.op4): {reason(error)}"
+        raise InputError(said) from None
     by_name = {str(name).lower(): value for name, value in found.items()}
     matrices = []
     for what, names in (("mass", _MASS), ("stiffness", _STIFFNESS)):
@@ -177,8 +179,3 @@ def _eigenpairs(path: Path, K: Array, M: Array) -> tuple[Array, Array]:
             "independent modes that are clamped at the boundary"
         )
     return np.asarray(squares), np.asarray(shapes)
-
-
-def _line(error: Exception) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 200 else f"{text[:200]}..."

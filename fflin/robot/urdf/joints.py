@@ -21,13 +21,13 @@ FREEDOM = dict(fixed=0, revolute=1, continuous=1, prismatic=1, planar=3, floatin
 # Value of a missing limit in the model.
 UNLIMITED = sys.float_info.max
 
-# An axis of a length outside these bounds is an error in the file.
+# An axis whose length is outside these bounds is an error in the file.
 _SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
 
 # urdfdom and Pinocchio's parser recurse along the tree, and take about 2.5 kB of stack per link.
 _DEPTH_LIMIT = 1_000
 
-# Robots have some 100 links. The limit bounds time and memory.
+# Most robots have fewer than 100 links. The limit bounds computing time and memory.
 _LINK_LIMIT = 10_000
 
 
@@ -85,7 +85,7 @@ def read_joint(element: Element) -> JointElement:
 
 def _axis(element: Element, of: str, kind: str) -> tuple[float, ...]:
     found = element.find("axis", of)
-    # Fixed joints have no axis, and exporters write zeros there.
+    # Fixed joints need no axis, and exporters write zeros for it.
     if found is None or FREEDOM[kind] != 1:
         return (1.0, 0.0, 0.0)
     found.allow_only("xyz", of=of)
@@ -115,7 +115,7 @@ def _limits(element: Element, of: str, kind: str) -> dict[str, float] | None:
 
 
 def _limit(found: Element, name: str, of: str) -> float:
-    """Return one limit; an invalid one only causes a note, as models do not depend on limits."""
+    """Return one limit; an invalid limit causes only a note, as models do not depend on limits."""
     value = decimal(found.attributes[name].strip())
     if math.isnan(value) or (value < 0.0 and name in ("effort", "velocity")):
         found.note(
@@ -182,7 +182,7 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
 
 
 def counted_leaders(joints: dict[str, JointElement], mimics: dict[str, Mimic]) -> set[str]:
-    """Return the continuous leaders whose full turn does not return all their mimic joints."""
+    """Return the continuous leaders for which a full turn leaves some mimic joint displaced."""
     return {
         mimic.leader
         for name, mimic in mimics.items()
@@ -264,7 +264,7 @@ def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[s
 
 
 def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointElement]) -> int:
-    """Check that the joints connect the links into one tree; return its depth in links."""
+    """Check that the joints connect the links into one tree; return the tree's depth in links."""
     above: dict[str, JointElement] = {}
     for joint in joints.values():
         of = f"joint {quoted(joint.name)}"

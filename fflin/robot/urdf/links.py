@@ -8,23 +8,23 @@ import pinocchio as pin
 
 from fflin.robot.urdf.xml import Element, enumerated, named, nearest, quoted
 
-# At lengths of 1e8 m, adding 1 m^2 to the squared length changes nothing in double precision. Then
-# the links' moments about their own joints are lost, and ABA divides zero by zero.
+# If a length is 1e8 m, adding 1 m^2 to its square changes nothing in double precision. The links'
+# moments about their own joints would be lost, and ABA would divide zero by zero.
 _FARTHEST = 1e7  # [m]
 
 # Tolerance of a quaternion's length: files often have four digits, seldom fewer.
 _QUATERNION_SLACK = 1e-3
 
-# Rounding of its six numbers gives a singular inertia eigenvalues of about -1e-16 of the largest.
-# The tolerance is larger because CAD programs write fewer digits.
+# A singular inertia has eigenvalues of about -1e-16 of the largest, because its six numbers are
+# rounded. The tolerance is larger because CAD programs write fewer digits.
 _NEGATIVE_SLACK = 1e-9
 
-# The inertia of a point mass from a CAD program is a rounding error of either sign. It is as small
-# as the inertia of a body within this distance of its centre.
+# CAD programs give a point mass an inertia that is only a rounding error of either sign. It is no
+# larger than if the body extended this far from its centre.
 _POINT = 1e-6  # [m]
 
-# A negative moment below this fraction of the whole rigid body's moment is accepted. It changes M
-# less than the rounding of published numbers.
+# A negative moment is accepted below this fraction of the whole rigid body's moment. It changes M
+# by less than the rounding of published numbers does.
 _LOST_IN_BODY = 1e-6
 
 # Tolerance of the triangle inequality of principal moments. A flat plate fulfils it with equality,
@@ -103,7 +103,7 @@ def read_pose(element: Element, of: str) -> Pose:
 
 
 def refuse_near_miss(element: Element, of: str, known: tuple[str, ...]) -> None:
-    """Raise `UrdfError` for misspelt names of known child elements; URDF ignores all others."""
+    """Raise `UrdfError` for misspelt known child elements; other unknown elements are ignored."""
     for child in element.children:
         if child.tag in known or ":" in child.tag:
             continue
@@ -114,7 +114,7 @@ def refuse_near_miss(element: Element, of: str, known: tuple[str, ...]) -> None:
 
 
 def is_impossible(mass: float, moments: Sequence[float]) -> bool:
-    """Return whether ascending principal moments [kg m^2] are negative beyond rounding."""
+    """Return whether any of the sorted principal moments [kg m^2] is negative beyond rounding."""
     # A body within the radius r of its centre has moments of at most mass r^2.
     return moments[0] < -max(_NEGATIVE_SLACK * moments[-1], mass * _POINT**2)
 
@@ -122,7 +122,7 @@ def is_impossible(mass: float, moments: Sequence[float]) -> bool:
 def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[str]:
     """Return notes about unusual inertias.
 
-    Raise an error for negative moments that are not negligible in the link's rigid body.
+    Raise an error for a negative moment that is not negligible beside the fixed links.
     """
     unequal, weightless, negligible = [], [], []
     for link in links:
@@ -147,7 +147,7 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
     lost = f"the inertia of {named('link', negligible)} has a negative principal moment, "
     notes = (
         (negligible, f"{lost}negligible compared with the links it is fixed to"),
-        # One principal moment is larger than the sum of the other two.
+        # Note a principal moment that is larger than the sum of the other two.
         (unequal, f"unphysical inertia: {enumerated(unequal)}"),
         (weightless, f"inertia without mass: {named('link', weightless)}"),
     )

@@ -41,7 +41,7 @@ XACRO_LIMIT = 60.0
 # modules from the working folder.
 _CHILD = str(Path(__file__).with_name("xacro_child.py"))
 
-# Elements that do not affect the model, so a "${" below them does not require xacro.
+# These elements do not affect the model, so a "${" inside them does not require xacro.
 _IGNORED = {
     *("visual", "collision", "material", "gazebo", "transmission", "ros2_control"),
     *("sensor", "plugin", "safety_controller", "calibration"),
@@ -49,7 +49,7 @@ _IGNORED = {
 
 
 class Advice(NamedTuple):
-    """Warning that is dropped if a field of the robot names all of the joints."""
+    """Warning about joints that is dropped if a field of the robot names all of them."""
 
     field: str
     joints: tuple[str, ...]
@@ -79,7 +79,7 @@ def describe(document: bytes, path: Path) -> Description:
     """Read a URDF from the bytes of a file; `path` is its name in errors."""
     root = parse(document, str(path))
     notes: list[str] = []
-    # Search for the marks of xacro, or for characters that may encode them.
+    # Search for text that indicates xacro, or for characters that may encode such text.
     plain = document.replace(b"\0", b"")  # so that UTF-16 is searched too
     first = first_xacro(root) if any(x in plain for x in (b"xacro:", b"$", b"&#")) else None
     if path.suffix == ".xacro" or first:
@@ -106,7 +106,7 @@ def describe(document: bytes, path: Path) -> Description:
 
 
 def _advice(moving: list[JointElement], origin: str) -> Iterator[Advice]:
-    """Yield warnings of dampers, friction and zero limits in the file that the model ignores."""
+    """Yield warnings about dampers, friction and zero limits that the model ignores."""
     damped = tuple(joint.name for joint in moving if joint.damping)
     rubbing = tuple(joint.name for joint in moving if joint.friction)
     zero = {
@@ -227,12 +227,12 @@ def _numbers(values: tuple[float, ...]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return an attribute's value in quotes; the standard library's functions load many modules."""
+    """Quote an attribute's value; the standard library's functions would load many modules."""
     return f'"{text.translate(_ENTITIES)}"'
 
 
 def first_xacro(root: Element) -> Element | None:
-    """Return the first element that uses xacro, or None; a declared prefix alone is no use."""
+    """Return the first element that uses xacro, or None; declaring the prefix is not a use."""
     for element in chain([root], root.iterate(_IGNORED)):
         marked = any("${" in value or "$(" in value for value in element.attributes.values())
         if marked or element.tag.startswith("xacro:"):

@@ -1,7 +1,7 @@
 """Program that expands one xacro document. It runs as a file, isolated, without the package fflin.
 
 Its arguments are the path of the document, the time limit [s], and the folders from which to
-import. Before it has set these folders, it imports only built-in modules.
+import. Until it has set these folders, it imports only built-in modules.
 """
 
 import sys

@@ -12,18 +12,18 @@ from xml.parsers import expat
 
 from fflin.base.errors import UrdfError, listed
 
-# URDFs nest some 10 elements. Much deeper documents would exceed the recursion limit.
+# URDFs are about 10 elements deep. Much deeper documents would exceed Python's recursion limit.
 _DEPTH_LIMIT = 100
 
-# URDFs contain some 10,000 elements. Millions would fill the memory.
+# Large URDFs contain about 10,000 elements. Millions would fill the memory.
 _ELEMENT_LIMIT = 500_000
 _TAG_LIMIT = 2**20  # bytes
 
-# No physical value is larger, and products of two such numbers do not overflow.
+# No physical value is larger than this, and the product of two such numbers does not overflow.
 _LARGEST = 1e30
 
-# Least similarity of a misspelt name: xzy is near to xyz, and quat to quat_xyzw; unit and value
-# are not near.
+# Least similarity at which a name counts as misspelt. For example, xzy is near to xyz, and quat to
+# quat_xyzw, but unit is not near to value.
 _NEAR = 0.6
 
 _SPACE = " \t\r\n"
@@ -57,7 +57,7 @@ class Element:
         return UrdfError(f"{self.origin}:{self.line}: {message}")
 
     def note(self, message: str) -> None:
-        """Add a warning about this element; equal warnings appear once, with all their lines."""
+        """Add a warning about this element; equal warnings appear once, with all line numbers."""
         self.notes.setdefault(message, []).append(self.line)
 
     def find_all(self, tag: str) -> list[Element]:
@@ -89,7 +89,7 @@ class Element:
                 yield from child.iterate(skip)
 
     def allow_only(self, *names: str, of: str) -> None:
-        """Raise an error for misspelt attributes, and add a note about other unknown ones."""
+        """Raise an error for misspelt attributes, and add a note about other unknown attributes."""
         for name in self.attributes:
             if name in names or ":" in name:
                 continue
@@ -144,7 +144,7 @@ def decimal(text: str) -> float:
 
 
 def quoted(text: str) -> str:
-    """Return a text of a file for an error: quoted, short, printable and on one line."""
+    """Return text from a file for an error message: quoted, short, printable and on one line."""
     return repr(text if len(text) <= 60 else f"{text[:57]}...")
 
 
@@ -160,7 +160,7 @@ def named(kind: str, names: Sequence[str]) -> str:
 
 def notes_of(root: Element) -> list[str]:
     """Return the notes about a document, one line each."""
-    # Notes contain the file's name without its folder, because they are kept with the robot.
+    # Notes are saved with the robot, so they contain the file's name without its folder.
     origin = root.origin.rpartition(os.sep)[2]
     return [
         f"{origin}:{lines[0]}: {message}"
