@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 # _CONTROL matches control characters, which could break a line or control the terminal. _LONG_NAME
@@ -277,6 +278,15 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
         hint = f"known names: {', '.join(names[:12])}"
         hint += f", ... ({len(names)} in all)" if len(names) > 12 else ""
     return UnknownNameError(f"no {kind} named '{name}'; {hint}")
+
+
+def optional_package(name: str, needed: str, extra: str) -> Any:
+    """Import an optional package, or raise `MissingPackageError` with the command to install it."""
+    try:
+        return import_module(name)
+    except ImportError:
+        said = f"{needed}; install it with: pip install 'fflin[{extra}]'"
+        raise MissingPackageError(said) from None
 
 
 def require_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:

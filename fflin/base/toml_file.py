@@ -94,12 +94,8 @@ class TomlFile:
         """Return the path of the first key, string or pattern of a table in a message."""
         head = ".".join(map(str, table)) + "."
         keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]
-        names = [
-            name.strip("'")
-            for pair in re.findall(r"('[^']+')| (\S+) is ", message)
-            for name in pair
-        ]
-        names = [name for name in names if name]
+        found = re.findall(r"'([^']+)'| (\S+) is ", message)
+        names = [name for one, other in found if (name := one or other.strip("'"))]
         for name in names:
             for key_path, value in _values(self.record):
                 if value == name and key_path[: len(table)] == table:

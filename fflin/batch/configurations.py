@@ -243,9 +243,9 @@ def random_configurations(
     """
     count, seed = whole("count", count, 1), whole("seed", seed, 0)
     start = configuration(robot, base=base)
-    if not (ranges is None or isinstance(ranges, Mapping)):
-        raise InputError(f"ranges is {ranges!r}, expected a mapping {{joint: (low, high)}}")
-    given = by_joint(ranges or {}, robot.joint_names, robot.joint)
+    ranges = {} if ranges is None else ranges
+    given = instance("ranges", ranges, Mapping, "a mapping {joint: (low, high)}")
+    given = by_joint(given, robot.joint_names, robot.joint)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
     start.setflags(write=False)
     return RandomConfigurations(robot, count, seed, checked, start)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fflin.base.errors import FileError, InputError, MissingPackageError
+from fflin.base.errors import FileError, InputError, optional_package
 from fflin.base.record import CHECKSUM, DAMAGED, content_digest, verify_checksum
 from fflin.base.validation import Array
 from fflin.base.writing import (
@@ -59,12 +59,7 @@ def check_format(path: Path) -> None:
 
 def hdf5() -> ModuleType:
     """Return h5py, or raise `MissingPackageError`."""
-    try:
-        import h5py
-    except ImportError:
-        raise MissingPackageError(
-            "HDF5 files need h5py; install it with: pip install 'fflin[fast]'"
-        ) from None
+    h5py: ModuleType = optional_package("h5py", "HDF5 files need h5py", "fast")
     return h5py
 
 

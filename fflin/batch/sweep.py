@@ -172,17 +172,9 @@ def sweep(
         return _finish(task, store, path)
 
 
-def planned_bytes(
-    robot: Robot,
-    count: int,
-    *,
-    at_rest: bool,
-    frame: Frame | None = None,
-    reference: pin.SE3 | None = None,
-) -> int:
-    """Return the size [bytes] of the result of a sweep over `count` points."""
-    options: Any = {"frame": frame, "reference": reference, "moving": False}
-    return count * _row_bytes(ChunkJob(robot, at_rest=at_rest, **options))
+def planned_bytes(robot: Robot, count: int, **options: Any) -> int:
+    """Return the size [bytes] of a sweep's result over `count` points; see `ChunkJob`."""
+    return count * _row_bytes(ChunkJob(robot, moving=False, **options))
 
 
 def _row_bytes(job: ChunkJob) -> int:

@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 NOT_RUN = -1.0  # value of `stop` in the rows of a file that contain no run
 
-_COMPARED = re.compile(r"\s*(.+?)\s*(<=|>=|<|>)\s*([-+.\de]+)\s*(.*?)\s*")
+_COMPARED = re.compile(
+    r"\s*(.+?)\s*(<=|>=|<|>)\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?![.\d])\s*(.*?)\s*"
+)
 _COMPARE = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}
 _DEGREE = math.pi / 180.0
 _FACTORS = {  # from the unit of a condition to the unit of a figure
@@ -59,16 +61,12 @@ def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> lis
     """
     bounds = []
     for part in condition.split(" and "):
-        match = _COMPARED.fullmatch(part)
-        try:
-            name, sign, bound, unit = match.groups() if match else ("", "", "", "")
-            limit = float(bound)
-        except ValueError:
+        if not (match := _COMPARED.fullmatch(part)):
             raise InputError(
                 f"condition {part!r} cannot be read, expected NAME < NUMBER UNIT, such as "
                 "'attitude < 1 deg'"
-            ) from None
-        name = kind_named(name)
+            )
+        name, sign, limit, unit = kind_named(match[1]), match[2], float(match[3]), match[4]
         values, own = figure(name)
         factors = [_FACTORS.get((unit, each), 0.0) for each in own.split("|")]
         factor = 1.0 if unit in ("", own, *own.split("|")) else max(factors)
@@ -220,10 +218,7 @@ class Campaign(FrozenArrays):
             return self.settle[:, at].max(axis=1, initial=0.0), "s"
         of, _, rest = name.partition(" ")
         of, rest = (of, rest) if of in ("worst", "settle", "drawn") else ("final", name)
-        states, inputs = (
-            (self.state_names, self.state_units),
-            (self.input_names, self.input_units),
-        )
+        states, inputs = (self.state_names, self.state_units), (self.input_names, self.input_units)
         kinds = tuple(KINDS), tuple(KINDS.values())
         groups: list[tuple[Any, Any, Array]] = {
             "final": [(*kinds, self._beyond(self.errors)), (*states, self.x), (*inputs, self.u)],
@@ -342,15 +337,12 @@ class Campaign(FrozenArrays):
             If the run does not exist, or the campaign was loaded from a file.
         """
         at = whole("run", run, 0, len(self) - 1)
-        return self._flown().replay(np.array(self.drawn[at]))
-
-    def _flown(self) -> CampaignJob:
         if self._job is None:
             raise InputError(
                 "the campaign was loaded from a file, which does not contain its robot and policy; "
                 "call monte_carlo again with the same seed, and replay a run of the new campaign"
             )
-        return self._job
+        return self._job.replay(np.array(self.drawn[at]))
 
     def save(self, path: str | Path) -> None:
         """Save the campaign to a .npz, .h5, .csv or .mat file, atomically.
@@ -384,7 +376,7 @@ class Campaign(FrozenArrays):
 
     def _save(self, path: Path, **texts: str) -> None:
         """Write the campaign and further strings, such as the request that identifies the call."""
-        arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in _ARRAYS}
+        arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in ARRAYS}
         rest = {key: getattr(self, key) for key in _HEADER}
         texts["header"] = json.dumps({"kind": "Campaign", **rest})
         write_rows(path, arrays, texts, checksummed=True)
@@ -415,7 +407,7 @@ class Campaign(FrozenArrays):
         """Return a campaign from its header and arrays; rows of missing runs are left out."""
         run = np.asarray(arrays["stop"]) != NOT_RUN
         values: dict[str, Any] = {
-            key: arrays[key] if run.all() else arrays[key][run] for key in _ARRAYS
+            key: arrays[key] if run.all() else arrays[key][run] for key in ARRAYS
         }
         for key in _HEADER:
             values[key] = tuple(header[key]) if isinstance(header[key], list) else header[key]
@@ -423,4 +415,4 @@ class Campaign(FrozenArrays):
 
 
 _NAMES = [item.name for item in fields(Campaign)]
-_ARRAYS, _HEADER = _NAMES[: _NAMES.index("names")], _NAMES[_NAMES.index("names") : -1]
+ARRAYS, _HEADER = _NAMES[: _NAMES.index("names")], _NAMES[_NAMES.index("names") : -1]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -32,9 +32,6 @@ from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
-
-if TYPE_CHECKING:
-    from fflin.robot.equipment.appendages import Appendage
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # {property: axes}
@@ -263,20 +260,16 @@ class Dispersions:
             except ChartError as error:
                 said = f"an invalid initial attitude is drawn in the runs from {start} on"
                 raise InputError(f"{said}: {error}; use a smaller dispersion") from None
-            if appendages := self._plant.robot.appendages:
-                self._require_realisable(appendages, drawn, start)
-
-    def _require_realisable(
-        self, appendages: Sequence[Appendage], drawn: Array, start: int
-    ) -> None:
-        """Raise `InputError` if a drawn inertia is too small for the flexible modes of its body."""
-        refused = first_impossible(self._model, appendages, self.bodies(drawn))
-        if refused is not None:
-            try:
-                self.one(drawn[refused])
-            except InputError as error:
-                said = f"run {start + refused} draws an invalid mass or inertia"
-                raise InputError(f"{said}: {error}; use a smaller dispersion") from None
+            if not (appendages := self._plant.robot.appendages):
+                continue
+            # A drawn inertia may be too small for the flexible modes of its body.
+            refused = first_impossible(self._model, appendages, self.bodies(drawn))
+            if refused is not None:
+                try:
+                    self.one(drawn[refused])
+                except InputError as error:
+                    said = f"run {start + refused} draws an invalid mass or inertia"
+                    raise InputError(f"{said}: {error}; use a smaller dispersion") from None
 
     def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
         """Return the drawn values (N, size, axes) of a kind, or zeros if it is not dispersed."""
@@ -393,13 +386,11 @@ class Dispersions:
         """Return a run's robot with its inputs, its policy, and its initial q and v."""
         plant, policy, rows = self._plant, self._policy, drawn[None]
         robot, (q, v) = plant.robot, self.starts(rows)
-        if bodies := self.bodies(rows):
-            robot = robot.with_bodies(
-                {
-                    joint: pin.Inertia(float(mass[0]), com[0], inertia[0])
-                    for joint, (mass, com, inertia) in bodies.items()
-                }
-            )
+        bodies = {
+            joint: pin.Inertia(float(mass[0]), com[0], inertia[0])
+            for joint, (mass, com, inertia) in self.bodies(rows).items()
+        }
+        robot = robot.with_bodies(bodies) if bodies else robot
         for kind in self._springs_of:
             values = self._springs(kind, rows)[0].tolist()
             of: Any = {kind: dict(zip(robot.joint_names, values, strict=True))}

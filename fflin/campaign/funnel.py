@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError, require_known
 from fflin.base.intervals import until_failure
 from fflin.base.record import Design
 from fflin.base.tables import folded, grid
@@ -23,7 +23,7 @@ from fflin.base.validation import (
     dimension,
     instance,
     number,
-    numbers,
+    positive,
     share,
     vector,
     whole,
@@ -32,7 +32,7 @@ from fflin.base.writing import as_path
 from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
-from fflin.campaign.statistics import EDGE, KINDS, kind_named
+from fflin.campaign.statistics import EDGE, KINDS, Judge, kind_named
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
 from fflin.dynamics.coordinates import moved_by, moving_error
@@ -241,10 +241,8 @@ class Funnel(Design):
     def __str__(self) -> str:
         count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
         head = f"{self.robot.name}: initial errors from which every run ends with {self.goal}"
-        head += (
-            f", and with {self.within} at all times" * bool(self.within)
-            + f"; {count} runs per knot"
-        )
+        head += f", and with {self.within} at all times" * bool(self.within)
+        head += f"; {count} runs per knot"
         tail = [
             "base, joint: largest half-axes of the ellipsoid of initial errors",
             "runs: number of runs that start inside the ellipsoid, all of which succeeded (+: "
@@ -365,9 +363,7 @@ def funnel(
     feedback = followed(schedule, robot)
     expected = "a GainSchedule or a TrajectoryFeedback"
     instance("schedule", feedback, TrajectoryFeedback, expected)
-    for name in options:
-        if name not in _OPTIONS:
-            raise unknown("option of funnel", name, list(_OPTIONS))
+    require_known("option of funnel", options, _OPTIONS)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)
     by_level = not isinstance(goal, Mapping)
@@ -375,7 +371,8 @@ def funnel(
     limits = _bounds("within", {} if within is None else within, KINDS)
     check_workers(executor, workers, threads, None, progress)
     motion, by = feedback.trajectory, feedback.schedule
-    reached, indices = Goal(final, limits, by.P[-1]), _indices(motion, by, knots)
+    reached = Judge(("outcome",), partial(_outcomes, final, limits, by.P[-1]))
+    indices = _indices(motion, by, knots)
     jobs = [runs_from(robot, feedback, *pair, options, reached) for pair in indices]
     for job in jobs:
         job.choose(engine)
@@ -383,13 +380,14 @@ def funnel(
     with executor_of(executor, workers) as others:
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
-            starts = Starts(job.x0, by.P[first], ellipsoid_axes(by.P[first]), rng)
+            axes = ellipsoid_axes(by.P[first])
+            drawn = partial(_starts, job.x0, by.P[first], axes, rng)
 
-            def simulate(roots: Array, job: CampaignJob = job, starts: Starts = starts) -> Array:
-                rows = Draws(starts.drawn(roots)).part
+            def simulate(roots: Array, job: CampaignJob = job, drawn: Any = drawn) -> Array:
+                rows = Draws(drawn(roots)).part
                 return completed(job, rows, len(roots), others, workers, threads)["outcome"]
 
-            root = _largest_root(simulate, _widest(starts.axes, robot))
+            root = _largest_root(simulate, _widest(axes, robot))
             tried[knot] = root**2
             outcomes[knot] = simulate(root * (np.arange(samples) + 0.5) / samples)
             if progress:
@@ -409,27 +407,19 @@ def funnel(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Goal:
-    """Evaluation of runs by bounds on final errors or final level, and on errors at any time."""
+def _outcomes(
+    final: Mapping[str, float], within: Mapping[str, float], P: Array, runs: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Return the codes of `Funnel.outcomes` for bounds on final errors and on errors at any time.
 
-    FIELDS: ClassVar[tuple[str, ...]] = ("outcome",)  # the codes of `Funnel.outcomes`
-    over: ClassVar[None] = None
-
-    final: Mapping[str, float]
-    within: Mapping[str, float]
-    P: Array  # (nx, nx), of the final level
-
-    def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
-        """Return the outcomes of runs."""
-        e = runs["state_errors"][:, -1]
-        largest, final = (
-            dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors")
-        )
-        final["level"] = ((e @ self.P) * e).sum(axis=1)
-        stopped = (runs["stop"] != 0.0) | (largest["attitude"] > EDGE)
-        failures = [stopped, _beyond(largest, self.within), _beyond(final, self.final)]
-        return {"outcome": np.select(failures, [1.0, 2.0, 3.0])}
+    P (nx, nx) is the matrix of the final level.
+    """
+    e = runs["state_errors"][:, -1]
+    largest, last = (dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors"))
+    last["level"] = ((e @ P) * e).sum(axis=1)
+    stopped = (runs["stop"] != 0.0) | (largest["attitude"] > EDGE)
+    failures = [stopped, _beyond(largest, within), _beyond(last, final)]
+    return {"outcome": np.select(failures, [1.0, 2.0, 3.0])}
 
 
 def _beyond(sizes: Mapping[str, Array], bounds: Mapping[str, float]) -> Array:
@@ -438,20 +428,15 @@ def _beyond(sizes: Mapping[str, Array], bounds: Mapping[str, float]) -> Array:
     return beyond
 
 
-class Starts(NamedTuple):
-    """Random errors about a state at a knot."""
+def _starts(center: Array, P: Array, axes: Array, rng: np.random.Generator, roots: Array) -> Array:
+    """Return random initial deviations e (N, nx) from `center` with sqrt(e' P e) equal to `roots`.
 
-    center: Array  # (nx,)
-    P: Array  # (nx, nx), of the level
-    axes: Array  # W of `ellipsoid_axes`
-    rng: np.random.Generator
-
-    def drawn(self, roots: Array) -> Array:
-        """Return random initial deviations e (N, nx) with sqrt(e' P e) equal to `roots` (N,)."""
-        e = self.rng.normal(size=(len(roots), len(self.P))) @ self.axes.T
-        # Directions in which P is zero do not contribute to the level.
-        e *= (roots / np.sqrt(((e @ self.P) * e).sum(axis=1)))[:, None]
-        return moved_by("local", np.tile(self.center, (len(e), 1)), e) - self.center
+    P (nx, nx) is the matrix of the level, and `axes` are its `ellipsoid_axes`.
+    """
+    e = rng.normal(size=(len(roots), len(P))) @ axes.T
+    # Directions in which P is zero do not contribute to the level.
+    e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
+    return moved_by("local", np.tile(center, (len(e), 1)), e) - center
 
 
 def runs_from(
@@ -460,7 +445,7 @@ def runs_from(
     k: int,
     first: int,
     options: Mapping[str, Any],
-    judge: Goal | None = None,
+    judge: Judge | None = None,
 ) -> CampaignJob:
     """Return the runs from knot k of the trajectory, which is knot `first` of the schedule."""
     motion, schedule = feedback.trajectory, feedback.schedule
@@ -488,22 +473,16 @@ def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
     return min(root * (2.0 if further else 1.4), widest)
 
 
-def _bounds(name: str, given: Any, kinds: Iterable[str]) -> dict[str, float]:
+def _bounds(name: str, given: Any, kinds: Collection[str]) -> dict[str, float]:
     """Return {kind: largest error} from a given mapping, or raise `InputError`."""
     given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
-    for key in given:
-        if key not in kinds:
-            raise unknown(f"kind of error in {name}", str(key), list(kinds))
+    require_known(f"kind of error in {name}", given, kinds)
     if name == "goal" and not given:
         raise InputError(
             "goal is empty; give the largest final error of at least one kind, such as "
             "{'attitude': 1.0} in deg"
         )
-    found = numbers(name, given, "kind", name)
-    for key, value in found.items():
-        if not value > 0.0:
-            raise InputError(f"{name} '{key}' is {value:g}, expected more than 0")
-    return found
+    return {key: positive(f"{name} '{key}'", value) for key, value in given.items()}
 
 
 def _shown(bounds: Mapping[str, float]) -> str:

@@ -16,9 +16,9 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import __version__
-from fflin.base.errors import FileError, InputError, unknown
+from fflin.base.errors import FileError, InputError, require_known
 from fflin.base.record import content_digest, reading
-from fflin.base.validation import share, truth, whole
+from fflin.base.validation import instance, share, truth, whole
 from fflin.batch.files import (
     FileStore,
     MemoryStore,
@@ -203,9 +203,7 @@ def monte_carlo(
     >>> len(runs), runs.fraction("attitude < 1 deg").value > 0.5
     (16, True)
     """
-    for name in options:
-        if name not in _OPTIONS:
-            raise unknown("option of monte_carlo", name, sorted(_OPTIONS))
+    require_known("option of monte_carlo", options, sorted(_OPTIONS))
     runs, seed = whole("runs", runs, 1), whole("seed", seed, 0)
     width, confidence = share("width", width), share("confidence", confidence)
     check_workers(executor, workers, threads, chunk, progress)
@@ -215,7 +213,11 @@ def monte_carlo(
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     threads = threads or available_cores()
     size = _chunk(runs, chunk, workers or threads, until is not None)
-    store: Any = _memory(path, runs, size, shapes)
+    store: Any = None
+    if path is None or path.suffix == ".npz":
+        store = MemoryStore(runs, size, shapes)
+    elif not part_of(path).exists():
+        require_room(path, 8 * runs * sum(map(math.prod, shapes.values())))
     if executor or workers:
         _require_sendable(job)
     job.choose(engine)
@@ -231,8 +233,7 @@ def monte_carlo(
         texts = {"header": json.dumps(header), "constant": "[]"}
         store = FileStore(path, request, runs, size, shapes, {}, texts)
     with closing(store), executor_of(executor, workers) as others:
-        how: Any = {"executor": others, "progress": progress}
-        how["threads"] = threads if job.engine == "compiled" else 1
+        how: Any = {"executor": others, "progress": progress, "threads": job.threads(threads)}
         expect(progress, [(job, job.dispersions.rows(0, min(runs, LANES)), runs)], others, threads)
         done = runs if until is None else min(_STAGE, runs)
         while not (failed := run_chunks(job, job.dispersions.rows, store, upto=done, **how)):
@@ -262,28 +263,14 @@ def _goals(
     given: object, until: object, shapes: Mapping[str, tuple[int, ...]], header: dict[str, Any]
 ) -> list[str]:
     """Return the goals; raise an error for an invalid goal before any run begins."""
-    goals = [given] if isinstance(given, str) else given
-    if not isinstance(goals, list | tuple):
-        said = f"goals has type {type(given).__name__}"
-        raise InputError(f"{said}, expected a list such as ['attitude < 1 deg']")
+    listed = [given] if isinstance(given, str) else given
+    expected = "a list such as ['attitude < 1 deg']"
+    goals: Any = instance("goals", listed, (list, tuple), expected)
     goals = [*goals, *([] if until is None or until in goals else [until])]
     for goal in goals:
-        if not isinstance(goal, str):
-            said = f"a goal has type {type(goal).__name__}"
-            raise InputError(f"{said}, expected a text such as 'attitude < 1 deg'")
+        instance("a goal", goal, str, "a text such as 'attitude < 1 deg'")
         Campaign.of(MemoryStore(1, 1, shapes).arrays, header | {"goals": []}).met(goal)
     return goals
-
-
-def _memory(
-    path: Path | None, runs: int, size: int, shapes: Mapping[str, tuple[int, ...]]
-) -> MemoryStore | None:
-    """Return a store in memory, or None for a .h5 file after a check that it fits on the disk."""
-    if path is None or path.suffix == ".npz":
-        return MemoryStore(runs, size, shapes)
-    if not part_of(path).exists():
-        require_room(path, 8 * runs * sum(map(math.prod, shapes.values())))
-    return None
 
 
 def _complete(store: FileStore, done: int, shapes: Mapping[str, tuple[int, ...]]) -> None:

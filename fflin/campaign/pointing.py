@@ -62,13 +62,10 @@ def misaligned(robot: Robot, angles: Array) -> Robot:
 def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str, Array]:
     """Return wrenches, stored momenta, joint placements and inertia changes of each run (N,)."""
     model, count, names = robot._bare.model, len(angles), list(robot.model.names)
-    wrench, stored, fixed, bodies = (
-        np.tile(each, (count, 1)).reshape(count, -1, size)
-        for each, size in (
-            *((loads.wrench, 6), (loads.stored, 3), (tree.fixed, 12)),
-            (np.zeros(tree.bodies.size), 10),
-        )
-    )
+    wrench = np.tile(loads.wrench, (count, 1)).reshape(count, -1, 6)
+    stored = np.tile(loads.stored, (count, 1)).reshape(count, -1, 3)
+    fixed = np.tile(tree.fixed, (count, 1)).reshape(count, -1, 12)
+    bodies = np.zeros((count, tree.bodies.size // 10, 10))
     inputs, storing = loads.input.tolist(), loads.stored_body.tolist()
     for item, own, at in _indexed(robot):
         if not (key := _ALONG.get(type(item))):

@@ -59,14 +59,12 @@ def influences(campaign: Campaign) -> dict[str, dict[str, float]]:
     At most five quantities are included: first the quantities in the goals, then the worst errors,
     then the settling time.
     """
-    about, doubt = (
-        [campaign.about, *(x.name for x in campaign.bounds)],
-        3.0 / math.sqrt(len(campaign)),
-    )
-    worst = [f"worst {kind}" for kind in campaign.judged]
+    doubt = 3.0 / math.sqrt(len(campaign))
+    about = [campaign.about, *(x.name for x in campaign.bounds)]
+    about += [*(f"worst {kind}" for kind in campaign.judged), "settle"]
     return {
         name: {k: x for k, x in campaign.sensitivity(name).items() if abs(x) > doubt}
-        for name in list(dict.fromkeys([*about, *worst, "settle"]))[:5]
+        for name in list(dict.fromkeys(about))[:5]
     }
 
 

@@ -24,7 +24,6 @@ from fflin.campaign.statistics import (
     KINDS,
     LOOK,
     Judge,
-    Outcome,
     Over,
     RunStatistics,
     errors_of,
@@ -43,7 +42,6 @@ from fflin.simulation.plant import Plant, conserved_by
 from fflin.simulation.run import Recording, go
 from fflin.simulation.simulate import motion_of
 
-ARRAYS = Outcome._fields[:-1]  # arrays in the record of a campaign
 _LARGEST_CHUNK = 256
 _FEW_STEPS, _SOME_STEPS = 4, 64  # steps timed to estimate the duration of runs
 
@@ -97,6 +95,15 @@ class CampaignJob:
         # pickled.
         return _remade, (self._arguments, self.engine)
 
+    @property
+    def lanes(self) -> int:
+        """Number of runs that are computed together."""
+        return LANES if self.engine == "compiled" else 1
+
+    def threads(self, asked: int | None) -> int:
+        """Return the number of threads that compute runs in this process."""
+        return (asked or available_cores()) if self.engine == "compiled" else 1
+
     def choose(self, engine: object) -> None:
         """Set the engine of the runs to the requested or the fastest one that supports the plan."""
         self.engine = engine_of(engine, self.plan, self.plant, many=True)
@@ -105,15 +112,24 @@ class CampaignJob:
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape per run of each array of the result."""
         if self.judge:
-            return dict.fromkeys(self.judge.FIELDS, ())
-        return {key: self._shapes[key] for key in ARRAYS}
+            return dict.fromkeys(self.judge.fields, ())
+        return {key: x for key, x in self.outcome_shapes.items() if key != "state_errors"}
 
     @property
-    def _shapes(self) -> dict[str, tuple[int, ...]]:
+    def outcome_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape per run of each array of an outcome: those of `Campaign`, and the state errors.
+
+        The state errors at the times of the histories are NaN after a run was stopped.
+        """
         robot, nx, nu = self.plant.robot, self.plant.state.nx, len(self.plan.initial)
-        sizes = [(size,) for size in (robot.nq, robot.nv, nx, nu, nx, nu, *[len(KINDS)] * 3)]
-        *histories, states = [(len(self.steps), size) for size in (len(KINDS), nu, nx)]
-        return dict(zip(Outcome._fields, [*sizes, *histories, (), (), states], strict=True))
+        sizes = {"q": robot.nq, "v": robot.nv, "x": nx, "u": nu, "largest_x": nx, "largest_u": nu}
+        sizes |= dict.fromkeys(("errors", "largest", "settle"), len(KINDS))
+        histories = {"error_history": len(KINDS), "input_history": nu, "state_errors": nx}
+        return {
+            **{key: (size,) for key, size in sizes.items()},
+            **{key: (len(self.steps), size) for key, size in histories.items()},
+            **{"stop": (), "end": ()},
+        }
 
     def digest(self, first: Draws) -> str:
         """Return a digest of the robot, the policy, the options and the first run.
@@ -131,7 +147,7 @@ class CampaignJob:
 
     def run(self, rows: Draws, start: int, out: Mapping[str, Array] | None = None) -> ChunkResult:
         """Simulate runs with the given drawn values."""
-        drawn, shapes = np.asarray(rows.drawn), self._shapes if self.judge else self.shapes
+        drawn, shapes = np.asarray(rows.drawn), self.outcome_shapes if self.judge else self.shapes
         found: dict[str, Array] = {
             key: np.empty((len(drawn), *shape)) for key, shape in shapes.items()
         }
@@ -195,9 +211,7 @@ class CampaignJob:
     def seconds(self, first: Draws, count: int) -> float:
         """Estimate the time [s] of runs on one core from a few steps of the first runs."""
         few, plan = _remade(self._arguments, self.engine), self.plan
-        compiled, steps = self.engine == "compiled", plan.times.steps
-        lanes = LANES if compiled else 1
-        drawn = first.part(0, lanes)
+        drawn, steps = first.part(0, self.lanes), plan.times.steps
 
         def measured(steps: int) -> float:
             few.plan = replace(plan, times=plan.times._replace(steps=steps))
@@ -208,7 +222,7 @@ class CampaignJob:
         measured(1)  # compiles the loop if needed
         begin = measured(short)
         step = (measured(long) - begin) / (long - short) if long > short else 0.0
-        return (begin + max(step, 0.0) * (steps - short)) * math.ceil(count / lanes)
+        return (begin + max(step, 0.0) * (steps - short)) * math.ceil(count / self.lanes)
 
     def replay(self, drawn: Array) -> Motion:
         """Repeat a run (k,) with the same arithmetic, and return its motion."""
@@ -266,11 +280,9 @@ def expect(
     tell = getattr(progress, "expect", None)
     if tell is None:
         return
-    compiled = any(job.engine == "compiled" for job, *_ in work)
-    here = (threads or available_cores()) if compiled else 1
-    lanes = LANES if compiled else 1
-    cores = worker_count(executor) if executor else here
-    cores = min(cores, max(math.ceil(count / lanes) for *_, count in work))
+    here = max(job.threads(threads) for job, *_ in work)
+    most = max(math.ceil(count / job.lanes) for job, _, count in work)
+    cores = min(worker_count(executor) if executor else here, most)
     try:
         seconds = sum(job.seconds(first, count) for job, first, count in work)
     except FflinError:
@@ -305,19 +317,9 @@ def completed(
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Run a job on all its rows, and return its arrays."""
-    compiled = job.engine == "compiled"
-    threads = (threads or available_cores()) if compiled else 1
-    size = chunk_size(count, workers or threads, LANES if compiled else 1)
-    store = MemoryStore(count, size, job.shapes)
-    failed = run_chunks(
-        job,
-        rows,
-        store,
-        executor=executor,
-        threads=threads,
-        progress=progress,
-        all_needed=True,
-    )
-    if failed:
+    threads = job.threads(threads)
+    store = MemoryStore(count, chunk_size(count, workers or threads, job.lanes), job.shapes)
+    how: Any = {"executor": executor, "threads": threads, "progress": progress}
+    if failed := run_chunks(job, rows, store, all_needed=True, **how):
         raise FflinError(failed[0].reason)
     return dict(store.arrays)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
@@ -18,10 +18,10 @@ from fflin.analysis.names import rate_of
 from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
-from fflin.base.validation import Array, Indices, Mask, as_double
+from fflin.base.validation import Array, Indices, Mask, as_double, instance
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob, completed
-from fflin.campaign.statistics import EDGE, Over
+from fflin.campaign.statistics import EDGE, Judge
 from fflin.control.policies import StateFeedback
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
@@ -155,7 +155,9 @@ def settling_runs(
     # Without limits, inputs do not saturate and thrusts may be negative.
     options |= {"unlimited": limits is None}
     options |= {"histories": checks + 1} if predicts else {}
-    judge = Settling(loop, _transition(loop, dt, every) if predicts else None)
+    step = _transition(loop, dt, every) if predicts else None
+    figures, over = partial(_figures, loop, step), None if predicts else partial(_is_over, loop)
+    judge = Judge(("outcome", "error"), figures, over)
     return CampaignJob(loop.robot, StateFeedback(lin, loop.K), None, 0, "python", options, judge)
 
 
@@ -172,48 +174,30 @@ def _transition(loop: Loop, dt: float, every: int) -> Array:
     return np.linalg.matrix_power(step, every)
 
 
-@dataclass(frozen=True, eq=False)
-class Settling:
-    """Evaluation of runs: whether they settle, and how far they are from the linear loop.
+def _is_over(loop: Loop, first: Array, e: Array) -> Mask:
+    """Return whether runs have settled or diverged, from their errors (N, nx) at first and now."""
+    first, size = (loop.size(each[:, loop.model_states]) for each in (first, e))
+    over: Mask = (size <= SETTLED * first) | ~(size < DIVERGED * first)
+    return over
+
+
+def _figures(loop: Loop, step: Array | None, runs: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the outcomes (indices into OUTCOMES) and largest relative prediction errors of runs.
 
     `step` is the transition matrix of the linear loop from one history entry to the next. If it is
-    given, runs are not ended early and are compared with the linear loop.
+    None, runs are not compared with the linear loop.
     """
-
-    # Names of the results: index into OUTCOMES, and largest relative prediction error.
-    FIELDS: ClassVar[tuple[str, ...]] = ("outcome", "error")
-
-    loop: Loop
-    step: Array | None
-
-    @property
-    def over(self) -> Over | None:
-        """Stop condition: settled or diverged; None if runs are compared with the linear loop."""
-        return self._is_over if self.step is None else None
-
-    def _is_over(self, first: Array, e: Array) -> Mask:
-        first, size = (self.loop.size(each[:, self.loop.model_states]) for each in (first, e))
-        over: Mask = (size <= SETTLED * first) | ~(size < DIVERGED * first)
-        return over
-
-    def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
-        """Return the outcomes and errors of runs."""
-        loop, stop = self.loop, runs["stop"]
-        e = runs["state_errors"][:, :, loop.model_states]
-        last, first = loop.size(runs["x"][:, loop.model_states] - loop.lin.x0), loop.size(e[:, 0])
-        turned = (stop == STOPS.index("left the chart")) | (runs["largest"][:, 0] > EDGE)
-        diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
-        code = np.select([turned, diverged, last <= SETTLED * first], [2, 3, 1], 0)
-        apart = np.zeros(len(e)) if self.step is None else self._apart(e, self.step)
-        return {"outcome": code, "error": np.where(code > 1, np.nan, apart / first)}
-
-    def _apart(self, e: Array, step: Array) -> Array:
-        """Return the largest norm (N,) of the difference between each run and the linear loop."""
-        worst, predicted = np.zeros(len(e)), e[:, 0]
+    e, stop = runs["state_errors"][:, :, loop.model_states], runs["stop"]
+    last, first = loop.size(runs["x"][:, loop.model_states] - loop.lin.x0), loop.size(e[:, 0])
+    turned = (stop == STOPS.index("left the chart")) | (runs["largest"][:, 0] > EDGE)
+    diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
+    code = np.select([turned, diverged, last <= SETTLED * first], [2, 3, 1], 0)
+    apart, predicted = np.zeros(len(e)), e[:, 0]
+    if step is not None:
         for now in e.swapaxes(0, 1):
-            worst = np.maximum(worst, self.loop.size(now - predicted))
+            apart = np.maximum(apart, loop.size(now - predicted))
             predicted = predicted @ step.T
-        return worst
+    return {"outcome": code, "error": np.where(code > 1, np.nan, apart / first)}
 
 
 def settle(
@@ -248,9 +232,8 @@ def settle(
 
 def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     """Return the loop of a gain; raise `InputError` if it cannot settle at the operating point."""
-    if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
-        given = f"robot has type {type(robot).__name__}, lin has type {type(lin).__name__}"
-        raise InputError(f"{given}; expected a fflin.Robot and its fflin.LinearModel")
+    instance("robot", robot, Robot, "a fflin.Robot")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
     kept = getattr(gain, "regulated", ())
     part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))

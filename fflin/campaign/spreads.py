@@ -170,15 +170,12 @@ def inverse_of(name: str, spread: object) -> Callable[[Array], Array]:
             )
         return spread.ppf
     if isinstance(spread, tuple):
-        if len(spread) != 2:
-            raise InputError(f"'{name}' is {spread!r}, expected the bounds (least, largest)")
-        least, largest = (number(f"'{name}'", each) for each in spread)
-        if not least <= largest:
+        bounds = [number(f"'{name}'", each) for each in spread]
+        if len(bounds) != 2 or bounds[0] > bounds[1]:
             raise InputError(
-                f"'{name}' is ({least:g}, {largest:g}), expected bounds (least, largest) with "
-                "least <= largest"
+                f"'{name}' is {spread!r}, expected bounds (least, largest) with least <= largest"
             )
-        return partial(_uniform, least, largest)
+        return partial(_uniform, bounds[0], bounds[1])
     if isinstance(spread, list | np.ndarray):
         values = [number(f"'{name}'", each) for each in np.ravel(spread).tolist()]
         if not values:

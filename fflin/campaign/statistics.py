@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -54,36 +54,13 @@ def kind_named(name: str) -> str:
     return f"{of} {kind}".strip()
 
 
-class Outcome(NamedTuple):
-    """Outcomes of runs; each array has one row per run."""
+class Judge(NamedTuple):
+    """Evaluation of runs, whose results replace the record of a campaign; it is sent to workers."""
 
-    q: Array  # (N, nq), final
-    v: Array  # (N, nv)
-    x: Array  # (N, nx)
-    u: Array  # (N, nu)
-    largest_x: Array  # (N, nx), errors
-    largest_u: Array  # (N, nu)
-    errors: Array  # (N, kinds), final
-    largest: Array  # (N, kinds)
-    settle: Array  # (N, kinds) [s], settling times; infinite if the error has not settled
-    error_history: Array  # (N, times, kinds), infinite after a run was stopped
-    input_history: Array  # (N, times, nu), zero after a run was stopped
-    stop: Array  # (N,), index into STOPS
-    end: Array  # (N,) [s]
-    state_errors: Array  # (N, times, nx), NaN after a run was stopped
-
-
-class Judge(Protocol):
-    """Evaluation of runs that replaces the record of a campaign, and may end runs early."""
-
-    FIELDS: ClassVar[tuple[str, ...]]
-
-    @property
-    def over(self) -> Over | None:
-        """Stop condition, checked every `LOOK` steps; None if no run is ended early."""
-
-    def figures(self, runs: Mapping[str, Array]) -> dict[str, Array]:
-        """Return the FIELDS (N,) from the runs' `Outcome`; the first history entry is the start."""
+    fields: tuple[str, ...]  # names of the results
+    # Return the results (N,) from the runs' outcomes; the first history entry is the start.
+    figures: Callable[[Mapping[str, Array]], dict[str, Array]]
+    over: Over | None = None  # condition that ends a run early
 
 
 def kinds_of(state: StateMap) -> Indices:
@@ -116,7 +93,9 @@ def errors_of(state: StateMap, target: Array, q: Array, v: Array) -> tuple[Array
 def outcome_of(
     plan: Plan, state: StateMap, target: Array, steps: Array, run: Recording
 ) -> dict[str, Array]:
-    """Return a run's outcome, one row of each array of `Outcome`, from its recorded steps.
+    """Return a run's outcome from its recorded steps: a row of each array of `Campaign`.
+
+    The outcome also has the state errors at the times of the histories.
 
     Errors are relative to the state `target` (nx,), or to a moving state (steps + 1, nx). Histories
     have entries at `steps`.
@@ -135,7 +114,7 @@ def outcome_of(
         found[: len(kept)] = values[kept]
         return found
 
-    return Outcome(
+    return dict(
         q=run.q[-1],
         v=run.v[-1],
         x=x[-1],
@@ -150,7 +129,7 @@ def outcome_of(
         stop=np.array(float(stop)),
         end=np.array(run.steps * plan.times.dt),
         state_errors=history(signed, np.nan),
-    )._asdict()
+    )
 
 
 def marks_of(
@@ -241,7 +220,7 @@ class RunStatistics:
         (q, nu, u), marks, times = self._last, self._marks, len(self._steps)
         settled = _by_run(marks.outside) + 1.0
         late = (stop != 0.0)[:, None] | is_late(settled, done + 1)
-        return Outcome(
+        return dict(
             q=q,
             v=self._state.spread(nu),
             x=_by_run(marks.law.x),
@@ -256,7 +235,7 @@ class RunStatistics:
             stop=stop,
             end=np.full(LANES, done * self._dt),
             state_errors=_by_run(marks.states, times, self._state.nx),
-        )._asdict()
+        )
 
 
 def _by_run(values: Array, *shape: int) -> Array:

@@ -17,7 +17,7 @@ from fflin.base.validation import Array, FrozenArrays, Indices, number, share, w
 from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import expect
-from fflin.campaign.settling import OUTCOMES, PATIENCE, Loop, checked_loop, settle, settling_runs
+from fflin.campaign.settling import OUTCOMES, PATIENCE, checked_loop, settle, settling_runs
 from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -235,6 +235,15 @@ def validity(
     confidence = share("confidence", confidence)
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
+
+    def displaced(levels: Array, streams: Indices, runs: Indices) -> Array:
+        """Return the initial deviations of some runs, each from its own random stream."""
+        x = []
+        for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+            x.append(loop.displaced(rng, **_scaled(largest, level)))
+        return np.array(x) - loop.start
+
     sets, work = [], []
     # Level and random stream of each run: the runs for the prediction error, then the random runs.
     for predicts, at, streams in (
@@ -242,7 +251,7 @@ def validity(
         (False, levels, _DIRECTIONS + np.arange(samples)),
     ):
         runs_of = partial(settling_runs, loop, predicts, limits, largest["joint"])
-        starts = partial(_starts, loop, largest, seed, at, streams)
+        starts = partial(displaced, at, streams)
         sets.append((runs_of, starts, len(at)))
         job = runs_of()
         job.choose(engine)  # a wrong argument is refused before anything is compiled
@@ -281,22 +290,6 @@ def validity(
     )
 
 
-def _starts(
-    loop: Loop,
-    largest: dict[str, float],
-    seed: int,
-    levels: Array,
-    streams: Indices,
-    runs: Indices,
-) -> Array:
-    """Return the initial deviations of some runs, each from its own random stream."""
-    x = []
-    for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-        x.append(loop.displaced(rng, **_scaled(largest, level)))
-    return np.array(x) - loop.start
-
-
 def _report(progress: Progress, before: int, total: int, done: int, _: int) -> None:
     progress(before + done, total)
 
@@ -330,15 +323,11 @@ def _checked_displacement(
     """Return the largest displacement, with zeros for quantities that are not model states."""
     given = {"attitude": attitude, "position": position, "joint": joint}
     given = {key: number(key, value) for key, value in given.items()}
-    if not 0.0 <= given["attitude"] < 175.0 or min(given.values()) < 0.0:
+    if given["attitude"] >= 175.0 or not all(0.0 <= x <= _FARTHEST for x in given.values()):
         raise InputError(
-            f"the displacements are {shown(given)}, but each must be 0 or more, and the rotation "
-            "must be less than 175 deg, because the attitude chart ends at 180 deg"
-        )
-    if max(given.values()) > _FARTHEST:
-        raise InputError(
-            f"the displacements are {shown(given)}; expected at most {_FARTHEST:g}; give smaller "
-            "ones"
+            f"the displacements are {shown(given)}, but each must be 0 or more and at most "
+            f"{_FARTHEST:g}, and the rotation must be less than 175 deg, because the attitude "
+            "chart ends at 180 deg"
         )
     groups = {name.partition(".")[0] for name in lin.state_names}
     names = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}

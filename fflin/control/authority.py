@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import combinations, islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -18,9 +18,6 @@ from fflin.robot.equipment.mounting import carrier
 from fflin.robot.fields import limits_of
 from fflin.robot.inputs import named_wheels
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    pass
 
 _FACETS = 20_000  # normals computed together
 _MANY = 36  # thrusters; their zonotope has 400 000 facets
@@ -48,8 +45,7 @@ def point_report(properties: Mapping[str, Any]) -> str:
     inertia = properties["inertia"]
     moments, axes = np.linalg.eigh(inertia)
     axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), range(3)])
-    head = ["inertia", *_AXES, "principal", *(f"axis {axis}" for axis in _AXES)]
-    rows = [head]
+    rows = [["inertia", *_AXES, "principal", *(f"axis {axis}" for axis in _AXES)]]
     for row, moment, axis, name in zip(inertia, moments, axes.T, _AXES, strict=True):
         shown = ["." if abs(x) < _ROUNDING * moments[-1] else f"{x:.5g}" for x in row]
         along = ["." if abs(x) < _ROUNDING else f"{x:.4f}" for x in axis]
@@ -58,10 +54,9 @@ def point_report(properties: Mapping[str, Any]) -> str:
         f"centre of mass at {_vector(properties['center_of_mass'])} m in the base frame, and "
         "inertia about the centre of mass in kg\u00a0m^2, in base axes, at the operating point"
     )
-    parts = [f"{folded([head_line])}\n\n{grid(rows)}"]
-    parts.append(wheel_report(properties["wheel_momentum"]))
-    parts.append(thruster_report(properties["thruster_authority"]))
-    return "\n\n".join(part for part in parts if part)
+    wheels = wheel_report(properties["wheel_momentum"])
+    thrusters = thruster_report(properties["thruster_authority"])
+    return "\n\n".join(filter(None, (folded([head_line]), grid(rows), wheels, thrusters)))
 
 
 def mass_properties(robot: Robot, q: Array) -> tuple[Array, Array]:

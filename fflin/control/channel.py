@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.validation import DOUBLE, Array, as_double
@@ -18,9 +19,6 @@ from fflin.kernel.channel import PULSES, WHEELS, Pulses, Wheels
 from fflin.robot.fields import Range
 from fflin.robot.inputs import Thruster, named_inputs
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 
 class Saturation(NamedTuple):
@@ -119,22 +117,16 @@ def _pulses(
 
 
 def warn_beyond(
-    robot: str,
-    where: str,
-    names: Sequence[str],
-    units: Sequence[str],
-    asked: Array,
-    low: Array,
-    high: Array,
+    robot: str, where: str, units: Mapping[str, str], asked: Array, low: Array, high: Array
 ) -> None:
-    """Warn about inputs whose commands (N, nu) exceed their limits."""
+    """Warn about inputs {name: unit} whose commands (N, nu) exceed their limits."""
     bounds = np.where(asked > 0.0, high, low)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
     worst = ratio.argmax(axis=0)
     beyond = [
         f"{name} requires {asked[row, k]:.3g} {unit}, its limit is {bounds[row, k]:g}"
-        for k, (name, unit, row) in enumerate(zip(names, units, worst, strict=True))
+        for k, ((name, unit), row) in enumerate(zip(units.items(), worst, strict=True))
         if ratio[row, k] > 1.0 + 1e-6
     ]
     if beyond:

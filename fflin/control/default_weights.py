@@ -381,8 +381,8 @@ def _slowed(
     limit, effort = trial.limit, trial.effort
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "to return from the displacements of the default weights"
-    required = trial.required[None]
-    warn_beyond(lin.robot, where, lin.input_names, lin.input_units, required, -high, high)
+    units = dict(zip(lin.input_names, lin.input_units, strict=True))
+    warn_beyond(lin.robot, where, units, trial.required[None], -high, high)
     held = limit.what == least.what  # a slower loop cannot control the unstable mode
     what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
     return limit._replace(what=what), _achieved(lin, trial)

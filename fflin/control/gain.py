@@ -17,13 +17,12 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array, Mask, Values
-from fflin.control.optimal.riccati import rates_of
+from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
     import control
 
-    from fflin.control.optimal.riccati import Solution
     from fflin.linear.exchange import ToolGain
 
 # A gain with more entries than this, as for a robot with more than three joints, is not shown.

@@ -6,7 +6,7 @@ from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -135,13 +135,11 @@ class GainSchedule(Schedule):
                 "fflin.Trajectory.load and use TrajectoryFeedback"
             )
         state, made = StateMap(robot), f"the gain schedule was made for '{self.robot}'"
-        for kind, there, own in (
-            ("state", state.names, self.state_names),
-            ("input", Actuation(state).names, self.input_names),
-        ):
-            require_same(made, robot, kind, (own, own), (there, there))
-        values: dict[str, Any] = {name: getattr(self, name) for name in ("q", "v", "u")}
-        return Trajectory(robot, self.knots, **values, hold=self.hold, frame=self.frame)
+        inputs = Actuation(state).names
+        require_same(made, robot, "state", (self.state_names,) * 2, (state.names,) * 2)
+        require_same(made, robot, "input", (self.input_names,) * 2, (inputs,) * 2)
+        parts = self.knots, self.q, self.v, self.u
+        return Trajectory(robot, *parts, hold=self.hold, frame=self.frame)
 
     def cost_to_go(self, t: float) -> Array:
         """Return P (nx, nx) at time t: interpolated, or of the latest sample if sampled."""

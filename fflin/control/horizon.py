@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.base.errors import FflinWarning, MissingPackageError
+from fflin.base.errors import FflinWarning, optional_package
 from fflin.base.validation import Array, Indices, Mask, number, vector
 from fflin.control.policies import Clock
 
@@ -248,13 +248,7 @@ class Receding:
             self._model.update(A=self._rows)
 
     def _start(self) -> None:
-        try:
-            import daqp
-        except ImportError:
-            raise MissingPackageError(
-                "this needs the solver DAQP; install it with: pip install 'fflin[mpc]'"
-            ) from None
-        self._model = daqp.Model()
+        self._model = optional_package("daqp", "this needs the solver DAQP", "mpc").Model()
         self._model.settings = {"primal_tol": _EXACT * self._size, "iter_limit": _MOST}
         self._model.settings = {"w_soft": _PRICE * self._size, "rho_soft": _YIELDS}
         (m, size), kinds = self._rows.shape, (_SOFT * self._soft).astype(np.int32)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,9 +24,6 @@ from fflin.dynamics.outputs import Measuring
 from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default names of signals
 
@@ -322,18 +319,14 @@ def _realised(given: object) -> Any:
         ) from None
 
 
-def _checked(
-    A: ArrayLike,
-    B: ArrayLike,
-    C: ArrayLike,
-    D: ArrayLike | None,
-    dt: object = None,
-    inputs: Iterable[object] = (),
-    outputs: Iterable[object] = (),
-) -> System:
+def _checked(*given: Any) -> System:
     """Return a system with consistent sizes; if A is empty, the system consists of D alone."""
-    of = dict(zip("ABCD", (A, B, C, 0.0 if D is None else D), strict=True))
-    A, B, C, D = (np.atleast_2d(as_double(f"controller's {x}", of[x])) for x in of)
+    *matrices, dt, inputs, outputs = System(*given)
+    matrices[3] = 0.0 if matrices[3] is None else matrices[3]
+    A, B, C, D = (
+        np.atleast_2d(as_double(f"controller's {key}", each))
+        for key, each in zip("ABCD", matrices, strict=True)
+    )
     nz = len(A) if A.size else 0
     ny, nu = (B.shape[-1], len(C)) if nz else (D.shape[-1], len(D))
     if not nz:

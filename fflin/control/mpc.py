@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,8 +30,6 @@ from fflin.robot.robot import Robot
 
 # Weights Q and R, and the name of their rule.
 Cost: TypeAlias = "tuple[Weight | None, Weight | None, str | None]"
-# Function that returns the limits of a stage: E, D, low and high.
-Rows: TypeAlias = Callable[..., tuple[Array, ...]]
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
 _MOST = 20_000_000
@@ -136,21 +134,21 @@ def mpc(
             "lin is sampled with another dt, or the model before sampling is not known; give the "
             "continuous model and dt="
         )
-    names, at, rows = _limits(source, limits)
-    if samples**2 * (len(at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
+    limited = _limits(source, limits)
+    if samples**2 * (len(limited.at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
         raise InputError(
-            f"horizon is {samples} samples with {len(at)} limits, which makes the optimisation "
-            "problem too large; give a shorter horizon or fewer limits"
+            f"horizon is {samples} samples with {len(limited.at)} limits, which makes the "
+            "optimisation problem too large; give a shorter horizon or fewer limits"
         )
-    given = (Q, R, weights), Qf, samples, dt, names, rows
+    given = (Q, R, weights), Qf, samples, dt, limited
     made: Callable[[Horizon], Mpc | TrajectoryMpc]
     if isinstance(source, LinearTrajectory):
         made, stages = _along(source, *given)
     else:
         made, stages = _about(source, *given)
-    acting = at[at < len(lin.input_names)]
+    acting = limited.at[limited.at < len(lin.input_names)]
     of: Any = getattr(source.robot, "name", source.robot)
-    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, names, of))
+    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, limited.names, of))
 
 
 class _Shown:
@@ -214,23 +212,31 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
         return Receding(self.horizon, self.deviation(robot))
 
 
-def _limits(
-    of: LinearModel | LinearTrajectory, limits: object
-) -> tuple[tuple[str, ...], Indices, Rows]:
-    """Return the names of limited signals, their indices, and a function that limits a stage.
+class _Limits(NamedTuple):
+    """Limited signals: their names, limits, and indices among inputs, states and outputs."""
 
-    The indices count inputs, then states, then outputs. The function returns E, D, low and high of
-    a stage from its output matrices and its target values.
-    """
+    names: tuple[str, ...]
+    at: Indices
+    low: Array
+    high: Array
+
+    def of_stage(self, C: Array, D: Array, *target: Array) -> tuple[Array, ...]:
+        """Return E, D, low and high of a stage from its output matrices and target values."""
+        (nx, nu), there = (C.shape[1], D.shape[1]), np.concatenate(target)[self.at]
+        of_e = np.vstack((np.zeros((nu, nx)), np.eye(nx), C))[self.at]
+        of_d = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))[self.at]
+        return of_e, of_d, self.low - there, self.high - there
+
+
+def _limits(of: LinearModel | LinearTrajectory, limits: object) -> _Limits:
+    """Return the limits of a model's inputs, states and outputs."""
     if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
         raise InputError("lin was loaded from a file, which contains no robot; linearise again")
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
     beside = [name for name in outputs if name not in states]
     known = (*state_keys(robot.joint_names), *input_keys(of))
-    found, parts = (
-        dict[str, object](),
-        list(limits) if isinstance(limits, list | tuple) else [limits],
-    )
+    found = dict[str, object]()
+    parts = list(limits) if isinstance(limits, list | tuple) else [limits]
     for k, part in enumerate(parts):
         if isinstance(part, Mapping) and beside:
             own = [x for x in part if stands_for_any(x, beside) and not stands_for_any(x, known)]
@@ -248,33 +254,20 @@ def _limits(
             f"the lower limit of {names[least.argmax()]} is above its upper limit; correct limits="
         )
     at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
-
-    def rows(C: Array, D: Array, *target: Array) -> tuple[Array, ...]:
-        (nx, nu), there = (C.shape[1], D.shape[1]), np.concatenate(target)
-        of_e = np.vstack((np.zeros((nu, nx)), np.eye(nx), C))[at]
-        of_d = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))[at]
-        return of_e, of_d, (low - there)[at], (high - there)[at]
-
-    return tuple(names[i] for i in at), at, rows
+    return _Limits(tuple(names[i] for i in at), at, low[at], high[at])
 
 
 def _about(
-    lin: LinearModel,
-    cost: Cost,
-    Qf: Weight | str,
-    samples: int,
-    dt: float,
-    names: tuple[str, ...],
-    rows: Rows,
+    lin: LinearModel, cost: Cost, Qf: Weight | str, samples: int, dt: float, signals: _Limits
 ) -> tuple[Callable[[Horizon], Mpc], list[Stage]]:
     """Return a function that creates the controller about a point, and the stages."""
     (Q, R, weights), sampled = cost, lin.discretize(dt)
     given = (Q, R) if Q is None or R is None else sampled_cost(lin, dt, Q, R)
     gain = lqr(sampled, *given, weights=weights)
     StateFeedback(sampled, gain.K)  # refuses a moving reference
-    limited = rows(lin.C, lin.D, lin.u0, lin.x0, lin.y0)
+    limited = signals.of_stage(lin.C, lin.D, lin.u0, lin.x0, lin.y0)
     far = np.maximum(limited[2], -limited[3]) > 1e-9
-    if beyond := [name for name, out in zip(names, far, strict=True) if out]:
+    if beyond := [name for name, out in zip(signals.names, far, strict=True) if out]:
         raise InputError(
             f"the point exceeds the limits of {listed(beyond)}; give wider limits, or linearise "
             "about another point"
@@ -289,13 +282,7 @@ def _about(
 
 
 def _along(
-    traj: LinearTrajectory,
-    cost: Cost,
-    Qf: Weight | str,
-    samples: int,
-    dt: float,
-    _: tuple[str, ...],
-    rows: Rows,
+    traj: LinearTrajectory, cost: Cost, Qf: Weight | str, samples: int, dt: float, signals: _Limits
 ) -> tuple[Callable[[Horizon], TrajectoryMpc], list[Stage]]:
     """Return a function that creates the controller along a trajectory, and the stages."""
     schedule = tvlqr(traj, cost[0], cost[1], Qf, dt, weights=cost[2])
@@ -305,7 +292,7 @@ def _along(
     def about(of: LinearModel, u: Array) -> tuple[Array, ...]:
         # Limits on the base pose apply to its error relative to the trajectory.
         x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
-        return rows(of.C, of.D, u, x, of.y0)
+        return signals.of_stage(of.C, of.D, u, x, of.y0)
 
     stages = []
     for k, sample in enumerate(held_stages(traj, dt, Q, R)):

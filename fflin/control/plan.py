@@ -164,8 +164,8 @@ def plan(
     bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in state.names]).T
     size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
     size[size == 0.0] = 1.0
-    for name, point, which in (("start", start, slice(None)), ("goal", end, asked)):
-        _require_within(shooting, bounds, name, point, which)
+    _require_within(shooting, bounds, "start", start, np.full(state.nx, True))
+    _require_within(shooting, bounds, "goal", end, asked)
     # A search without a solution may diverge; an error is then raised instead of NumPy warnings.
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
         guess = shooting.guess(start, end)
@@ -227,12 +227,10 @@ def _least(search: Search, guess: tuple[Array, Array, Array], size: Array) -> _M
 
 
 def _require_within(
-    shooting: Shooting, bounds: Array, what: str, point: Point, which: slice | Mask
+    shooting: Shooting, bounds: Array, what: str, point: Point, asked: Mask
 ) -> None:
-    """Raise `InputError` if a point is outside the limits of some states."""
+    """Raise `InputError` if a point is outside the limits of the states `asked`."""
     values, state = shooting.limited_values(*point), shooting.state
-    asked = np.zeros(state.nx, dtype=bool)
-    asked[which] = True
     outside = [
         f"{state.names[i]} is {values[i]:.4g} {state.units[i]}, limit {limit:.4g} {state.units[i]}"
         for side, limits in zip((-1.0, 1.0), bounds, strict=True)

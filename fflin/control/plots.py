@@ -224,7 +224,6 @@ def _poles_of(given: object) -> tuple[Values, float]:
     if not right or not np.isfinite(poles).all():
         raise InputError(
             f"poles has type {type(given).__name__} of shape {poles.shape}, expected finite "
-            "numbers "
-            "(k,), a Gain, a LinearModel or {label: poles}"
+            "numbers (k,), a Gain, a LinearModel or {label: poles}"
         )
     return poles, 0.0

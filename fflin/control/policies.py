@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, frozen, instance, shaped, vector
-from fflin.control.channel import Law
+from fflin.control.channel import Law, input_limits
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import readout
@@ -48,10 +48,6 @@ class Feedback:
         state = StateMap(robot, reference=self.lin.reference, frame=self.lin.frame)
         require_fit(self.lin, robot, state)
         return state
-
-    def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot."""
-        raise NotImplementedError
 
 
 @dataclass(eq=False)
@@ -188,10 +184,7 @@ class AllocatedPolicy:
         self.advance = self._command.advance
         self._inner = inner
         self._data, self._design_data = robot.create_data(), allocation.design.create_data()
-        limits, open_ = limits_of(robot), (-np.inf, np.inf)
-        self._least, self._most = np.array(
-            [limits.get(name, open_) for name in self._robot.names]
-        ).T
+        self._limits = input_limits(robot, limits_of(robot))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -216,7 +209,7 @@ class AllocatedPolicy:
         M = asked.project(pin.crba(asked.robot.model, self._design_data, q).T)
         factor = np.linalg.cholesky(M)
         scaled = np.linalg.solve(factor, np.column_stack((columns, force)))
-        return nearest(scaled[:, :-1], scaled[:, -1], self._least, self._most)
+        return nearest(scaled[:, :-1], scaled[:, -1], *self._limits)
 
 
 class Clock:

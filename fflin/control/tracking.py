@@ -318,11 +318,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
             state = home.about(home.origin * pin.XYZQUATToSE3(q[:7]))
             return Measuring(state, q), state.read(q, v)
 
-        return Loop(home, self.filter.dt, self.noise, self._size, self._sample, there)
-
-    @property
-    def _size(self) -> int:
-        return len(self.filter.state_names)
+        return Loop(home, self.filter.dt, self.noise, home.nx, self._sample, there)
 
     @cached_property
     def _rest(self) -> tuple[LinearModel, Array]:
@@ -332,7 +328,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
 
     def _sample(self, t: float) -> Sample:
         gains, seen, dt = self.schedule, self.filter, self.filter.dt
-        k, jump = round(t / dt), np.zeros(self._size)
+        k, jump = round(t / dt), np.zeros(len(seen.state_names))
         if k < len(seen.A):
             A, B, K, L, C, D = (x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D))
             # A held input approximates a changing input best if it has the value at the middle of

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import DetectabilityError, EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, instance, number
 from fflin.control.default_weights import pace_along
 from fflin.control.gain import Gain
 from fflin.control.gain_schedule import FilterSchedule, GainSchedule, Interpolant
@@ -180,12 +180,8 @@ def held_stages(
 
 def require_continuous(traj: LinearTrajectory) -> None:
     """Raise `InputError` if traj is not a LinearTrajectory in continuous time."""
-    if not isinstance(traj, LinearTrajectory):
-        raise InputError(
-            f"traj has type {type(traj).__name__}, expected a LinearTrajectory; "
-            "fflin.linearize_trajectory returns one"
-        )
-    if traj.dt:
+    expected = "a LinearTrajectory; fflin.linearize_trajectory returns one"
+    if instance("traj", traj, LinearTrajectory, expected).dt:
         raise InputError("traj is sampled; give the continuous trajectory and sample=")
 
 
@@ -314,7 +310,12 @@ def tvkalman(
         return 0.5 * (spread + spread.T)
 
     if asks_steady(P0, "P0", "a covariance"):
-        P = _steady_filter(traj, intensity(float(traj.t[0])), V, dt)
+        lin, early = steady_end(traj, 0), intensity(float(traj.t[0]))
+        try:
+            P = kalman(lin.discretize(dt), held_cost(lin.A.T, early, dt), V).P
+        except (DetectabilityError, InputError) as error:
+            said = f"no steady filter exists at the start of the trajectory: {error}; or give P0"
+            raise type(error)(said) from None
     else:
         P = weight("P0", P0, traj.state_names)
     held, at_samples, nx = list(transitions(traj, dt)), along(traj.resampled(dt)), len(P)
@@ -341,16 +342,6 @@ def tvkalman(
         dt=dt,
         **{key: getattr(traj, key) for key in _OF_FILTER},
     )
-
-
-def _steady_filter(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Array:
-    lin = steady_end(traj, 0)
-    try:
-        return kalman(lin.discretize(dt), held_cost(lin.A.T, W, dt), V).P
-    except (DetectabilityError, InputError) as error:
-        raise type(error)(
-            f"no steady filter exists at the start of the trajectory: {error}; or give P0"
-        ) from None
 
 
 def _disturbed(steps: Steps, intensity: Callable[[float], Array]) -> Array:

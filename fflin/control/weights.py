@@ -290,14 +290,11 @@ def rule_weights(
         Q, R, rule = np.eye(nx), np.eye(nu), "1 for every state and every input (identity)"
     else:
         raise unknown("rule of weights", name, ("urdf", "identity"))
-    given_weights: dict[int, _Given] = {}
-    named: dict[str, None] = {}
+    weights = dict[int, _Given]()
     for layer, of_robot in layers:
-        weights, names = _weights_of(lin, layer, of_robot)
-        given_weights |= weights
-        named |= dict.fromkeys(names)
-    if named:
-        Q, R = _reweighed(lin, Q, R, terms, given_weights)
+        weights |= _weights_of(lin, layer, of_robot)
+    if named := dict.fromkeys(each.key for each in weights.values()):
+        Q, R = _reweighed(Q, R, terms, weights)
         rule = f"{', '.join(named)} as given; all other weights: {rule}"
         rule += " (these figures are for this rule alone)" if terms.any() else ""
     if source.dt == lin.dt:
@@ -346,28 +343,27 @@ def _of_regulated(
 
 
 class _Given(NamedTuple):
-    """A weight from the user, and whether it was given as a largest value (Bryson's rule)."""
+    """A weight from the user, its name or pattern, and whether it is a largest value (Bryson)."""
 
     value: float
+    key: str
     largest: bool
 
 
-def _weights_of(
-    lin: LinearModel, given: Mapping[str, Any], of_robot: bool
-) -> tuple[dict[int, _Given], list[str]]:
-    """Return {index: given weight}, with states before inputs, and the names that were given."""
+def _weights_of(lin: LinearModel, given: Mapping[str, Any], of_robot: bool) -> dict[int, _Given]:
+    """Return {index: given weight}, with states before inputs."""
     states, inputs = lin.state_names, input_keys(lin)
-    found, named = dict[int, _Given](), list[str]()
-    every = (*states, *inputs)
+    found, every = dict[int, _Given](), (*states, *inputs)
     kinds = ("q", "state", states), ("r", "input", inputs), ("bryson", "state or input", every)
     for part, kind, known in kinds:
-        values = given.get(part, {})
-        if of_robot:  # a reduced model may lack states that the robot's weights name
-            values = {key: x for key, x in values.items() if stands_for_any(key, known)}
-        values = {key: number(f"{part} of '{key}'", x) for key, x in values.items()}
-        if part == "bryson":
-            what = "largest value of '{}' (--bryson)"
-            values = {key: inverse_square(what.format(key), x) for key, x in values.items()}
+        values = dict[str, _Given]()
+        for key, raw in given.get(part, {}).items():
+            if of_robot and not stands_for_any(key, known):
+                continue  # a reduced model may lack states that the robot's weights name
+            value = number(f"{part} of '{key}'", raw)
+            if part == "bryson":
+                value = inverse_square(f"largest value of '{key}' (--bryson)", value)
+            values[key] = _Given(value, key, part == "bryson")
         first = len(states) if part == "r" else 0
         at = {first + i: x for i, x in by_name(kind, values, known).items()}
         if both := found.keys() & at.keys():
@@ -375,13 +371,12 @@ def _weights_of(
                 f"'{every[min(both)]}' has both a weight and a largest value "
                 "(bryson); give only one of them"
             )
-        found |= {i: _Given(x, part == "bryson") for i, x in at.items()}
-        named += values
-    return found, named
+        found |= at
+    return found
 
 
 def _reweighed(
-    lin: LinearModel, Q: Array, R: Array, terms: Array, given: Mapping[int, _Given]
+    Q: Array, R: Array, terms: Array, given: Mapping[int, _Given]
 ) -> tuple[Array, Array]:
     """Return Q and R with the `given` weights, and all others scaled to match them.
 
@@ -391,7 +386,7 @@ def _reweighed(
     costs = [terms[index] for index, each in given.items() if each.largest and terms[index]]
     scale = math.exp(-np.log(costs).mean()) if costs else 1.0
     Q, R, nx = scale * Q, scale * R, len(Q)
-    for index, (value, _) in given.items():
+    for index, (value, *_) in given.items():
         matrix, at = (Q, index) if index < nx else (R, index - nx)
         matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
     return Q, R

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.base.errors import InputError, MissingPackageError
+from fflin.base.errors import InputError, optional_package
 from fflin.base.validation import Array, FrozenArrays, frozen, number, positive
 from fflin.dynamics.integrators import held_exponential
 
@@ -440,12 +440,7 @@ def state_space(
     matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str]
 ) -> control.StateSpace:
     """Return a `control.StateSpace` of A, B, C, D and names of states, inputs and outputs."""
-    try:
-        import control
-    except ImportError:
-        raise MissingPackageError(
-            "to_control needs python-control; install it with: pip install 'fflin[control]'"
-        ) from None
+    control = optional_package("control", "to_control needs python-control", "control")
     # python-control reserves dots in signal names for its own system.signal syntax.
     states, inputs, outputs = ([name.replace(".", "_") for name in each] for each in signals)
     return control.ss(*matrices, dt, states=states, inputs=inputs, outputs=outputs)

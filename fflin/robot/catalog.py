@@ -8,6 +8,7 @@ from typing import NamedTuple
 from urllib.parse import unquote
 
 from fflin.base.errors import FileError, InputError, require_known, unknown
+from fflin.base.validation import instance
 from fflin.base.writing import as_path, missing, shown
 
 # Robots of example-robot-data that code builds from another robot, so they have no URDF.
@@ -71,8 +72,7 @@ def list_robots() -> tuple[str, ...]:
 
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
     """Find a robot by a bundled name, by a path in `folder`, or by a name in example-robot-data."""
-    if not isinstance(robot, str | os.PathLike):
-        raise InputError(f"robot has type {type(robot).__name__}, expected a robot name or a path")
+    instance("robot", robot, (str, os.PathLike), "a robot name or a path")
     if isinstance(robot, str) and robot in _bundled():
         return _bundled()[robot]
     path, text = Path(folder, robot), str(robot)

@@ -50,10 +50,8 @@ def checked_inputs(
     value: object, find: Find, joints: Sequence[str], passive: Sequence[str]
 ) -> tuple[Input, ...]:
     """Check inputs, and return them with one joint torque for each joint of a pattern."""
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        raise InputError(f"inputs has type {type(value).__name__}, expected a sequence of inputs")
-    if not value:
-        raise InputError("inputs is empty; give at least one input")
+    if isinstance(value, str) or not isinstance(value, Sequence) or not value:
+        raise InputError(f"inputs is {value!r}, expected a sequence of at least one input")
     for item in value:
         if not isinstance(item, Input):
             known = ", ".join(kind.__name__ for kind in kinds.KINDS)

@@ -200,22 +200,17 @@ class LaneLoop:
         mass = robot.tree.bodies[::10].sum(axis=0)
         kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * robot.gravity[:, None]
         kept.start[9:], self.done = self.parts.point.q[:3], 0
-        return self._sensors(runs, of_lane)
-
-    def _sensors(self, runs: Runs, of_lane: Indices) -> Callable[[int, int], None]:
-        """Return a function that writes the sensor errors between two steps."""
         law, size = self.parts.law, len(self.parts.law.y)
         rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
         nothing = np.zeros((LANES, size))
         bias, deviation = (runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise"))
         rows[:] = bias
         draws = [noise_generator(seed) for seed in runs["seed"][of_lane]] if "seed" in runs else []
-
         drawn = 0
 
         def sense(step: int, last: int) -> None:
             nonlocal drawn
-            if drawn == last:  # the slice was interrupted by the end of a run
+            if not self._noisy or drawn == last:  # the end of a run interrupted the slice
                 return
             drawn = last
             k, values = noises(self._plan, size, step, last)
@@ -224,7 +219,7 @@ class LaneLoop:
                 random = normal.standard_normal(values.shape)
                 rows[k % SLOTS, :, lane] += deviation[:, lane] * random
 
-        return sense if self._noisy else lambda *_: None
+        return sense
 
     def _end(self, statistics: Statistics, ending: Mask, stop: Array, out: Runs) -> None:
         """Write into `out` the outcomes of the runs that end at the current step."""

@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
-from fflin.control.channel import channel_of
+from fflin.control.channel import channel_of, input_limits
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Gridded, StateFeedback, measured_at
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
@@ -203,11 +203,10 @@ def _filtered(
 
 def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
     """Return the allocation of commands for the robot `asking` to inputs of the robot `giving`."""
-    names, tree = plant.actuation.names, batch_tree(asking.robot)
+    tree = batch_tree(asking.robot)
     assert tree is not None
     size, asks = plant.state.nx // 2, mechanics_of(asking, tree)
-    limits = [limits_of(plant.robot).get(key, (-np.inf, np.inf)) for key in names]
-    least, most = (np.array(each) for each in zip(*limits, strict=True))
+    least, most = input_limits(plant.robot, limits_of(plant.robot))
     point = empty(forward.POINT)._replace(
         q=np.zeros(plant.robot.nq), pushing=np.zeros(len(asking.actuation.names))
     )

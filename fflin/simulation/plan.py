@@ -254,8 +254,8 @@ def _initial_inputs(policy: Any, plant: Plant, limits: Saturation) -> Array:
         initial = along.reference(0.0)[2]
     else:
         return np.zeros(len(limits.low))
-    names, units = actuation.names, actuation.units
-    warn_beyond(robot.name, where, names, units, inputs, limits.low, limits.high)
+    units = dict(zip(actuation.names, actuation.units, strict=True))
+    warn_beyond(robot.name, where, units, inputs, limits.low, limits.high)
     return initial
 
 

@@ -115,11 +115,10 @@ def limited(motion: Motion) -> Iterator[Limited]:
     """Yield the states and inputs of a motion that have limits."""
     names = motion.state_names + motion.input_names
     units = motion.state_units + motion.input_units
-    found = dict(
-        zip(names, zip(np.hstack((motion.x, motion.u)).T, units, strict=True), strict=True)
-    )
+    columns = np.hstack((motion.x, motion.u)).T
     for name, limits in zip(motion.limit_names, motion.limits, strict=True):
-        yield name, *found[name], limits
+        at = names.index(name)
+        yield name, columns[at], units[at], limits
 
 
 def _name(name: str) -> str:

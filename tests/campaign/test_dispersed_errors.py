@@ -7,9 +7,10 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.campaign.campaign import ARRAYS
 from fflin.campaign.pointing import turned
 from fflin.campaign.report import worst_runs
-from fflin.campaign.runs import ARRAYS, CampaignJob
+from fflin.campaign.runs import CampaignJob
 from fflin.robot.equipment.mounting import turned_to
 from tests.support import policies
 from tests.support.campaigns import both
@@ -173,7 +174,7 @@ def test_noise_is_the_same_for_any_chunks_and_threads_and_whatever_else_ends():
     whole = turned_by_noise("compiled", 1.5)
     parts = turned_by_noise("compiled", 1.5, chunk=8, threads=2, runs=9)
     assert len({*whole.end}) > 5
-    for name in ("drawn", *ARRAYS):
+    for name in ARRAYS:
         assert np.array_equal(getattr(whole, name)[:9], getattr(parts, name)), name
     for run in range(20):
         assert np.array_equal(whole.replay(run).q[-1], whole.q[run])

@@ -17,8 +17,9 @@ from scipy import stats
 from scipy.linalg import expm
 
 import fflin
+from fflin.campaign.campaign import ARRAYS
 from fflin.campaign.report import influences, worst_runs
-from fflin.campaign.runs import ARRAYS, CampaignJob
+from fflin.campaign.runs import CampaignJob
 from fflin.campaign.statistics import KINDS
 from fflin.simulation.report import error_histories
 from tests.support.campaigns import both
@@ -225,7 +226,7 @@ def test_a_campaign_is_the_same_on_any_workers_and_after_a_kill(tmp_path):
     given = {"q_b": 0.05, "*.mass": 0.1, "q_m": (-0.2, 0.2)}
     case = {"duration": 0.4, "dt": 0.02, "threads": 2, "engine": one.engine}
     few = fflin.monte_carlo(robot, feedback(robot), given, runs=27, chunk=8, **case)
-    for name in ("drawn", *ARRAYS):
+    for name in ARRAYS:
         for other in others:
             assert np.array_equal(getattr(one, name), getattr(other, name)), name
         assert np.array_equal(getattr(one, name)[:27], getattr(few, name)), name
@@ -414,7 +415,7 @@ def test_it_is_saved_and_loaded_to_the_last_bit(campaign, ending, tmp_path):
     campaign.save(tmp_path / f"runs{ending}")
     again = fflin.Campaign.load(tmp_path / f"runs{ending}")
     assert (again.names, again.asked, again.judged) == (campaign.names, 40, campaign.judged)
-    for name in ("drawn", *ARRAYS):
+    for name in ARRAYS:
         assert np.array_equal(getattr(again, name), getattr(campaign, name))
     assert str(again) == str(campaign)
     with pytest.raises(fflin.InputError, match="file"):
@@ -632,7 +633,7 @@ def test_what_is_kept_does_not_grow_with_the_duration(robots):
         fflin.monte_carlo(robot, None, {"q_b": 0.01}, runs=2, duration=duration, dt=0.01)
         for duration in (0.1, 3.0)
     )
-    for name in ("drawn", *ARRAYS):
+    for name in ARRAYS:
         assert getattr(short, name).shape == getattr(long, name).shape
 
 

@@ -12,7 +12,7 @@ from fflin.campaign.runs import CampaignJob
 from fflin.campaign.statistics import (
     KINDS,
     LOOK,
-    Outcome,
+    Judge,
     RunStatistics,
     kinds_of,
     marks_of,
@@ -165,7 +165,7 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
             defined(job, home, *(each[:, lane] for each in (q, nu, u)), stop[lane])
             for lane in range(LANES)
         ]
-        for name in Outcome._fields:
+        for name in job.outcome_shapes:
             expected = np.array([each[name] for each in plain])
             found = ends[-1][name]
             assert found.shape == expected.shape
@@ -175,17 +175,9 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
         assert np.array_equal(one, ends[1][name])
 
 
-class Halved:
-    """Ends a run when its position error has fallen to half of the one at the start."""
-
-    FIELDS = ("end", "stop")
-
-    @staticmethod
-    def over(first, e):
-        return np.linalg.norm(e[:, 3:6], axis=1) <= 0.5 * np.linalg.norm(first[:, 3:6], axis=1)
-
-    def figures(self, runs):
-        return {key: runs[key] for key in self.FIELDS}
+def halved(first, e):
+    """Whether the position error has fallen to half of the one at the start."""
+    return np.linalg.norm(e[:, 3:6], axis=1) <= 0.5 * np.linalg.norm(first[:, 3:6], axis=1)
 
 
 @pytest.mark.compiled
@@ -201,7 +193,8 @@ def test_a_stop_condition_ends_each_run_where_it_is_first_looked_at_and_met(engi
     starts = np.zeros((10, len(lin.x0)))
     starts[:9, 3:6] = 0.2 * np.eye(3).repeat(3, axis=0) + 0.01 * np.arange(9)[:, None]
     starts[9, 5] = 1e-3
-    job = CampaignJob(robot, policy, None, 0, engine, options, Halved())
+    judge = Judge(("end", "stop"), lambda runs: {key: runs[key] for key in judge.fields}, halved)
+    job = CampaignJob(robot, policy, None, 0, engine, options, judge)
     found = job.run(Draws(starts), 0).arrays
     ends = []
     for start in starts:

@@ -283,7 +283,8 @@ def test_bad_input(arm):
         ((arm, lin, -gain.K), "stable"),
         ((arm, lin, gain.K[:, 1:]), r"\bK\b.*shape"),
         ((arm, lin, "K"), "<U1"),
-        ((arm, None, gain), "fflin.Robot"),
+        ((arm, None, gain), "fflin.LinearModel"),
+        ((None, lin, gain), "fflin.Robot"),
         ((arm.replace(inputs=[fflin.BaseTorque()]), lin, gain), "F_b"),
     ):
         with pytest.raises(fflin.InputError, match=words):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fflin.campaign.runs import ARRAYS, CampaignJob
+from fflin.campaign.runs import CampaignJob
 
 
 def both(robot, policy, given, runs=3, tolerance=1e-10, **options):
@@ -13,7 +13,7 @@ def both(robot, policy, given, runs=3, tolerance=1e-10, **options):
     jobs = [CampaignJob(robot, policy, given, 5, name, options) for name in ("python", "compiled")]
     rows = jobs[0].dispersions.rows(0, runs)
     python, lanes = (job.run(rows, 0).arrays for job in jobs)
-    for name in ARRAYS:
+    for name in jobs[0].shapes:
         size = np.maximum(1.0, np.where(np.isfinite(python[name]), np.abs(python[name]), 1.0))
         assert np.array_equal(np.isinf(python[name]), np.isinf(lanes[name])), name
         with np.errstate(invalid="ignore"):

@@ -6,10 +6,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Mask
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.optimal.stage_qp import StageQP, StageRows
 
@@ -47,8 +46,6 @@ _STAGNANT = 10
 # guess.
 _PRICE = 1e3
 
-Flags = NDArray[np.bool_]
-
 
 class Trial(NamedTuple):
     """Trial: knots, inputs, gaps between intervals, and distances of states from their limits."""
@@ -65,7 +62,7 @@ class Trial(NamedTuple):
         """Largest gap between intervals."""
         return float(np.abs(self.missed).max())
 
-    def outside(self, limited: Flags) -> float:
+    def outside(self, limited: Mask) -> float:
         """Return the sum of limit violations at knots and at `limited` points within intervals."""
         return float(excess(self.knots).sum() + excess(self.inside)[limited].sum())
 
@@ -79,7 +76,7 @@ class Search(NamedTuple):
     shooting: Shooting
     start: Point
     end: Point
-    asked: Flags  # states whose value at the end is prescribed (nx,)
+    asked: Mask  # states whose value at the end is prescribed (nx,)
     bounds: Array  # limits of states (2, nx)
     limits: Array  # limits of inputs (2, nu)
     cost: Array  # weights of squared inputs (N + 1, nu)
@@ -129,7 +126,7 @@ class Search(NamedTuple):
                 break
         return self._acting(self._closed(trial, limited, first, left))
 
-    def _report(self, what: str, trial: Trial, limited: Flags) -> None:
+    def _report(self, what: str, trial: Trial, limited: Mask) -> None:
         """Report the cost relative to the guess, and the largest violation."""
         cost, inside = float((self.cost * trial.u**2).sum()), excess(trial.inside)[limited]
         most = max(trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0)))
@@ -152,16 +149,16 @@ class Search(NamedTuple):
         inside = tighter[:, None, None] - shooting.inside(motions, self.parts)
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
 
-    def _exceeding(self, trial: Trial) -> Flags:
+    def _exceeding(self, trial: Trial) -> Mask:
         """Return whether points (N, parts - 1, nx) or their neighbours exceed a limit."""
-        beyond: Flags = excess(trial.inside) > (_LIMITED + _TIGHTER) * self._size
+        beyond: Mask = excess(trial.inside) > (_LIMITED + _TIGHTER) * self._size
         near = beyond.copy()
         near[:, 1:] |= beyond[:, :-1]
         near[:, :-1] |= beyond[:, 1:]
         return near
 
     def _step(
-        self, trial: Trial, limited: Flags, near: Array, effort: Array
+        self, trial: Trial, limited: Mask, near: Array, effort: Array
     ) -> tuple[Array, Array, Array, float, float] | None:
         """Return the optimal step of knots and inputs, its multipliers and its violations.
 
@@ -191,7 +188,7 @@ class Search(NamedTuple):
         at_knots = float(excess(trial.knots - found.x).sum())
         return *found, at_knots + float(excess(left).sum()), at_knots
 
-    def _closed(self, trial: Trial, limited: Flags, near: Array, left: list[float]) -> Trial:
+    def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
         """Close the gaps between intervals by the smallest changes, if possible.
 
         `left` contains the violations at the knots that the earlier quadratic programs left.

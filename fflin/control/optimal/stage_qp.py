@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import MissingPackageError
+from fflin.base.errors import optional_package
 from fflin.base.validation import Array, Indices
 
 # Absolute and relative tolerance of the optimality conditions of the scaled problem.
@@ -63,12 +63,7 @@ class StageQP(NamedTuple):
         """Return the solution, or None if the program is infeasible or the solver fails."""
         import scipy.sparse as sp
 
-        try:
-            import piqp
-        except ImportError:
-            raise MissingPackageError(
-                "this needs the solver PIQP; install it with: pip install 'fflin[mpc]'"
-            ) from None
+        piqp = optional_package("piqp", "this needs the solver PIQP", "mpc")
         (N, nx, nu), (knots, nw) = self.B.shape, self.g.shape
         size, of_rows = np.tile(self.scale, knots), 1.0 / np.tile(self.scale[:nx], knots)
         none = sp.csc_array((N * nx, nw))

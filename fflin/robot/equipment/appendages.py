@@ -15,14 +15,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, FrozenArrays, as_double, number, positive, shaped
-from fflin.robot.equipment.mounting import about_origin, inertia_of
+from fflin.robot.equipment.mounting import inertia_of, point_inertia
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
 # First root of J_1'(x) = 0: the wavenumber times the radius of the first lateral mode in a
@@ -31,10 +31,9 @@ _FIRST_ROOT = 1.8411837813406593
 _FASTEST = 1e12  # [Hz]
 
 
-class Appendage(FrozenArrays):
+class _Part(FrozenArrays):
     """Base class of passive parts of a link."""
 
-    KEY: ClassVar[str]  # name of the table in a robot file
     frame: str
     name: str | None
 
@@ -43,24 +42,9 @@ class Appendage(FrozenArrays):
         """Prefix of the names of the modes."""
         return self.name or self.frame
 
-    @property
-    def modes(self) -> tuple[str, ...]:
-        """Names of the modes, which are coordinates of the robot."""
-        raise NotImplementedError
-
-    @property
-    def participation(self) -> Array:
-        """Modal participation L (6, k): translation, then rotation about the frame's origin."""
-        raise NotImplementedError
-
-    @property
-    def springs(self) -> dict[str, dict[str, float]]:
-        """Stiffness and damping of the modes, as {"stiffness": {mode: value}, "damping": ...}."""
-        raise NotImplementedError
-
 
 @dataclass(frozen=True, eq=False)
-class FlexibleAppendage(Appendage):
+class FlexibleAppendage(_Part):
     r"""Flexible part of a link, such as a solar array, described by its modes when clamped.
 
     Each mode adds a coordinate to q_m, with the name NAME_mode_1, NAME_mode_2 and so on. The
@@ -105,7 +89,6 @@ class FlexibleAppendage(Appendage):
     ('array_mode_1', 3.553)
     """
 
-    KEY = "flexible"
     frame: str
     frequency: Any
     translation: Any
@@ -264,7 +247,7 @@ class FlexibleAppendage(Appendage):
 
 
 @dataclass(frozen=True, eq=False)
-class Slosh(Appendage):
+class Slosh(_Part):
     r"""Liquid that sloshes in a tank, modelled as a point mass that moves across the tank's axis.
 
     With `frequency`, the mass moves on springs, and its coordinates are the displacements NAME_x
@@ -310,7 +293,6 @@ class Slosh(Appendage):
     ('tank_x', 'tank_y')
     """
 
-    KEY = "slosh"
     frame: str
     mass: float
     position: Vector3
@@ -478,6 +460,9 @@ class Slosh(Appendage):
         return np.column_stack((x, np.cross(z, x), z))
 
 
+Appendage: TypeAlias = FlexibleAppendage | Slosh
+
+
 def checked_appendages(value: object) -> tuple[Appendage, ...]:
     """Return the given flexible appendages and slosh if they are valid, or raise `InputError`."""
     if isinstance(value, Appendage):
@@ -493,9 +478,7 @@ def rigid_inertia(M: Array) -> pin.Inertia:
     """Convert a rigid-body mass matrix (6, 6), translation before rotation, to an inertia."""
     mass = float(M[0, 0])
     lever = np.array([M[1, 5], M[2, 3], M[0, 4]]) / mass
-    return inertia_of(
-        mass, lever, M[3:, 3:] - about_origin(inertia_of(mass, lever, 0.0 * M[3:, 3:]))
-    )
+    return inertia_of(mass, lever, M[3:, 3:] - point_inertia(mass, lever))
 
 
 def _text(what: str, value: Any) -> str:

@@ -59,18 +59,14 @@ def difference(body: pin.Inertia, part: pin.Inertia) -> pin.Inertia:
     if part.mass == 0.0:
         return inertia_of(mass, body.lever, body.inertia - part.inertia)
     moment = body.mass * body.lever - part.mass * part.lever
-    moments = about_origin(body) - about_origin(part)
+    moments = body.inertia + point_inertia(body.mass, body.lever)
+    moments = moments - (part.inertia + point_inertia(part.mass, part.lever))
     lever = moment / mass if mass else np.zeros(3)
-    return inertia_of(mass, lever, moments - _shift(mass, lever))
+    return inertia_of(mass, lever, moments - point_inertia(mass, lever))
 
 
-def about_origin(body: pin.Inertia) -> Array:
-    """Return the rotational inertia (3, 3) of a body about the origin of its frame."""
-    about: Array = body.inertia + _shift(body.mass, body.lever)
-    return about
-
-
-def _shift(mass: float, lever: Array) -> Array:
+def point_inertia(mass: float, lever: Array) -> Array:
+    """Return the inertia (3, 3) of a point mass about the origin."""
     return mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
 
 
