@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass
 
 import numpy as np
 
 from fflin.analysis.mechanics import floating_inertia
 from fflin.base.errors import InputError
-from fflin.base.tables import counted, grid, width
+from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array, FrozenArrays, instance
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
@@ -80,7 +79,7 @@ class EffectiveMasses(FrozenArrays):
             f"{self.robot}, base clamped: {counted(len(self.frequencies), 'mode')}; effective "
             "masses and moments of inertia about the origin of the base frame, in base axes"
         )
-        parts = [textwrap.fill(head, width())]
+        parts = [folded([head])]
         for values, unit, at in ((self.masses, "kg", 0), (self.inertias, "kg m^2", 3)):
             others = {"free joints": self.free} if self.free.any() else {}
             others |= {"residual": self.residual, "total": self.total}

@@ -13,7 +13,7 @@ import pinocchio as pin
 from fflin.analysis.eigenpairs import natural_modes
 from fflin.analysis.reduction import ReducedModel
 from fflin.base.errors import InputError
-from fflin.base.tables import counted, grid, width
+from fflin.base.tables import counted, folded, grid, width
 from fflin.base.validation import Array, Complex, FrozenArrays, instance
 from fflin.dynamics.coordinates import Chart
 from fflin.dynamics.state import StateMap
@@ -205,7 +205,7 @@ class Modes:
             poles = ", ".join(f"{mode.pole:.5g}" for mode in self.unstable)
             said.append(f"unstable poles (positive real part): {poles}")
         said += [f"note: {note}" for note in self.notes]
-        parts = [textwrap.fill(each, width()) for each in said]
+        parts = [folded([each]) for each in said]
         rows = [["rad/s", "damping", "decay [s]", "", "kinetic energy"]]
         rows += [
             [

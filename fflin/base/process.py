@@ -15,6 +15,7 @@ T = TypeVar("T")
 _PATIENCE = 1.0  # seconds before a bar is shown
 _WORTH = 10.0  # seconds of work from which an estimate is shown
 _INTERVAL = 0.1
+LONG_RUN = 20.0  # seconds of a run after which a faster engine is recommended
 
 
 class Progress:
@@ -37,14 +38,15 @@ class Progress:
         on = f"{cores} core{'s' * (cores != 1)}"
         print(f"fflin: about {float(f'{size:.2g}'):g} {unit} on {on}", file=sys.stderr)
 
-    def __call__(self, done: int, total: int, what: str = "") -> None:
-        """Update the bar: `done` of `total` steps of `what`."""
+    def __call__(self, done: int, total: int, what: str = "", hint: str = "") -> None:
+        """Update the bar: `done` of `total` steps of `what`; a long run also shows `hint`."""
         self.done, self.total = done, total
         if self._shown:
             share = done / total
-            left = (time.monotonic() - self._start) * (1.0 - share) / share
+            spent = time.monotonic() - self._start
+            left, hint = spent * (1.0 - share) / share, hint if spent > LONG_RUN else ""
             bar = "#" * round(30 * share)
-            self.say(f"{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left ")
+            self.say(f"{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left {hint}")
 
     def say(self, text: str) -> None:
         """Show a line instead of the bar, for work of unknown length."""

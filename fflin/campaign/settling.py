@@ -34,7 +34,7 @@ from fflin.simulation.run import STOPS
 SETTLED, DIVERGED = 1e-3, 1e3
 # Duration of a run that is compared with the prediction, in time constants of the slowest pole.
 # Duration of a random run, in settling times of the slowest pole.
-_CONSTANTS, _PATIENCE = 3.0, 3.0
+_CONSTANTS, PATIENCE = 3.0, 3.0
 _STEP = 0.25  # time step times the fastest pole
 _WIDEST = 10.0  # largest joint displacement [rad] to which the step is adapted
 _FINER, _FINEST = 8, 2  # factor by which steps are shortened if a run diverges, and how often
@@ -136,7 +136,7 @@ def settling_runs(
     free = linearize(loop.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
     rates = [2.0 * free.A] if lin.dt else [free.A, loop.rate]
     fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
-    horizon = (_CONSTANTS if predicts else _PATIENCE * math.log(1.0 / SETTLED)) / decay
+    horizon = (_CONSTANTS if predicts else PATIENCE * math.log(1.0 / SETTLED)) / decay
     pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
     every = math.ceil(lin.dt * pace / _STEP) if lin.dt else 1
     dt = lin.dt / every if lin.dt else _STEP / pace

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from fflin.base.validation import Array, FrozenArrays, Indices, number, share, w
 from fflin.batch.run import Progress, check_workers, executor_of
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import expect
-from fflin.campaign.settling import OUTCOMES, checked_loop, settle, settling_runs
+from fflin.campaign.settling import OUTCOMES, PATIENCE, checked_loop, settle, settling_runs
 from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -254,7 +255,9 @@ def validity(
         sets.append((runs_of, starts, len(at)))
         job = runs_of()
         job.choose(engine)  # a wrong argument is refused before anything is compiled
-        work.append((job, Draws(starts(np.arange(min(LANES, len(at))))), len(at)))
+        # A random run usually settles after 1 / PATIENCE of its longest duration.
+        long = len(at) if predicts else math.ceil(len(at) / PATIENCE)
+        work.append((job, Draws(starts(np.arange(min(LANES, len(at))))), long))
     total, done, found = sum(count for *_, count in sets), 0, []
     with executor_of(executor, workers) as others:
         how: dict[str, object] = {"executor": others, "workers": workers, "threads": threads}

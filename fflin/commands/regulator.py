@@ -155,8 +155,9 @@ def add_allocation(group: parser.Group) -> None:
         "--allocate",
         "design the regulator with base torque and force as inputs, and allocate its commands to "
         "the thrusters, which produce the nearest possible wrench. Allocation is the default if "
-        "the thrusters can push in every direction. With --no-allocate, the regulator commands "
-        "each thruster itself, and negative thrust is cut at zero",
+        "the thrusters can push in every direction, but not along a trajectory. With "
+        "--no-allocate, the regulator commands each thruster itself, and negative thrust is cut at "
+        "zero",
     )
 
 
@@ -252,6 +253,12 @@ _ALLOCATED = (
 )
 
 
+_NOT_ALLOCATED = (
+    "no allocation: the gains command each thruster, in `fflin simulate` too, and negative thrust "
+    "is cut at zero"
+)
+
+
 def _lqr(arguments: argparse.Namespace) -> Report:
     """Design a linear quadratic regulator; show gain, poles, residual and margins.
 
@@ -344,11 +351,16 @@ def _tvlqr(arguments: argparse.Namespace) -> Report:
     example: fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 -o
     gains.npz
     """
+    from fflin.robot.inputs import Thruster
+
     why = "along a trajectory no reduced model is needed, because the finite-horizon cost exists"
     refuse(arguments, ("reduce",), why)
     along = models_along(arguments)
     schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
-    return Report(along.robot.name, schedule, str(schedule), {arguments.output_file: schedule.save})
+    text = str(schedule)
+    if any(isinstance(each, Thruster) for each in along.robot.inputs):
+        text += f"\n{folded([_NOT_ALLOCATED])}"
+    return Report(along.robot.name, schedule, text, {arguments.output_file: schedule.save})
 
 
 def schedule_of(

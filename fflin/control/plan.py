@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, listed
-from fflin.base.names import chosen, input_keys
+from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
 from fflin.base.validation import Array, Mask, number, whole
 from fflin.control.channel import input_limits
@@ -57,8 +57,9 @@ def plan(
     The plan minimises :math:`\int u^T R\,u\;dt`. Inputs, joints and wheels stay within their
     limits. The method is multiple shooting: the state at the start of each interval is an
     optimisation variable. Sequential quadratic programming searches for a local minimum in at most
-    50 iterations. The quadratic programs are built from the linear models along the motion and
-    solved by PIQP (``pip install 'fflin[mpc]'``).
+    50 iterations. The search ends earlier if the violation of the goal and the limits at the knots
+    does not fall by a tenth in ten iterations. The quadratic programs are built from the linear
+    models along the motion and solved by PIQP (``pip install 'fflin[mpc]'``).
 
     The base may rotate by any angle, including full turns if the angular rates at both ends require
     them. Continuous joints take the shorter direction.
@@ -67,7 +68,7 @@ def plan(
     knots. If the motion between knots exceeds a limit, the quadratic program includes this limit at
     points within the interval. If limits cannot be satisfied between knots, they are satisfied at
     the knots only, and a warning is issued. Printing the trajectory shows the largest violation,
-    the limit that is violated and the time.
+    the limit that is violated and the time, and the inputs and states nearest to their limits.
 
     Parameters
     ----------
@@ -181,6 +182,7 @@ def plan(
             warnings.warn(
                 f"{note}; give more knots or a longer duration", FflinWarning, stacklevel=2
             )
+        note += _largest(shooting, actuation, made, np.hstack((bounds, inputs)))
         return Trajectory(robot, t, q, v, u, hold=hold, _note=note)
     raise _failure(shooting, made, asked, duration)
 
@@ -275,3 +277,19 @@ def _note(shooting: Shooting, made: _Made, size: Array) -> str:
         percent = f"{100.0 * made.most:.2g} %"
         most = f"exceeds the limit of {shooting.state.names[i]} by {percent} at t = {at:.4g} s"
     return f"the integrated motion {most} (checked at {_PARTS} points per interval)"
+
+
+def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Array) -> str:
+    """Return a line with the state or input of each group that is nearest to its limit (2, k)."""
+    state, values = shooting.state, np.hstack((shooting.limited_values(made.q, made.v), made.u))
+    names, units = state.names + input_keys(actuation), state.units + actuation.units
+    bound = np.abs(np.where(values > 0.0, limits[1], limits[0]))
+    shares = np.abs(values) / np.where(bound > 0.0, bound, np.inf)
+    found: dict[tuple[str, bool], tuple[float, str]] = {}
+    for i in np.flatnonzero(np.isfinite(limits).any(axis=0)):
+        k = int(shares[:, i].argmax())
+        said = f"{names[i]} {abs(values[k, i]):.3g} of {bound[k, i]:.3g} {units[i]}"
+        group = group_of(names[i]), names[i].removeprefix("qdot_m.") in state.robot.wheels
+        found[group] = max(found.get(group, (0.0, said)), (float(shares[k, i]), said))
+    said = ", ".join(said.replace(" ", "\u00a0") for _, said in found.values())
+    return f"\nnearest to their limits at the knots: {said}" if said else ""

@@ -65,6 +65,7 @@ class Impact(FrozenArrays):
     event: str
     # Robot, configuration and velocity just before the impact.
     _before: tuple[Robot, Array, Array] = field(kw_only=True)
+    _units: tuple[str, ...] = field(default=(), kw_only=True)  # units of the impulses of `jam`
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}('{self.robot.name}', {self.energy_lost:.4g} J lost)"
@@ -75,8 +76,9 @@ class Impact(FrozenArrays):
     @property
     def told(self) -> str:
         """One-line summary of the event, its impulse and the lost energy."""
-        felt = f"largest impulse {np.abs(self.impulse).max(initial=0.0):.4g}"
-        return f"{self.event}: {felt}, {self.energy_lost:.4g} J lost"
+        impulses = zip(np.abs(self.impulse).tolist(), self._units, strict=True)
+        value, unit = max(impulses, default=(0.0, "N m s"))
+        return f"{self.event}: largest impulse {value:.4g} {unit}, {self.energy_lost:.4g} J lost"
 
 
 def jam(
@@ -150,7 +152,8 @@ def jam(
     left = welded(robot, at)
     said, impulse = struck(left, [(robot, q, v)], "", f"{', '.join(at)} jammed")
     stopped = [6 + robot.joint_names.index(name) for name in at]
-    return Impact(impulse=-state.forces(impulse)[stopped], **said)
+    units = tuple(f"{robot.joint(name).force_unit} s" for name in at)
+    return Impact(impulse=-state.forces(impulse)[stopped], _units=units, **said)
 
 
 def struck(

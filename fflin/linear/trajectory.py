@@ -145,7 +145,7 @@ class Trajectory(Design):
     def __str__(self) -> str:
         """Return a text about the trajectory, with its residual as a motion of the robot."""
         said = self._fault or f"residual {self.residual.max():.1e}"
-        note = f"\n{folded([self._note])}" if self._note else ""
+        note = f"\n{folded(self._note.splitlines())}" if self._note else ""
         return f"{folded(super().__str__().splitlines())}\n{folded([said])}{note}"
 
     @property

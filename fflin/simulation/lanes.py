@@ -15,7 +15,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.process import Progress
+from fflin.base.process import LONG_RUN, Progress
 from fflin.base.validation import Array, Indices, Mask, vector
 from fflin.control.linear_controller import LinearController, OutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback, measured_at
@@ -34,10 +34,10 @@ _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 # Number of steps above which a single run uses the compiled loop, if its machine code is stored.
 LONG = 20_000
-# After a run in Python of more than _LONG_RUN seconds, a message recommends the compiled loop. The
+# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
 # compiled loop takes about _FRACTION of the time. Compiling it takes about _COMPILING seconds,
 # once.
-_LONG_RUN, _FRACTION, _COMPILING = 20.0, 0.1, 30.0
+_FRACTION, _COMPILING = 0.1, 30.0
 
 _log = logging.getLogger("fflin")
 
@@ -354,10 +354,10 @@ def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> 
     """Simulate a plan with an engine; `plant` and `conserved` belong to the simulated robot."""
     if engine == "compiled":
         return recorded(plan, plant)
-    began = time.perf_counter()
-    run = go(plan, plant, conserved)
+    began, slower = time.perf_counter(), not _reason(plan, plant)
+    run = go(plan, plant, conserved, "(faster: --engine compiled) " if slower else "")
     spent = time.perf_counter() - began
-    if spent > _LONG_RUN and not _reason(plan, plant):
+    if spent > LONG_RUN and slower:
         once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
         _log.warning(
             "fflin: the simulation took %.0f s in Python; engine='compiled' (--engine compiled) "

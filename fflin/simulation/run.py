@@ -41,8 +41,11 @@ class Recording(NamedTuple):
 
 # A diverging motion overflows before it is stopped, so NumPy need not warn.
 @np.errstate(over="ignore", invalid="ignore")
-def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
-    """Simulate a plan in Python; `plant` and `conserved` belong to the simulated robot."""
+def go(plan: Plan, plant: Plant, conserved: Conserved, hint: str = "") -> Recording:
+    """Simulate a plan in Python; `plant` and `conserved` belong to the simulated robot.
+
+    The progress bar of a long run shows `hint`.
+    """
     times, q, v = plan.times, plan.q, plan.v
     dt, channel = times.dt, plan.channel()
     reference = MomentumReference(conserved, plan.method, dt, q, v)
@@ -76,7 +79,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
             if stopped := ending(t, q, v):
                 break
             if step % _LOOK == 0:
-                bar(step + 1, times.steps)
+                bar(step + 1, times.steps, hint=hint)
     except KeyboardInterrupt:
         if not count:
             raise

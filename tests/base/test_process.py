@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import fflin
-from fflin.base.process import import_path_without
+from fflin.base.process import Progress, import_path_without
 from fflin.batch.workers import OwnWorkers
 from tests.support.commands import run, run_in_process
 
@@ -78,3 +78,14 @@ def test_the_program_imports_nothing_from_the_working_folder(poison, tmp_path):
     code, out, error = run_in_process("info", "r.urdf.xacro", cwd=tmp_path, PYTHONPATH=package)
     assert code == 0, error
     assert "mass 2 kg" in out
+
+
+def test_a_long_run_shows_its_hint(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr("fflin.base.process.time.monotonic", lambda: now[0])
+    bar = Progress(True)
+    for now[0] in (15.0, 25.0):
+        bar(1, 4, hint="(faster: --engine compiled)")
+    early, late = capsys.readouterr().err.split("\r")[1:]
+    assert "faster" not in early and late.rstrip().endswith("75 s left (faster: --engine compiled)")
+    assert len(late) <= 80

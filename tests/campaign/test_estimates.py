@@ -24,13 +24,19 @@ class Told(Progress):
 @pytest.fixture
 def clock(monkeypatch):
     """Let a run take a millisecond for each step and 20 ms at its start."""
-    now, done = [0.0], CampaignJob.run
+    now, done, flown = [0.0], CampaignJob.run, runs_module._recorded
 
     def timed(job, rows, start, out=None):
-        now[0] += len(rows.drawn) * (20.0 + job.plan.times.steps) * STEP
+        now[0] += len(rows.drawn) * 20.0 * STEP
         return done(job, rows, start, out)
 
+    def stepped(plan, plant, every):
+        found = flown(plan, plant, every)
+        now[0] += found.steps * STEP  # a run may end early
+        return found
+
     monkeypatch.setattr(CampaignJob, "run", timed)
+    monkeypatch.setattr(runs_module, "_recorded", stepped)
     monkeypatch.setattr(runs_module, "perf_counter", lambda: now[0])
     return now
 
@@ -55,9 +61,10 @@ def test_a_campaign_and_validity_say_what_they_will_take(clock):
     silent = fflin.monte_carlo(robot, policy, {"q_b": 0.1}, runs=3, **options)
     assert (silent.q == campaign.q).all()  # the estimate changes no run
     before = clock[0]
-    fflin.validity(robot, lin, gain, samples=3, engine="python", progress=bar)
+    fflin.validity(robot, lin, gain, samples=30, engine="python", progress=bar)
     seconds, cores = bar.told
-    assert cores == 1 and seconds == pytest.approx(clock[0] - before, rel=0.1)
+    # The clock also counts the runs of the estimate.
+    assert cores == 1 and 0.5 < seconds / (clock[0] - before) < 2.0
 
 
 @pytest.mark.parametrize(

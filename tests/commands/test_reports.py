@@ -7,6 +7,7 @@ import pytest
 
 import fflin
 from tests.support.commands import run
+from tests.support.messages import any_wording
 from tests.support.robots import mostly
 
 ROBOTS = ("planar_detumble", "ets_vii", "servicer_7dof", "inspector", "canadarm2")
@@ -81,3 +82,13 @@ def test_the_list_of_robots_begins_with_how_many_load():
     lines = run("robots")[1].splitlines()
     assert re.fullmatch(r"robots: \d+ robots can be loaded by name; 1 cannot be loaded", lines[0])
     assert len(set(lines) - {""}) == len([line for line in lines if line])
+
+
+def test_the_head_of_the_modes_continues_indented():
+    given = ("planar_detumble", "--damping", "0.2", "--stiffness", "joint_1=0.3")
+    with any_wording():
+        code, out, _ = run("modes", *given)
+    first, second, blank, *_ = out.splitlines()
+    assert code == 0 and not blank and second.startswith("  ") and len(first) <= 80
+    # The second line begins with a word that the first has no room for.
+    assert len(first) + 1 + len(second.split()[0]) > 80

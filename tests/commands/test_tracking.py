@@ -216,3 +216,18 @@ def test_a_gain_from_a_file_regulates_as_the_one_that_is_designed(tmp_path, opti
     assert "--gain" in said
     other = refused("simulate", "canadarm2", "--gain", "gain.npz", cwd=tmp_path)
     assert says(other, "gain.npz", "'ets_vii'", "'canadarm2'")
+
+
+def test_gains_of_thrusters_say_that_nothing_is_allocated(tmp_path):
+    thruster = '[[input]]\ntype = "thruster"\nframe = "base"\nposition = [0.1, 0, 0]\n'
+    base = '[[input]]\ntype = "base_torque"\n[[input]]\ntype = "base_force"\n'
+    said = []
+    for name, text in (("with", base + thruster + "direction = [0, 1, 0]\n"), ("without", base)):
+        (tmp_path / f"{name}.toml").write_text(text)
+        given = ("cubesat", "--inputs", f"{name}.toml")
+        options = ("--duration", "5", "--knots", "6", "-o", f"{name}.npz")
+        assert run("plan", *given, *options, cwd=tmp_path)[0] == 0
+        code, out, _ = run("tvlqr", *given, "--trajectory", f"{name}.npz", cwd=tmp_path)
+        assert code == 0
+        said.append("no allocation" in out)
+    assert said == [True, False]

@@ -8,6 +8,7 @@ import pytest
 
 import fflin
 from fflin.control.optimal.shooting import Shooting
+from fflin.control.optimal.stage_qp import StageQP
 from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
 from tests.support.speeds import largest_speeds
@@ -230,6 +231,37 @@ def test_few_knots_keep_limits_between_them(one_joint, knots):
     assert motion.t == pytest.approx(np.linspace(0.0, 10.0, knots), abs=1e-12)
     assert largest_speeds(motion).max() <= 1.01 * SPEEDS["qdot_m"]
     assert missed(robot, motion, goal) < 1e-6 and motion.residual.max() < 1e-6
+
+
+@pytest.mark.parametrize("duration", [3.0, 5.0])
+def test_an_infeasible_plan_gives_up_and_names_the_limit(one_joint, monkeypatch, duration):
+    """A joint needs 1 rad / (0.13 rad/s) = 7.7 s; the search stops after ten iterations in vain."""
+    solved, solve = [], StageQP.solve
+    monkeypatch.setattr(StageQP, "solve", lambda qp: solved.append(len(qp.rows.k)) or solve(qp))
+    robot, goal = one_joint
+    with any_wording(), pytest.raises(fflin.InputError, match=r"joint_1.*longer duration"):
+        fflin.plan(robot, (goal, None), duration, knots=21, limits=SPEEDS)
+    assert len(solved) <= 24  # with and without the points between knots
+
+
+def test_the_values_nearest_to_their_limits_are_printed(one_joint):
+    robot, goal = one_joint
+    limits = {"qdot_m": 0.2, "tau_b": [-30.0, 20.0], "tau_m": 25.0}
+    motion = fflin.plan(robot, (goal, None), 10.0, knots=21, limits=limits)
+    *_, said = " ".join(str(motion).split()).partition("nearest to their limits at the knots: ")
+    names = fflin.linearize(robot).input_names
+    u = dict(zip(names, motion.u.T, strict=True))
+    torque = np.array([u[f"tau_b.{axis}"] for axis in "xyz"])
+    share = np.where(torque > 0.0, torque / 20.0, -torque / 30.0)
+    axis, at = np.unravel_index(share.argmax(), share.shape)
+    limit = 20 if torque[axis, at] > 0.0 else 30
+    assert said.split(", ") == [
+        f"qdot_m.joint_1 {np.abs(motion.v[:, 6]).max():.3g} of 0.2 rad/s",
+        f"tau_b.{'xyz'[axis]} {abs(torque[axis, at]):.3g} of {limit} N m",
+        f"tau_m.joint_1 {np.abs(u['tau_m.joint_1']).max():.3g} of 25 N m",
+    ]
+    assert max(map(len, str(motion).splitlines())) <= 80
+    assert "nearest" not in str(fflin.plan(robot, (goal, None), 10.0, knots=4, limits=None))
 
 
 @pytest.mark.exhaustive

@@ -68,7 +68,7 @@ def test_momentum_and_energy_across_the_phases(flown):
     assert lost == pytest.approx(caught.energy_lost, rel=1e-9)
     said = str(whole)
     assert says(said, "4 s: payload of 500 kg")
-    assert says(said, "10 s: joint_3 jammed")
+    assert says(said, "10 s: joint_3 jammed", "N m s")
     assert says(said, "not settled")
     assert max(map(len, said.splitlines())) <= 80
 

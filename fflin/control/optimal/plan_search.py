@@ -38,6 +38,10 @@ _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 # state.
 _OF_WHEELS = 1e-6
 
+# The search also ends if the quadratic programs violate the goal or a limit at the knots, and this
+# violation does not fall by a tenth in this number of iterations.
+_STAGNANT = 10
+
 # Penalty on a violation of the goal or a limit by 1 rad or 1 m, relative to the effort of the
 # guess.
 _PRICE = 1e3
@@ -89,7 +93,7 @@ class Search(NamedTuple):
         wheels = [*shooting.wheels, *(shooting.state.nx // 2 + i for i in shooting.wheels)]
         near = np.where(np.isin(range(shooting.state.nx), wheels), _OF_WHEELS, 1.0) / len(q)
         first, trial = near, self._trial(q, v, u)
-        limited, price = self._exceeding(trial), 0.0 * trial.missed
+        limited, price, left = self._exceeding(trial), 0.0 * trial.missed, list[float]()
 
         def merit(u: Array, missed: Array, outside: float) -> float:
             lost = (price * np.abs(missed)).sum() + _PRICE * outside
@@ -100,7 +104,10 @@ class Search(NamedTuple):
             step = self._step(trial, limited, near, cost * trial.u)
             if step is None:
                 return self._acting(self._flown(trial.u))
-            z, du, y, outside = step
+            z, du, y, outside, at_knots = step
+            left.append(at_knots)
+            if _stagnates(left):
+                return self._acting(self._flown(trial.u))
             # The multipliers determine the penalty on gaps (Powell).
             price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
             was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
@@ -117,7 +124,7 @@ class Search(NamedTuple):
             known, limited = limited, limited | self._exceeding(trial)
             if saved <= _SAVED * was and (limited == known).all():
                 break
-        return self._acting(self._closed(trial, limited, first))
+        return self._acting(self._closed(trial, limited, first, left))
 
     def _report(self, what: str, trial: Trial, limited: Mask) -> None:
         """Report the cost relative to the guess, and the largest violation."""
@@ -152,8 +159,11 @@ class Search(NamedTuple):
 
     def _step(
         self, trial: Trial, limited: Mask, near: Array, effort: Array
-    ) -> tuple[Array, Array, Array, float] | None:
-        """Return the optimal step of knots and inputs, its multipliers and its violations."""
+    ) -> tuple[Array, Array, Array, float, float] | None:
+        """Return the optimal step of knots and inputs, its multipliers and its violations.
+
+        The violations are their sum, and their sum at the knots alone.
+        """
         u, nx = trial.u, self.shooting.state.nx
         if not max(trial.outside(limited), trial.gap) < np.inf:
             return None
@@ -175,10 +185,14 @@ class Search(NamedTuple):
         if found is None:
             return None
         left = np.array((rows.low, rows.high)) - rows.values(found.x, found.u)
-        return *found, float(excess(trial.knots - found.x).sum() + excess(left).sum())
+        at_knots = float(excess(trial.knots - found.x).sum())
+        return *found, at_knots + float(excess(left).sum()), at_knots
 
-    def _closed(self, trial: Trial, limited: Mask, near: Array) -> Trial:
-        """Close the gaps between intervals by the smallest changes, if possible."""
+    def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
+        """Close the gaps between intervals by the smallest changes, if possible.
+
+        `left` contains the violations at the knots that the earlier quadratic programs left.
+        """
         shooting, last = self.shooting, _NEARLY
         shooting.refine(trial.q, trial.v, trial.u, _FLIES)
         trial = self._trial(*trial[:3])
@@ -197,7 +211,8 @@ class Search(NamedTuple):
                     return trial
                 trial = one
             step = self._step(trial, limited, near, 0.0 * trial.u)
-            if step is None:
+            left = [*left, np.inf if step is None else step[-1]]
+            if step is None or _stagnates(left):
                 break
             u = np.clip(trial.u + step[1], *self.limits)
             trial = self._trial(*shooting.moved(trial.q, trial.v, step[0]), u)
@@ -212,6 +227,12 @@ class Search(NamedTuple):
         """Return q, v and u; if u is held, its last row repeats the input of the last interval."""
         u = np.vstack((trial.u[:-1], trial.u[-2])) if self.shooting.held else trial.u
         return trial.q, trial.v, u
+
+
+def _stagnates(left: list[float]) -> bool:
+    """Return whether violations remain and did not fall by a tenth in _STAGNANT iterations."""
+    before = left[-1 - _STAGNANT] if len(left) > _STAGNANT else np.inf
+    return min(left[-_STAGNANT:]) > max(_ENDS, 0.9 * before)
 
 
 def cost_of_inputs(shooting: Shooting, R: Array, u: Array) -> Array:
