@@ -58,8 +58,8 @@ def plan(
     limits. The method is multiple shooting: the state at the start of each interval is an
     optimisation variable. Sequential quadratic programming searches for a local minimum in at most
     50 iterations. The search ends earlier if the violation of the goal and the limits at the knots
-    does not fall by a tenth in ten iterations. The quadratic programs are built from the linear
-    models along the motion and solved by PIQP (``pip install 'fflin[mpc]'``).
+    is above 0.01 and does not fall by a tenth in ten iterations. The quadratic programs are built
+    from the linear models along the motion and solved by PIQP (``pip install 'fflin[mpc]'``).
 
     The base may rotate by any angle, including full turns if the angular rates at both ends require
     them. Continuous joints take the shorter direction.

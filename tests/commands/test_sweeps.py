@@ -72,7 +72,7 @@ def test_the_engine_can_be_chosen(tmp_path):
         (("--grid", "joint_2=0:1:2", "--joint", "joint_2=1"), "grid"),
         (("--random", "3", "--range", "joint_22=0:1"), "'joint_22'"),
         (("--random", "0"), "--random"),
-        (("--random", "3", "--range", "joint_1=-1e308:1e308"), "narrow"),
+        (("--random", "3", "--range", "joint_1=-1e308:1e308"), "overflow"),
         (("--random", "3", "--grid", "joint_2=0:1:2"), "--grid"),
         (("--random", "3", "-o", "none/x.npz"), "none"),
     ],

@@ -274,7 +274,7 @@ def test_bad_fields_are_told():
         "'panel'": {"damping": {"panel": 1}},
         "'urdf'": {"damping": "yes"},
         "gravity": {"gravity": 9.81},
-        "rest position": {"rest": 1.0},
+        "rest has": {"rest": 1.0},
         "'friction'": {"friction": "urdf"},
         "'stifness'": {"stifness": 1},
     }

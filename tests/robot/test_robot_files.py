@@ -319,7 +319,7 @@ def test_a_regulator_weighs_what_the_robot_says(written, tmp_path, ending):
     for model in (lin, loaded):
         gain = fflin.lqr(model)
         np.testing.assert_allclose(gain.K, fflin.lqr(lin, Q, R).K, rtol=1e-9, atol=1e-9)
-        assert says(gain.weights, "q_m.joint_1, q_b, tau_b, qdot_m.rw")
+        assert says(gain.weights, "q_b, q_m.joint_1, tau_b, qdot_m.rw")
     assert says(fflin.lqr(lin, weights="urdf").weights, "limits")
 
 

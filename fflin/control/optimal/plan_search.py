@@ -38,9 +38,10 @@ _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 # state.
 _OF_WHEELS = 1e-6
 
-# The search also ends if the quadratic programs violate the goal or a limit at the knots, and this
-# violation does not fall by a tenth in this number of iterations.
-_STAGNANT = 10
+# The search also ends if the quadratic programs violate the goal or limits at the knots by more
+# than _HOPELESS [rad or m], and this violation does not fall by a tenth in _STAGNANT iterations.
+# Smaller violations come from the finite penalty, and vanish when the gaps are closed.
+_STAGNANT, _HOPELESS = 10, 1e-2
 
 # Penalty on a violation of the goal or a limit by 1 rad or 1 m, relative to the effort of the
 # guess.
@@ -230,9 +231,9 @@ class Search(NamedTuple):
 
 
 def _stagnates(left: list[float]) -> bool:
-    """Return whether violations remain and did not fall by a tenth in _STAGNANT iterations."""
+    """Return whether large violations did not fall by a tenth in _STAGNANT iterations."""
     before = left[-1 - _STAGNANT] if len(left) > _STAGNANT else np.inf
-    return min(left[-_STAGNANT:]) > max(_ENDS, 0.9 * before)
+    return min(left[-_STAGNANT:]) > max(_HOPELESS, 0.9 * before)
 
 
 def cost_of_inputs(shooting: Shooting, R: Array, u: Array) -> Array:
