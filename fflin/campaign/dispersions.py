@@ -30,8 +30,8 @@ from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import Piece, bodies_named, varied, with_changed
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
+from fflin.simulation.plan import Times
 from fflin.simulation.plant import Plant
-from fflin.simulation.times import Times
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # {property: axes}
