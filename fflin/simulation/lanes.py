@@ -151,7 +151,8 @@ class LaneLoop:
         sense = self._begin(runs, of_lane)
         statistics.reset()
         space = self.rows(-(-steps // every))
-        span = max(1, min((len(space) // self.width - 1) * every, statistics.span))
+        # A slice of count * every steps contains count recorded steps, wherever it begins.
+        span = min(len(space) // self.width * every, statistics.span)
         if self._noisy:
             span = min(span, SLOTS * times.sample)
         clock, messages = np.zeros(1, dtype=np.intp), [""] * count
