@@ -21,7 +21,7 @@ from fflin.robot.joints import ROOT, Follower, Joint, find_frame, joint_of
 from fflin.robot.mass_properties import LinkMass
 from fflin.robot.outputs import JointOutput
 from fflin.robot.robot import Robot
-from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.description import Mimic
 
 _GROUPS = ("q_m", "qdot_m", "tau_m", "wheel")
 

@@ -248,6 +248,25 @@ def test_ctrl_c_keeps_what_is_done(robots, monkeypatch):
     assert 4 * 16 <= len(motion.t) < 1e6
 
 
+@pytest.mark.parametrize("every", [1, 7, 60, 100, 1000])
+@pytest.mark.parametrize("memory", [1, 2**22])
+def test_recorded_rows_do_not_depend_on_the_slices(robots, monkeypatch, every, memory):
+    robot, calls = robots["cubesat"], []
+    policy = feedback(robot)
+    options = {"x0": displaced(policy.lin), "duration": 1.0, "dt": 0.01, "linear": False}
+    motion = fflin.simulate(robot, policy, **options, engine="compiled")
+    kernel = lanes.kernel
+    counted = lambda *names: lambda *a: [calls.append(a), kernel(*names)(*a)]  # noqa: E731
+    monkeypatch.setattr(lanes, "kernel", counted)
+    monkeypatch.setattr(lanes, "_MEMORY", memory)
+    found = fflin.simulate(robot, policy, **options, every=every, engine="compiled")
+    chosen = np.append(np.arange(0, 100, every), 100)
+    for name in ("t", "q", "v", "u"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(motion, name)[chosen])
+    # Each call fills its memory: one row, or all rows of the run.
+    assert len(calls) == (-(-100 // every) if memory == 1 else 1)
+
+
 def nothing(t, q, v):
     return np.zeros(9)
 

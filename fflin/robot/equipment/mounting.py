@@ -10,7 +10,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen
 from fflin.robot.inputs import Input, ReactionWheel, named_wheels
 from fflin.robot.joints import ROOT, Joint, find_frame
-from fflin.robot.urdf.links import is_impossible
+from fflin.robot.urdf.description import is_impossible
 
 _Z = np.array([0.0, 0.0, 1.0])
 
