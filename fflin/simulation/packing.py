@@ -224,10 +224,10 @@ def _path(path: policies.Path, plan: Plan, policy: object, asking: Plant) -> pol
     if type(policy) is not TrajectoryFeedback:
         return path
     motion, schedule = policy.trajectory, policy.schedule
-    shift, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
+    shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
     q, u = list(motion.q), list(motion.u)
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
-    held = _places([each.start for each in motion.flow.held])
+    held = _places([each.start for each in motion.actuation.held])
     nx, gains = state.nx, schedule.interpolant
     pieces = (schedule.K if schedule.dt else gains.pieces).reshape(
         len(gains.starts), -1, count * nx
