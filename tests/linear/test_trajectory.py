@@ -333,7 +333,7 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
     beside = columns["q_m.joint_2"].copy()
     beside[3] = np.nan
     write(columns | {"q_m.joint_2": beside})
-    with pytest.raises(fflin.InputError, match=r"row 5 of column q_m.joint_2 is 'nan'"):
+    with pytest.raises(fflin.InputError, match=r"column q_m.joint_2\[3\] is nan"):
         fflin.Trajectory.load(path, robot)
     path.write_text(path.read_text().replace("nan", "much"))
     with pytest.raises(fflin.InputError, match=r"column q_m\.joint_2: .*'much'; expected"):
