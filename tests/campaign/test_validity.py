@@ -22,7 +22,7 @@ import fflin
 from fflin.base.intervals import clopper_pearson
 from fflin.batch.run import executor_of
 from fflin.campaign.dispersions import Draws
-from fflin.campaign.settling import Loop, settling_runs
+from fflin.campaign.settling import OUTCOMES, Loop, settle, settling_runs
 from fflin.campaign.validity import _LEVELS, _crossing, _slope
 from fflin.simulation.plant import Conserved
 from fflin.simulation.run import go
@@ -103,6 +103,20 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
         q, v = pin.integrate(robot.model, q, h * k), v + h * a
     last = loop.state.to_state(q, v, near=x)
     assert end == pytest.approx(last, abs=2e-4)
+
+
+@pytest.mark.parametrize(("angle", "outcome"), [(170.0, "settled"), (179.0, "chart")])
+def test_a_run_close_to_half_a_turn_counts_as_out_of_the_chart(robots, angle, outcome):
+    lin, gain = held(robots["cubesat"])
+    loop = Loop(robots["cubesat"], lin, gain.K)
+    x = loop.displaced(np.random.default_rng(2), angle, 0.0, 0.0)
+    found = settle(
+        lambda fine: settling_runs(loop, False, None, 0.0, fine),
+        lambda runs: np.tile(x - lin.x0, (len(runs), 1)),
+        1,
+        "python",
+    )
+    assert OUTCOMES[int(found["outcome"][0])] == outcome
 
 
 def test_displacements_are_as_large_as_they_say(robots):
