@@ -25,7 +25,7 @@ from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, loads_of
-from fflin.robot.equipment.appendage_bodies import first_impossible
+from fflin.robot.equipment.assembly import first_impossible
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import Piece, bodies_named, varied, with_changed
 from fflin.robot.robot import Robot

@@ -213,8 +213,8 @@ def _path(
 ) -> policies.Path:
     """Return a trajectory and its gains; if it ends before the run, with the rest at its end."""
     motion, schedule, gains = policy.trajectory, policy.schedule, policy.schedule.interpolant
-    shift, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
-    q, u, held = list(motion.q), list(motion.u), [each.start for each in motion.flow.held]
+    shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
+    q, u, held = list(motion.q), list(motion.u), [each.start for each in motion.actuation.held]
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
     pieces = schedule.K if schedule.dt else gains.pieces
     pieces = pieces.reshape(len(gains.starts), -1, len(u[0]) * state.nx)
