@@ -36,8 +36,7 @@ from fflin.robot.robot import Robot
 from fflin.simulation.lanes import LaneLoop, Runs, engine_of, noises, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.packing import SLOTS, noise_of, packed
-from fflin.simulation.plan import Plan, SimulationOptions, law_of, planned
-from fflin.simulation.plant import Plant, conserved_by
+from fflin.simulation.plan import Plan, SimulationOptions, law_of
 from fflin.simulation.run import Recording, go
 from fflin.simulation.simulate import motion_of
 
@@ -67,13 +66,13 @@ class CampaignJob:
         # A judge compares errors with the errors at the start, so the histories contain the start.
         histories = settings.pop("histories", 0 if judge is None else 1)
         unlimited = settings.pop("unlimited", False)
-        settings |= {"linear": False, "progress": False}
-        self.plan, self.plant = planned(robot, policy, SimulationOptions(**settings))
+        settings |= {"robot": robot, "policy": policy, "linear": False, "progress": False}
+        self.plan = Plan(SimulationOptions(**settings))
         if unlimited:
             most = np.full(len(self.plan.initial), np.inf)
-            self.plan = replace(self.plan, limits=Saturation(-most, most))
-        self.judge, state, times = judge, self.plant.state, self.plan.times
-        self.engine = engine_of(engine, self.plan, self.plant, many=True)
+            self.plan = self.plan.replace(limits=Saturation(-most, most))
+        self.judge, self.plant, times = judge, self.plan.plant, self.plan.times
+        self.engine, state = engine_of(engine, self.plan, many=True), self.plant.state
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
         # Errors are deviations from a fixed state (nx,) or a moving state (steps + 1, nx).
         self.target, self._path = self.x0 if self.plan.target is None else self.plan.target, []
@@ -136,9 +135,7 @@ class CampaignJob:
         if self.engine == "python":
             return content_digest(completed(self, first, Execution()))
         runs = self._in_lanes(first)
-        return content_digest(
-            {**_loop_arrays(self.plan, self.plant), **runs, "target": self.target}
-        )
+        return content_digest({**_loop_arrays(self.plan), **runs, "target": self.target})
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Simulate runs with the given drawn values; see `Job`."""
@@ -147,7 +144,7 @@ class CampaignJob:
             found = {k: np.empty((len(drawn), *x)) for k, x in self.outcome_shapes.items()}
         if self.engine == "compiled":
             runs, of = self._in_lanes(drawn), (self.plant.state, self.target, self.steps)
-            loop = LaneLoop(self.plan, self.plant, runs)
+            loop = LaneLoop(self.plan, runs)
             statistics = RunStatistics(self.plan, *of, self._path, judge and judge.over)
             for first in range(0, len(drawn), LANES):
                 eight, their_out = (
@@ -170,17 +167,17 @@ class CampaignJob:
         assert tree is not None
         return self.dispersions.in_lanes(drawn, tree)
 
-    def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
-        """Return the plan of a run (k,), and its plant."""
+    def plan_of(self, drawn: Array) -> Plan:
+        """Return the plan of a run (k,)."""
         plan, (plant, policy, q, v) = self.plan, self.dispersions.one(drawn)
         law = law_of(policy, plant, plan.limits, plan.times)
         times = plan.times._replace(delay=int(self.dispersions.delays(drawn[None])[0]))
-        return replace(plan, q=q, v=v, policy=policy, law=law, times=times), plant
+        return plan.replace(plant=plant, q=q, v=v, policy=policy, law=law, times=times)
 
     @np.errstate(over="ignore", invalid="ignore")  # a run that diverges overflows
     def _one(self, drawn: Array) -> dict[str, Array]:
         """Return the outcome of a run (k,) in Python."""
-        (plan, plant), state = self.plan_of(drawn), self.plant.state
+        plan, state = self.plan_of(drawn), self.plant.state
         if over := self.judge and self.judge.over:
 
             def errors(q: Array, v: Array) -> Array:
@@ -192,8 +189,8 @@ class CampaignJob:
                 looks = round(t / plan.times.dt) % LOOK == 0
                 return float(not (looks and over(first, errors(q, v))[0]))
 
-            plan = replace(plan, events=(stops,))
-        return outcome_of(plan, state, self.target, self.steps, _recorded(plan, plant, every=1))
+            plan = plan.replace(events=(stops,))
+        return outcome_of(plan, state, self.target, self.steps, _recorded(plan, every=1))
 
     def seconds(self, first: Array, count: int) -> float:
         """Estimate the time [s] of runs on one core from a few steps of the first runs."""
@@ -202,7 +199,7 @@ class CampaignJob:
         out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
 
         def measured(steps: int) -> float:
-            few.plan = replace(plan, times=plan.times._replace(steps=steps))
+            few.plan = plan.replace(times=plan.times._replace(steps=steps))
             # Other programs may slow down one of the trials.
             timed = partial(few.run, {"drawn": drawn}, 0, out)
             return min(repeat(timed, timer=perf_counter, repeat=3, number=1))
@@ -215,30 +212,28 @@ class CampaignJob:
 
     def replay(self, drawn: Array) -> Motion:
         """Repeat a run (k,) with the same arithmetic, and return its motion."""
-        plan, plant = self.plan_of(drawn)
+        plan = self.plan_of(drawn)
         if self.engine == "python":
-            run = _recorded(plan, plant, plan.times.every)
+            run = _recorded(plan, plan.times.every)
         else:
-            run = recorded(self.plan, self.plant, self._in_lanes(drawn[None]))
-        motion = motion_of(plan, plant, conserved_by(plant.robot, plan.q, plant.field), run)
-        return replace(motion, _nominal=self.plant.robot.urdf_sha256)
+            run = recorded(self.plan, self._in_lanes(drawn[None]))
+        return replace(motion_of(plan, run), _nominal=self.plant.robot.urdf_sha256)
 
 
-def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:
+def _recorded(plan: Plan, every: int) -> Recording:
     """Simulate a run in Python, and record a row every `every` steps."""
-    plan = replace(plan, times=plan.times._replace(every=every))
-    run = go(plan, plant, conserved_by(plant.robot, plan.q, plant.field))
+    run = go(plan.replace(times=plan.times._replace(every=every)))
     if run.stopped.startswith("interrupted"):
         raise KeyboardInterrupt
     return run
 
 
-def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, object]:
+def _loop_arrays(plan: Plan) -> dict[str, object]:
     """Return all arrays and numbers that the compiled loop reads for a plan, without compiling it.
 
     Two plans with equal arrays have equal runs.
     """
-    parts = packed(plan, plant)
+    parts = packed(plan)
     last = min(plan.times.steps, SLOTS * plan.times.sample)
     samples = noises(plan, len(parts.law.y), 0, last)[1] if noise_of(plan) else np.zeros(0)
     found: dict[str, object] = {"noise": samples}

@@ -136,7 +136,7 @@ def _add_controllers(group: parser.Group) -> None:
 def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
     """Return the loop that the options of `add_loop` define."""
     from fflin.control.policies import StateFeedback
-    from fflin.simulation.times import SHORTEST, time_to_settle
+    from fflin.simulation.plan import SHORTEST, time_to_settle
 
     options.settle_step(arguments)
     settings: dict[str, Any] = {

@@ -74,7 +74,7 @@ def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
     if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
         return
     check_tool(robot, arguments.tool)
-    from fflin.simulation.times import LONGEST
+    from fflin.simulation.plan import LONGEST
 
     duration = arguments.duration or LONGEST
     check_rates(arguments.fps, arguments.speed, duration)

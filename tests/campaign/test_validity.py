@@ -9,6 +9,7 @@ import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -20,10 +21,9 @@ from scipy.stats import binomtest
 
 import fflin
 from fflin.base.intervals import clopper_pearson
-from fflin.batch.run import OwnWorkers
-from fflin.campaign.settling import Loop, settling_runs
+from fflin.batch.run import Execution, OwnWorkers
+from fflin.campaign.settling import OUTCOMES, Loop, settle, settling_runs
 from fflin.campaign.validity import _LEVELS, _crossing, _slope
-from fflin.simulation.plant import Conserved
 from fflin.simulation.run import go
 from tests.support.campaigns import flown
 from tests.support.commands import refused, run
@@ -78,9 +78,9 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(1), 40.0, 0.3, 0.5)
     job = settling_runs(loop, False, None, 1.0)
-    plan, plant = job.plan_of(x - lin.x0)
+    plan = job.plan_of(x - lin.x0)
     times = plan.times._replace(dt=0.02, steps=200, every=1)
-    run = go(replace(plan, times=times), plant, Conserved(robot, plan.q))
+    run = go(plan.replace(times=times))
     end = loop.state.to_state(run.q[-1], run.v[-1], near=x)
     data = robot.create_data()
     q, v = loop.state.to_pinocchio(x)
@@ -103,6 +103,17 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
         q, v = pin.integrate(robot.model, q, h * k), v + h * a
     last = loop.state.to_state(q, v, near=x)
     assert end == pytest.approx(last, abs=2e-4)
+
+
+@pytest.mark.parametrize(("angle", "outcome"), [(170.0, "settled"), (179.0, "chart")])
+def test_a_run_close_to_half_a_turn_counts_as_out_of_the_chart(robots, angle, outcome):
+    lin, gain = held(robots["cubesat"])
+    loop = Loop(robots["cubesat"], lin, gain.K)
+    x = loop.displaced(np.random.default_rng(2), angle, 0.0, 0.0)
+    found = settle(
+        partial(settling_runs, loop, False, None, 0.0, "python"), (x - lin.x0)[None], Execution()
+    )
+    assert OUTCOMES[int(found["outcome"][0])] == outcome
 
 
 def test_displacements_are_as_large_as_they_say(robots):
@@ -196,7 +207,7 @@ def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
         e = step @ e
     settles = next(k for k, size in enumerate(sizes) if size <= 1e-3 * sizes[0])
     for steps, outcome in ((settles, 1.0), (settles - 1, 0.0)):
-        job.plan = replace(job.plan, times=times._replace(steps=steps))
+        job.plan = job.plan.replace(times=times._replace(steps=steps))
         assert flown(job, (x - lin.x0)[None])["outcome"] == [outcome]
 
 
