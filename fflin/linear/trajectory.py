@@ -207,11 +207,10 @@ class Trajectory(Design):
     def points(self, times: Array) -> tuple[Array, Array, Array]:
         """Return q, v and u (k, ..) at times (k,); see `point`."""
         k, s = intervals_of(self.t, times)
-        powers, (turns, speeds) = s[:, None] ** np.arange(4), self.cubics
-        steps = np.einsum("ij,ijk->ik", powers, turns[k])
+        s = s[:, None]
+        steps, v = np.einsum("ij,lijk->lik", s ** np.arange(4), self.cubics[:, k])
         q = integrate_rows(self.robot.model, self.q[k], steps)
-        u = self._in_base_axes(q, self._input(k, s[:, None]))
-        return q, np.einsum("ij,ijk->ik", powers, speeds[k]), u
+        return q, v, self._in_base_axes(q, self._input(k, s))
 
     def _input(self, k: int | Indices, fraction: float | Array) -> Array:
         """Return the inputs in the axes of `frame`, at a fraction of the intervals k."""
@@ -426,8 +425,8 @@ class Trajectory(Design):
         return q, v
 
     @cached_property
-    def cubics(self) -> tuple[Array, Array]:
-        """Coefficients (N - 1, 4, nv) of v and of the displacement from each interval's start."""
+    def cubics(self) -> Array:
+        """Coefficients (2, N - 1, 4, nv) of the displacement within each interval, and of v."""
         q, v, h, model = self.q, self.v, np.diff(self.t)[:, None], self.robot.model
         begin = self._aba.accelerations(q, v, self.u_base)
         end = begin[1:]
@@ -444,10 +443,8 @@ class Trajectory(Design):
             pin.dDifference(model, *pair, pin.ArgumentPosition.ARG1) @ speed
             for pair, speed in zip(pairwise(q), v[1:], strict=True)
         ]
-        return (
-            cubic(np.zeros_like(apart), apart, h * v[:-1], h * slopes),
-            cubic(v[:-1], v[1:], h * begin[:-1], h * end),
-        )
+        displacement = cubic(np.zeros_like(apart), apart, h * v[:-1], h * slopes)
+        return np.array((displacement, cubic(v[:-1], v[1:], h * begin[:-1], h * end)))
 
 
 def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
@@ -469,10 +466,9 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
 
 def intervals_of(t: Array, times: Array) -> tuple[Indices, Array]:
     """Return the indices (k,) of the intervals that contain times (k,), and elapsed fractions."""
-    last = len(t) - 2
-    k = np.maximum(np.minimum(t.searchsorted(times, "right") - 1, last), 0)
+    k = t[1:-1].searchsorted(times, "right")
     fraction = (times - t[k]) / (t[k + 1] - t[k])
-    ends = (fraction > 1.0 - _NEAR) & (k < last)
+    ends = (fraction > 1.0 - _NEAR) & (k < len(t) - 2)
     fraction[ends | (fraction < _NEAR)] = 0.0
     return k + ends, np.minimum(fraction, 1.0)
 
