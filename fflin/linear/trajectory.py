@@ -17,7 +17,7 @@ from fflin.base.errors import FflinError, FflinWarning, InputError
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
-from fflin.base.validation import Array, Indices, as_double, frozen, number, shaped, vector
+from fflin.base.validation import Array, Indices, as_double, frozen, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
@@ -131,18 +131,25 @@ class Trajectory(Design):
             )
         if self.hold is not None and str(self.hold) not in ("linear", "previous"):
             raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
-        short = np.shape(self.u) == (count - 1, nu) and self.hold != "linear"
+        q, v, u = (
+            _configurations(robot, self.q, count),
+            as_double("v", self.v),
+            as_double("u", self.u),
+        )
+        short = u.shape == (count - 1, nu) and self.hold != "linear"
         hint = f", or ({count - 1}, {nu}) if each row acts over an interval"
-        u = shaped("u", self.u, (count - short, nu), hint)
-        q, v = _configurations(robot, self.q, count), shaped("v", self.v, (count, robot.nv))
+        u = np.vstack((u, u[-1:])) if short else u
+        for name, rows, size, more in (("v", v, robot.nv, ""), ("u", u, nu, hint)):
+            if rows.shape != (count, size):
+                raise InputError(f"{name} has shape {rows.shape}, expected {(count, size)}{more}")
         for k, t in enumerate(times):
             try:
                 q[k], v[k] = robot.checked_configuration(q[k]), robot.checked_velocity(v[k])
                 require_slow("v", v[k])
+                vector("u", u[k], nu, "the robot's inputs")
             except FflinError as error:
                 raise InputError(f"at t = {t:g} s: {error}") from None
-        values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v)}
-        values["u"] = frozen(np.vstack((u, u[-1:])) if short else u)
+        values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v), "u": frozen(u)}
         values["hold"] = self.hold or ("previous" if short else "linear")
         for name, value in values.items():
             object.__setattr__(self, name, value)

@@ -8,7 +8,7 @@ import fflin
 from fflin.batch.chunks import BatchEquations
 from fflin.batch.rows import Points
 from fflin.dynamics.rnea import Inertia
-from fflin.linear.verification import inertia_matrix
+from fflin.linear.check import inertia_matrix
 from tests.support.robots import BUNDLED, random_tree
 
 pytestmark = pytest.mark.compiled
