@@ -27,7 +27,7 @@ from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, loads_of
 from fflin.robot.equipment.assembly import first_impossible
 from fflin.robot.joints import ROOT
-from fflin.robot.mass_properties import Piece, bodies_named, varied, with_changed
+from fflin.robot.mass_properties import bodies_named, varied, with_changed
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plant import Plant
@@ -291,18 +291,12 @@ class Dispersions:
         mass, com, inertia, density = (
             self._of(kind, drawn, len(pieces), len(axes)) for kind, axes in _OF_BODIES.items()
         )
-        changed: dict[int, list[tuple[Piece, tuple[Array, Array, Array]]]] = {}
+        changed: dict[int, list[Array]] = {}
         for at in sorted({at for _, at in self._changed(*_OF_BODIES)}):
             joint = pieces[at].joint
             own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
-            properties = varied(
-                pieces[at],
-                mass=mass[:, at, 0],
-                density=density[:, at, 0],
-                com=com[:, at],
-                inertia=inertia[:, at],
-            )
-            changed.setdefault(own, []).append((pieces[at], properties))
+            changes = mass[:, at, 0], density[:, at, 0], com[:, at], inertia[:, at]
+            changed.setdefault(own, []).append(varied(pieces[at], *changes))
         return {joint: with_changed(model.inertias[joint], x) for joint, x in changed.items()}
 
     def _springs(self, kind: str, drawn: Array) -> Array:
